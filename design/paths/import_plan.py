@@ -7,6 +7,7 @@ non-linear least squares (SciPy's), and removed one by one while the others suff
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import shapely
@@ -28,7 +29,10 @@ _ASPECT_TOLERANCE = 2e-3  # largest relative difference in aspect ratio of the d
 _FIT_SHARE = 0.8  # tolerance of the fit, relative to the stated one: the fit measures its misfit at samples only
 _FLATNESS_MM = 1e-3  # tolerance to which curves are compared
 SAMPLES = 700  # samples of a polyline
+_MAX_ROUNDS = 20  # fits, each within the room between the knots of the last
+_MIN_GAIN = 0.01  # relative gain in squared misfit from which another fit follows
 _MAX_STEP = 0.4  # largest shift of a knot along the axis in one fit, as a share of the way to its neighbour
+_TINY = 1e-12  # room of a knot that has none: bounds must differ
 _MAX_CANDIDATES = 4  # knots whose removal is tried, those with the smallest misfit first
 _SUPPORT = 3  # spans on either side of a knot that may depend on it, while it moves within one
 _MIN_SPAN = 2e-3  # smallest distance of knots along the axis, as a share of the curve's extent
@@ -324,32 +328,41 @@ def _insert_knots(samples: Array, knots: Array, misfit: Array, tolerance: float,
 
 
 def _optimise(samples: Array, weight: Array, knots: Array) -> Array:
-    """Move the inner knots along and across by non-linear least squares."""
+    """Move the inner knots along and across by non-linear least squares, again and again while they gain by it."""
+    cost = np.inf
+    for _ in range(_MAX_ROUNDS if len(knots) > 2 else 0):
+        fit = _fit_within_room(samples, weight, knots)
+        knots = np.vstack([knots[:1], fit.x.reshape(-1, 2), knots[-1:]])
+        if fit.cost > (1 - _MIN_GAIN) * cost:
+            break
+        cost = fit.cost
+    return knots
+
+
+def _fit_within_room(samples: Array, weight: Array, knots: Array) -> Any:
+    """Fit inner knots that stay within a share of the way to their neighbours, so that they keep their order."""
     from scipy.optimize import least_squares
 
-    if len(knots) == 2:
-        return knots
     along, across = samples.T
 
     def residual(inner: Array) -> Array:
         return (_evaluate(np.vstack([knots[:1], inner.reshape(-1, 2), knots[-1:]]), along) - across) * weight
 
     min_span = _MIN_SPAN * (knots[-1, 0] - knots[0, 0])
-    room = _MAX_STEP * np.maximum(np.diff(knots[:, 0]) - min_span, 0) + 1e-12  # neighbours keep their order
+    room = _MAX_STEP * np.maximum(np.diff(knots[:, 0]) - min_span, 0) + _TINY
     bounds = np.full((2, len(knots) - 2, 2), np.inf) * [[[-1]], [[1]]]
     bounds[:, :, 0] = knots[1:-1, 0] - room[:-1], knots[1:-1, 0] + room[1:]
     span = np.clip(np.searchsorted(knots[:, 0], along, side="right") - 1, 0, len(knots) - 2)
-    # a span depends on the knots at its ends and on one beyond either; knots move by less than one span
-    depends = np.abs(2 * span[:, None] + 1 - 2 * np.arange(1, len(knots) - 1)) <= 2 * _SUPPORT - 1
-    fit = least_squares(
+    depends = np.abs(span[:, None] - np.arange(1, len(knots) - 1) + 0.5) < _SUPPORT
+    return least_squares(
         residual,
         knots[1:-1].ravel(),
         bounds=bounds.reshape(2, -1),
-        jac_sparsity=np.repeat(depends, 2, axis=1),
+        jac_sparsity=np.repeat(depends, 2, axis=1),  # derivatives by knots without a span in common at once
         x_scale="jac",
         ftol=1e-3,
+        max_nfev=8,
     )
-    return np.vstack([knots[:1], fit.x.reshape(-1, 2), knots[-1:]])
 
 
 def _remove_redundant(samples: Array, weight: Array, knots: Array, tolerance: float) -> Array:

@@ -9,11 +9,9 @@ from hypothesis import strategies as st
 
 from padforge.design import Contact, InputError, Morphology, signals, signals_quantized
 from padforge.design.contact import signals_sparse
-from padforge.design.objectives.ambiguity import ambiguities
 from padforge.design.objectives.rules import check_rules
 from padforge.design.paths.curves import crossings, lengths
-from padforge.design.published.objective import information
-from padforge.design.settings import Layout, PadSettings, RulesSettings
+from padforge.design.settings import Layout, RulesSettings
 
 ROUND = Contact(radius=0.6, sides=None)
 CONTACTS = [
@@ -89,15 +87,6 @@ def test_rules_and_lengths_of_a_transposed_rectangle(pad):
     assert [each[2] for each in swapped] == pytest.approx([each[2] for each in found], abs=0.02, rel=1e-2)
 
 
-def test_ambiguities_of_a_transposed_rectangle():
-    pad = Morphology.random(Layout.create((2, 1), (8.0, 15.0)), 3, seed=1)
-    found, other = (
-        ambiguities(each, contact, 1, 0.05, PadSettings().for_layout(each.layout))
-        for each, contact in ((pad, Contact()), (turned(pad), with_exchanged_depths(Contact())))
-    )
-    assert other == pytest.approx(found, rel=2e-3)  # in single precision
-
-
 def test_signals_of_coarse_families_and_single_fibres():
     """Horizontals lie 6 pitches of the verticals apart; one leaves its level by nearly that and is felt there."""
     for counts in ((1, 0), (0, 1)):
@@ -142,9 +131,3 @@ def test_load_refuses_invalid_rectangles_in_one_line(tmp_path, change):
     path.write_text(json.dumps(PAD.to_dict() | change))
     with pytest.raises(InputError, match=r"pad\.json: "):
         Morphology.load(path)
-
-
-def test_information_of_a_transposed_rectangle():
-    pad, contact = Morphology.random(Layout.create((2, 4), (6.0, 15.0)), 3, 1), Contact(model="profile")
-    turned_bits = information(turned(pad), contact, noise=50.0, side=5)
-    assert information(pad, contact, noise=50.0, side=5) == pytest.approx(turned_bits, rel=1e-6)

@@ -163,12 +163,8 @@ SHAPE = {"radius": 0.6, "sides": 30, "weight": "uniform"}
     [
         ({}, "layer", "euclidean"),
         ({"tool": "flat", "depth_mm": 1.0, "thickness_mm": 2.0}, "layer", "euclidean"),
-        ({"length": "euclidean"}, "layer", "euclidean"),
-        ({"model": "profile"}, "profile", "euclidean"),
         ({"model": "profile", "length": "manhattan"}, "profile", "manhattan"),
-        ({"sensitivity_profile": PROFILE}, "profile", "euclidean"),
         ({"sensitivity_profile": np.array(PROFILE), "length": "manhattan"}, "profile", "manhattan"),
-        ({"model": "shape"}, "shape", "manhattan"),
         ({"radius": 0.9}, "shape", "manhattan"),
         ({"sides": "circle"}, "shape", "manhattan"),
         ({"weight": "inverse", "length": "euclidean"}, "shape", "euclidean"),

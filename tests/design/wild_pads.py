@@ -75,18 +75,6 @@ def wild_presses(pad: Morphology, seed: int, count: int = 8) -> Array:
     return kinds[rng.integers(len(kinds), size=count), np.arange(count)]
 
 
-def mirrored(pad: Morphology) -> Morphology:
-    """The pad seen in a mirror along y: fibres of either family keep their places in it from the other side."""
-    knots = pad.knots.copy()
-    knots[..., 0] = pad.grid + 1 - knots[..., 0]
-    return Morphology(np.concatenate([knots[: pad.grid, ::-1], knots[pad.grid :][::-1]]), pad.pitch_mm)
-
-
-def transposed(pad: Morphology) -> Morphology:
-    """The pad with x and y exchanged."""
-    return Morphology(np.concatenate([pad.knots[pad.grid :], pad.knots[: pad.grid]])[..., ::-1], pad.pitch_mm)
-
-
 def longest_signals(pad: Morphology, length: Length) -> Array:
     """(2M,) the longest a signal can be with weight 1."""
     if length == "manhattan":

@@ -130,20 +130,6 @@ def test_atomic_files_moves_and_removes_all_or_none(tmp_path):
     assert (tmp_path / "out" / "mine").read_text() == "old"
 
 
-def test_documents_of_a_set_leave_first_and_come_last(tmp_path, monkeypatch):
-    """Whoever reads one finds the files that it names."""
-    replaced(tmp_path, "a.json", "b.png", "c.json", "gone.json", "z.stl", text="old")
-    states, replace = [], Path.replace
-
-    def watched(self, target):
-        states.append({name: text for name, text in texts(tmp_path).items() if name.endswith(".json")})
-        return replace(self, target)
-
-    monkeypatch.setattr(Path, "replace", watched)
-    replaced(tmp_path, "a.json", "z.stl", "c.json", "b.png", without=["gone.json"])
-    assert states == [{}, {}, {}, {"a.json": "new"}]
-
-
 def test_files_that_cannot_be_moved_leave_no_document(tmp_path, monkeypatch):
     replaced(tmp_path, "a.json", "b.png", "c.png", text="old")
     replace = Path.replace

@@ -72,6 +72,7 @@ def program(tmp_path: Path, pad: Path) -> Iterator[Program]:
         program.process.communicate()
 
 
+@pytest.mark.slow
 def test_editor_refuses_hostile_requests_and_saves_beside_pad(program: Program, tmp_path: Path, pad: Path) -> None:
     before = pad.read_bytes()
     assert "saves to pad-edited.json" in program.said

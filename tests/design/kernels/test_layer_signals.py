@@ -1,18 +1,14 @@
 """Signals of a pressed layer: exact ones against a dense oracle, those of a search beside them, and lengths."""
 
-from itertools import pairwise
-
 import numpy as np
 import pytest
-from numpy.polynomial import Polynomial
-from scipy.interpolate import CubicSpline, PchipInterpolator
 
 from padforge.design import Contact, Morphology, signals, signals_quantized, signals_sparse
-from padforge.design.contact import fibre_axes, half_width_mm, profile_weights
-from padforge.design.kernels.geometry import DEGREE
+from padforge.design.contact import fibre_axes
 from padforge.design.kernels.measured_signals import LAYER_PRECISION
 from padforge.design.settings import BUILT_CONTACT
 from padforge.design.signal_gradients import FibreCurves
+from tests.design.kernels.oracle import dense_oracle
 
 CONTACTS = {
     "default": Contact(),
@@ -21,53 +17,6 @@ CONTACTS = {
     "flat, shallow": Contact(tool="flat", tool_radius_mm=4.0, depth_mm=1.0, fibre_depths_mm=(3.0, 1.0)),
     "wider": Contact(tool="finger", thickness_mm=10.0, scale=1.3),
 }
-
-
-def dense_oracle(pad, press, contact, fibre):
-    """One signal: Gauss's rule on 1000 pieces of every span of the PCHIP curve, in mm, shortest at its knots.
-
-    Between them the curve may turn within a thousandth of the span. Weights are interpolated anew between the family's.
-    """
-    axis = pad.layout.family(fibre)
-    distance, *weights = profile_weights(contact)[axis if contact.model == "layer" else 0]
-    interpolate = panel_polynomials if contact.model == "layer" else spline
-    plain, directed = (interpolate(distance**2, values) for values in weights)
-    knots, centre = pad.unit_mm * pad.knots[fibre], pad.unit_mm * np.asarray(press)
-    curve = PchipInterpolator(knots[:, axis], knots[:, 1 - axis])
-    slope, total = curve.derivative(), 0.0
-    nodes, shares = np.polynomial.legendre.leggauss(10)
-    ends = (1 - np.cos(np.pi * np.linspace(0, 1, 1001))) / 2
-    at = (ends[:-1, None] + np.diff(ends)[:, None] * (nodes + 1) / 2).ravel()
-    length = (np.diff(ends)[:, None] * shares / 2).ravel()
-    for begin, end in pairwise(knots[:, axis]):
-        t = begin + (end - begin) * at
-        x, y, rise = t - centre[axis], curve(t) - centre[1 - axis], slope(t)
-        square = x * x + y * y
-        inside = square < distance[-1] ** 2
-        x, y, rise, square = x[inside], y[inside], rise[inside], square[inside]
-        weight = plain(square) + directed(square) * (x + y * rise) ** 2 / (square * (1 + rise**2))
-        total += weight * np.hypot(1, rise) @ length[inside] * (end - begin)
-    return total / pad.unit_mm
-
-
-def spline(squares, values):
-    """The cubic spline through a measured profile."""
-    return CubicSpline(squares, values, bc_type=((2, 0), (1, 0)))  # pyright: ignore[reportArgumentType]
-
-
-def panel_polynomials(squares, values):
-    """The function of a squared distance that is a polynomial between every eighth of them."""
-    begins = squares[:-1:DEGREE]
-    panels = [
-        Polynomial.fit(squares[i : i + DEGREE + 1], values[i : i + DEGREE + 1], DEGREE)
-        for i in range(0, len(squares) - 1, DEGREE)
-    ]
-
-    def evaluate(square):
-        panel = np.searchsorted(begins, square, side="right") - 1
-        return np.piecewise(square, [panel == index for index in range(len(panels))], panels)
-
-    return evaluate
 
 
 def curves(pad, move: np.ndarray | float = 0.0):
@@ -160,12 +109,3 @@ def test_a_press_is_as_wide_in_mm_at_every_pitch(model):
     widths, elongations = np.transpose([half_width_and_elongation_mm(pitch, Contact(model=model)) for pitch in pitches])
     assert widths == pytest.approx([widths[1]] * 3, rel=1e-3)
     assert elongations == pytest.approx([elongations[1]] * 3, rel=1e-3)
-
-
-def test_half_the_tool_at_half_the_size_is_half_as_wide():
-    whole = Contact(tool_radius_mm=16.0, depth_mm=8.0, thickness_mm=12.0, fibre_depths_mm=(4.0, 3.0))
-    half = Contact(tool_radius_mm=8.0, depth_mm=4.0, thickness_mm=6.0, fibre_depths_mm=(2.0, 1.5))
-    assert half_width_mm(half) == pytest.approx(half_width_mm(whole) / 2, rel=5e-3)
-    (wide, long), (narrow, short) = half_width_and_elongation_mm(20.0, whole), half_width_and_elongation_mm(10.0, half)
-    assert narrow == pytest.approx(wide / 2, rel=5e-3)
-    assert short == pytest.approx(long / 2, rel=5e-3)

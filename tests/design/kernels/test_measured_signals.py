@@ -1,15 +1,10 @@
-"""Signals of a measured profile: exact ones against adaptive quadrature, and those that a search takes beside them."""
-
-import warnings
-from itertools import pairwise
+"""Signals of a measured profile: exact ones against dense quadrature, and those that a search takes beside them."""
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.integrate import quad
-from scipy.interpolate import CubicSpline, PchipInterpolator
-from scipy.optimize import brentq
+from scipy.interpolate import CubicSpline
 
 from padforge.design import Contact, Morphology, signals, signals_quantized, signals_sparse
 from padforge.design.common.profiling import profiled
@@ -17,6 +12,7 @@ from padforge.design.contact import fibre_axes
 from padforge.design.kernels.measured_signals import PRECISION
 from padforge.design.settings import DEFAULT_PITCH_MM
 from padforge.design.signal_gradients import FibreCurves
+from tests.design.kernels.oracle import dense_oracle
 from tests.design.wild_pads import LENGTHS, SEEDS, Length, longest_signals, wild_pads, wild_presses
 
 PROFILES = {
@@ -44,34 +40,6 @@ def searched(pad, presses, contact):
     return FibreCurves(travel[0], cross[0], ends, pad.unit_mm).signals(presses, contact)[0].T
 
 
-def measured_oracle(pad, press, length, fibre):
-    """One signal under the broad profile: adaptive quadrature between the circles on which the spline's pieces meet."""
-    axis = 0 if fibre < pad.grid else 1
-    knots = pad.knots[fibre]
-    curve = PchipInterpolator(knots[:, axis], knots[:, 1 - axis])
-    slope = curve.derivative()
-    distance, weight = np.array(PROFILES["broad"]).T
-    spline = CubicSpline(distance**2, weight, bc_type=((2, 0), (1, 0)))  # pyright: ignore[reportArgumentType]
-
-    def square(t):
-        return (t - press[axis]) ** 2 + (curve(t) - press[1 - axis]) ** 2
-
-    def density(t):
-        run = 1 + abs(slope(t)) if length == "manhattan" else np.hypot(1, slope(t))
-        return spline(square(t)) * run if square(t) < distance[-1] ** 2 else 0.0
-
-    total = 0.0
-    for begin, end in pairwise(knots[:, axis]):
-        at = np.linspace(begin, end, 1500)
-        ends = {begin, end}
-        for d in distance[1:]:
-            sign = np.sign(square(at) - d**2)
-            turns = np.flatnonzero(np.diff(sign))
-            ends |= {brentq(lambda t, d=d: square(t) - d**2, at[i], at[i + 1], xtol=1e-15) for i in turns}
-        total += sum(quad(density, *piece, epsabs=1e-13, epsrel=1e-12)[0] for piece in pairwise(sorted(ends)))
-    return total
-
-
 @pytest.mark.parametrize("length", ["manhattan", "euclidean"])
 def test_profile_signals_match_the_oracle(length):
     for knots in (0, 5):
@@ -79,9 +47,7 @@ def test_profile_signals_match_the_oracle(length):
         pad, contact = Morphology.random(1, knots, rng), contact_of(PROFILES["broad"], length)
         presses = rng.uniform(0, 2, (2, 2))
         found = signals(pad, presses, contact)
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            expected = [[measured_oracle(pad, press, length, fibre) for fibre in range(2)] for press in presses]
+        expected = [[dense_oracle(pad, press, contact, fibre) for fibre in range(2)] for press in presses]
         np.testing.assert_allclose(found, expected, rtol=0, atol=1e-9)
         np.testing.assert_array_equal(signals_sparse(pad, presses, contact).toarray(), found)
         sampled = signals_quantized(pad, presses, contact, samples=200_001)

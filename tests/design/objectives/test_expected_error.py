@@ -132,23 +132,6 @@ def test_aggregate_failures_is_a_weighted_geometric_mean():
     assert aggregate_failures(given[:1], kept[:1], even)[0] == pytest.approx(0.1)
 
 
-def test_bound_matches_explicit_covariances():
-    """An oracle that builds every covariance and inverts it."""
-    scatter, signals = Scatter(0.02, 0.3, 0.4), random_responses(5)
-    grid = signals.T.reshape(SIDE, SIDE, 5)
-    found = []
-    for i in range(SIDE - 1):
-        for j in range(SIDE - 1):
-            a, b, c, d = grid[i, j], grid[i, j + 1], grid[i + 1, j], grid[i + 1, j + 1]
-            rates = np.stack([(b + d - a - c) / (2 * STEPS[0]), (c + d - a - b) / (2 * STEPS[1])], axis=1)
-            x = (a + b + c + d) / 4
-            own = np.diag(scatter.floor**2 + scatter.share**2 * (1 - scatter.common) * x**2)
-            covariance = own + scatter.share**2 * scatter.common * np.outer(x, x)
-            information = rates.T @ np.linalg.inv(covariance) @ rates + np.diag(12 / SIZE**2)
-            found.append(np.sqrt(np.trace(np.linalg.inv(information))))
-    assert bound(signals, scatter) == pytest.approx(np.mean(found), rel=1e-5)
-
-
 def test_expected_error_without_signals_is_that_of_the_prior():
     silent = np.zeros((2, SIDE**2))
     assert bound(silent, Scatter(0.1)) == pytest.approx(np.sqrt(2 * 16 / 12))
@@ -233,24 +216,6 @@ def test_kernel_weights_scale_fibres_of_a_strip():
     full_scale = stretch.max(axis=0) / straight_full_scale(size.layout, profile, "beyond")
     assert (weights * full_scale)[[0, 2, 3, 8, 14]] == pytest.approx(np.ones(5), rel=0.05)
     assert kernel_weights(PadSettings(grid=4).layout) == pytest.approx(np.ones(8))
-
-
-def test_bound_of_one_informative_direction_keeps_the_prior_of_the_other():
-    along = np.stack([PLACES[:, 0], 2 * PLACES[:, 0]])
-    assert bound(along, Scatter(1e-9)) == pytest.approx(SIZE[1] / np.sqrt(12), rel=1e-3)
-
-
-@pytest.mark.parametrize("floor", [1e-4, 1.0])
-def test_bound_in_single_precision_holds_under_faint_noise(floor):
-    """Fibres that all answer to one oblique direction: the prior remains across it, whatever is known along it."""
-    way = np.array([0.6, 0.8])
-    along = (2 * np.arange(1, 4)[:, None] * (PLACES @ way)).astype(np.float32)
-    precision = np.outer(way, way) * 4 * 14 / floor**2 + np.diag(12 / SIZE**2)
-    expected = np.sqrt(np.trace(np.linalg.inv(precision)))
-    found = errors(along, [[1.0] * 3, [0.0] * 3], Scatter(floor))
-    learning = [REGRESSION_WEIGHT * leave_one_out_error(works * along.astype(float)) for works in (1.0, 0.0)]
-    assert found[0] == pytest.approx(BOUND_WEIGHT * expected + learning[0], rel=0.01)
-    assert found[1] == pytest.approx(BOUND_WEIGHT * np.sqrt(2 * SIZE[0] ** 2 / 12) + learning[1], rel=1e-4)
 
 
 def test_bound_in_single_precision_does_not_overflow_under_faint_noise():

@@ -37,26 +37,6 @@ def test_rules_settings_write_no_limit_as_any(key, refused):
         Spec({"rules": {key: refused}}).section(RulesSettings)
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_min_gap_fold_matches_scipy_curve(seed):
-    """Against points of SciPy's curve, 0.02 mm apart: none lies nearer, and some almost as near."""
-    pad = Morphology.random(1, 6, seed)
-    found = check_rules(pad, only(min_gap_mm=2.0))
-    assert found
-    for v in found:
-        fibre = v.fibres[0] - 1
-        t, cross = pad.knots[fibre, :, fibre], pad.knots[fibre, :, 1 - fibre]
-        fine = np.unique(np.concatenate([np.linspace(0, 2, 200_000), t]))
-        curve = 11.25 * np.column_stack([fine, PchipInterpolator(t, cross)(fine)])
-        arc = np.append(0, np.linalg.norm(np.diff(curve, axis=0), axis=1).cumsum())
-        at = np.arange(0, arc[-1], 0.02)
-        points = np.column_stack([np.interp(at, arc, axis) for axis in curve.T])
-        first, second = KDTree(points).query_pairs(v.measured + 0.1, output_type="ndarray").T
-        apart = at[second] >= at[first] + np.pi
-        least = np.linalg.norm(points[first] - points[second], axis=1)[apart].min(initial=np.inf)
-        assert v.measured - 2e-3 <= least <= v.measured + 0.025
-
-
 def test_violation_reads_as_one_line():
     (close,) = check_rules(bent(1.95), only(min_gap_mm=0.8))
     assert str(close).startswith("min_gap_mm: fibre 1 and fibre 2 at (0.0, -5.9) mm: 0.56")

@@ -32,7 +32,7 @@ def test_genetic_search_objective_never_rises_and_is_that_of_its_best_pad():
 @pytest.mark.parametrize(
     "asked",
     [
-        *({"weights": (2.0, 1e-6, 0.0)}, {"presses": 12}, {"levels": 16}, {"weights": (0.5, 0.0, 1e-5), "presses": 3}),
+        *({"levels": 16}, {"weights": (0.5, 0.0, 1e-5), "presses": 3}),
         {"entropy": "joint"},
     ],
 )
@@ -42,24 +42,6 @@ def test_genetic_search_minimises_the_objective_of_its_settings(asked):
     others = {name: asked[name] for name in asked if name != "presses"}
     assert published_terms(breeding.morphology(), CONTACT, presses, **others)[0].objective == objectives[-1]
     assert published_objective(breeding.morphology(), CONTACT) != objectives[-1]
-
-
-@pytest.mark.parametrize("broken_at", [0, 1, 4])
-def test_genetic_search_resumes_bit_for_bit(broken_at, tmp_path):
-    unbroken, objectives = bred(4)
-    broken = bred(broken_at)[0]
-    state = broken.state()
-    np.savez(tmp_path / "state.npz", allow_pickle=False, **state)
-    broken.advance()
-    with np.load(tmp_path / "state.npz", allow_pickle=False) as saved:
-        assert all(np.array_equal(saved[name], state[name]) for name in state)  # what follows does not touch it
-        resumed, further = bred(4 - broken_at, state=saved)
-    assert (resumed.step, further) == (4, objectives[broken_at:])
-    assert resumed.morphology() == unbroken.morphology()
-    first, second = unbroken.state(), resumed.state()
-    assert first.keys() == second.keys()
-    for name in first:
-        np.testing.assert_array_equal(first[name], second[name], strict=True)
 
 
 def test_genetic_search_keeps_or_improves_its_origin():

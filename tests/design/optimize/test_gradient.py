@@ -16,9 +16,7 @@ from padforge.design.objectives.rules import check_rules
 from padforge.design.objectives.score import score
 from padforge.design.optimize.gradient import (
     FINE_STEPS,
-    GENTLE,
     REPAIR_STEPS,
-    STRICT,
     Adam,
     GradientSearch,
     Parametrization,
@@ -88,20 +86,6 @@ def test_arc_lengths_match_lengths():
     pad = Morphology.random((2, 3), 5, seed=1, pitch_mm=(8.0, 15.0))
     travel, cross, ends, _ = fibre_axes(pad)
     assert FibreCurves(travel[0], cross[0], ends, pad.unit_mm).lengths()[0] == pytest.approx(lengths(pad), rel=1e-3)
-
-
-def test_arc_length_gradients_match_differences():
-    travel, cross, ends, _ = fibre_axes(Morphology.random((2, 3), 5, seed=1))
-    knots, rng = np.array([travel[0], cross[0]]), np.random.default_rng(2)
-    move, weights = rng.standard_normal(knots.shape), rng.standard_normal(5)
-
-    def curves(step):
-        along, across = knots + step * move
-        return FibreCurves(along, across, ends, 11.25)
-
-    gradient = curves(0.0).by_knots(np.einsum("f,dfn->dfn", weights, curves(0.0).lengths()[1]))
-    ahead, behind = (weights @ curves(step).lengths()[0] for step in (1e-6, -1e-6))
-    assert (gradient * move).sum() == pytest.approx((ahead - behind) / 2e-6, rel=1e-6)
 
 
 @settings(max_examples=20)
@@ -224,23 +208,6 @@ def test_gradient_search_beats_straight_fibres_within_the_rules():
     assert pad["ambiguity_mm_1"] < 0.5 * grid["ambiguity_mm_1"]
 
 
-@pytest.mark.parametrize(("start", "ends"), [(0, GENTLE.penalty_weights), (3, STRICT.penalty_weights)])
-def test_broken_rules_count_the_more_the_longer_the_search_goes_on(monkeypatch, start, ends):
-    """By equal factors from the first weight to the last."""
-    weights = []
-
-    class Gradient:
-        """Notes by what it is multiplied."""
-
-        def __rmul__(self, weight):
-            weights.append(weight)
-            return 0.0
-
-    monkeypatch.setattr(GradientSearch, "_penalty_gradient", lambda *_, **__: Gradient())
-    advance(begun(SearchSettings(knots=2, steps=4, starts=1, max_failures=0), RulesSettings(), start), 4)
-    assert weights == pytest.approx(np.geomspace(ends[0], ends[1], 4))
-
-
 def test_common_tracks_count_at_the_end_of_a_search(monkeypatch):
     """Before, crossings may move along; the other rules count from the first step."""
     seen = []
@@ -275,16 +242,6 @@ def test_repair_moves_only_fibres_that_break_rules_and_goes_on_from_its_state():
     moved = np.abs(run.morphology().knots - knots).max(axis=(1, 2))
     assert moved[0] > 0.01
     assert moved[1:].max() < 1e-9
-
-
-def test_fine_steps_leave_what_has_no_finite_gradient(monkeypatch):
-    """As those of the search do: one value that is none must not lose a pad."""
-    run = begun(SearchSettings(knots=5, steps=1, starts=1), RulesSettings(min_mean_bend_radius_mm=4.0))
-    run.finish()
-    before, gradient = run.morphology().knots, np.full((2, *run.fibres.axes()[0].shape), np.nan)
-    monkeypatch.setattr(GradientSearch, "_penalty_gradient", lambda *_: gradient)
-    advance(run, 2)
-    np.testing.assert_array_equal(run.morphology().knots, before)
 
 
 def test_what_fine_steps_do_not_repair_firm_ones_do():

@@ -107,7 +107,6 @@ def test_search_prefers_a_pad_within_the_rules_to_one_that_errs_less(monkeypatch
     ("rules", "broken"),
     [
         ({"min_gap_mm": 30.0, "max_crossings": 3, "border_mm": 500.0}, {"min_gap_mm", "max_crossings", "border_mm"}),
-        ({"min_mean_bend_radius_mm": 900.0, "min_gap_mm": 11.2, "border_mm": 12.0}, {"border_mm"}),
         ({"max_length_mm": 20.0}, {"max_length_mm"}),
     ],
 )
@@ -125,12 +124,6 @@ def test_search_reports_rules_that_cannot_hold(rules, broken, monkeypatch):
     [
         ({"knots": 1, "max_failures": 8, "noise": 1e-9, "sharpness": 1e6}, {"min_gap_mm": 1000.0}, 0.1),
         ({"knots": 64, "max_failures": (1e-300, 1e6), "noise": 10.0}, {"min_mean_bend_radius_mm": 1000.0}, 1000.0),
-        (
-            {"method": "genetic", "population": 4, "max_failures": (5e-324,), "seed": 2**32 - 1},
-            {"border_mm": 1000.0},
-            5.0,
-        ),
-        ({"knots": 2, "max_failures": (0.0, 1.0), "starts": 3}, {"max_length_mm": 1e-300}, 11.25),
     ],
 )
 def test_search_with_extreme_settings_has_finite_terms(settings, rules, pitch_mm, monkeypatch):
@@ -143,7 +136,7 @@ def test_search_with_extreme_settings_has_finite_terms(settings, rules, pitch_mm
 
 @pytest.mark.parametrize(
     ("method", "counts"),
-    [("descent", (3, 0)), ("genetic", (0, 1)), pytest.param("descent", (0, 1), marks=pytest.mark.slow)],
+    [("descent", (3, 0)), ("genetic", (0, 1))],
 )
 def test_search_score_and_evaluation_of_pads_of_one_family(method, counts, monkeypatch):
     monkeypatch.setattr(REPAIR, 20)

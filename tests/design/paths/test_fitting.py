@@ -11,7 +11,7 @@ from padforge.design.paths.curves import SPARE_LENGTH, add_spare_knots, remove_s
 from padforge.design.paths.import_plan import fit_knots
 
 
-def off(knots, points):
+def max_misfit(knots, points):
     """Greatest distance along the normal, by scipy's curve."""
     curve = PchipInterpolator(*knots.T)
     slope = np.gradient(points[:, 1], points[:, 0])
@@ -21,30 +21,28 @@ def off(knots, points):
 def test_fit_knots_needs_few_knots():
     points = np.stack([np.linspace(-20, 20, 50), np.full(50, 3.0)], axis=1)
     assert np.array_equal(fit_knots(points, 0.05), points[[0, -1]])
-    assert len(fit_knots(points[[0, -1]], 0.05)) == 2
-    x = np.linspace(-28, 28, 1500)
+    x = np.linspace(-14, 14, 700)
     points = np.stack([x, 4 * np.sin(x / 3)], axis=1)
-    found = fit_knots(points, 0.05)
-    assert off(found, points) < 0.06
-    assert len(found) < 40
-    assert len(fit_knots(points, 0.5)) < len(found)
-    assert len(fit_knots(points, 1e-6, max_inner=12)) == 14
-    assert (np.diff(found[:, 0]) > 0).all()
-    assert np.array_equal(found[[0, -1]], points[[0, -1]])
-    found = fit_knots(np.array([[0.0, 0], [10, 0], [10.001, 5], [20, 5]]), 0.05)
-    assert np.isfinite(found).all()
-    assert np.ptp(found[:, 1]) >= 4.9
+    knots = fit_knots(points, 0.05)
+    assert max_misfit(knots, points) < 0.06
+    assert len(fit_knots(points, 0.5)) < len(knots) < 15
+    assert len(fit_knots(points, 1e-6, max_inner=4)) == 6
+    assert (np.diff(knots[:, 0]) > 0).all()
+    assert np.array_equal(knots[[0, -1]], points[[0, -1]])
+    steep = fit_knots(np.array([[0.0, 0], [10, 0], [10.001, 5], [20, 5]]), 0.05)
+    assert np.isfinite(steep).all()
+    assert np.ptp(steep[:, 1]) >= 4.9
 
 
-@given(st.lists(st.floats(-8, 8), min_size=1, max_size=8))
-@settings(max_examples=4)
+@given(st.lists(st.floats(-8, 8), min_size=1, max_size=5))
+@settings(max_examples=3)
 def test_fit_knots_recovers_pchip_curves(heights):
     t = np.linspace(-28, 28, len(heights) + 2)
     knots = np.stack([t, [1.0, *heights, 1.0]], axis=1)
     x = np.linspace(-28, 28, 1500)
     points = np.stack([x, PchipInterpolator(*knots.T)(x)], axis=1)
     found = fit_knots(points, 0.05)
-    assert off(found, points) < 0.06
+    assert max_misfit(found, points) < 0.06
     assert len(found) <= len(knots) + 4
 
 

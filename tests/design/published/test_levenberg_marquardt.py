@@ -14,7 +14,7 @@ from padforge.design.published.levenberg_marquardt import (
     gauss_newton_matrix,
     jacobian_product,
 )
-from padforge.design.published.networks import Network, RangeScaler, fit_batch, initial_weights
+from padforge.design.published.networks import fit_batch, initial_weights
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -149,24 +149,6 @@ def test_initial_weights_follow_nguyen_and_widrow(varying, hidden):
     assert 0 < (weights[:, -1] * np.linspace(-1, 1, hidden) < 0).sum() < hidden
     assert (weights[:, 0] > 0).any()
     assert (weights[:, 0] < 0).any()
-
-
-def test_range_scaler_maps_to_minus_one_to_one_and_back():
-    values = np.array([[1.0, 5.0, -2.0], [3.0, 5.0, 2.0], [2.0, 5.0, 4.0]])
-    scale = RangeScaler.fit(values)
-    np.testing.assert_allclose(scale.transform(values), [[-1, 0, -1], [1, 0, 1 / 3], [0, 0, 1]])
-    np.testing.assert_allclose(scale.inverse_transform(scale.transform(values)), values)
-    np.testing.assert_allclose(scale.inverse_transform(np.array([[0.5, 9.0, -2.0]])), [[2.5, 5.0, -5.0]])
-
-
-def test_network_evaluates_its_formula():
-    rng = np.random.default_rng(1)
-    inputs, targets = (RangeScaler(rng.normal(size=n), rng.uniform(1, 2, n)) for n in (3, 2))
-    hidden, output = rng.normal(size=(4, 4)), rng.normal(size=(2, 5))
-    x = rng.normal(size=(6, 3))
-    neurons = np.tanh((x - inputs.middle) / inputs.half @ hidden[:, :3].T + hidden[:, 3])
-    expected = targets.middle + targets.half * (neurons @ output[:, :4].T + output[:, 4])
-    np.testing.assert_allclose(Network(hidden, output, inputs, targets, 1)(x), expected)
 
 
 def test_networks_bench_errs_as_plain_numpy(monkeypatch, taken):
