@@ -201,10 +201,10 @@ def _flatten_shape(shape: Any) -> Iterator[tuple[Array, bool]]:
     from ezdxf.path import Path as BezierPath
     from svgelements import Close, CubicBezier, Move, Path, QuadraticBezier
 
-    whole = abs(Path(shape))
+    whole: Any = abs(Path(shape))
     whole.approximate_arcs_with_cubics()
     for part in whole.as_subpaths():
-        segments = [segment for segment in part if not isinstance(segment, Move)]
+        segments: list[Any] = [segment for segment in part if not isinstance(segment, Move)]
         if not segments:
             continue
         path = BezierPath(tuple(part[0].end))
