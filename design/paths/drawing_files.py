@@ -209,12 +209,13 @@ def _flatten_shape(shape: Any) -> Iterator[tuple[Array, bool]]:
             continue
         path = BezierPath(tuple(part[0].end))
         for segment in segments:
+            end = segment.end
             if isinstance(segment, CubicBezier):
-                path.curve4_to(tuple(segment.end), tuple(segment.control1), tuple(segment.control2))
+                path.curve4_to(tuple(end), tuple(segment.control1), tuple(segment.control2))
             elif isinstance(segment, QuadraticBezier):
-                path.curve3_to(tuple(segment.end), tuple(segment.control))
-            elif segment.end is not None:
-                path.line_to(tuple(segment.end))
+                path.curve3_to(tuple(end), tuple(segment.control))
+            elif end is not None:
+                path.line_to(tuple(end))
         yield _flatten(path), isinstance(segments[-1], Close)
 
 

@@ -208,11 +208,12 @@ def test_import_command_writes_morphology_and_reports_rules(tmp_path: Path, monk
     monkeypatch.chdir(tmp_path)
     stated = "[pad]\nhorizontals = 2\nverticals = 3\npitch_mm = [10, 12]\n[rules]\nmin_mean_bend_radius_mm = 0\n"
     Path("pad.toml").write_text(stated)
-    svg(tmp_path, paths(*(way.replace("20 -6", "20 -6.03") for way in WAYS)))
+    ways = ("M -20 -6 L 20 -6.03", "M -20 6 L 20 6", *(f"M {x} -18 L {x} 18" for x in (-10, 0, 10)))
+    svg(tmp_path, paths(*ways))
     result = CliRunner().invoke(design, ["import", "plan.svg"], catch_exceptions=False)
     lines = result.output.splitlines()
     assert (result.exit_code, lines[-1]) == (0, "  all rules hold")
-    assert re.fullmatch(r"  fibre 1: w1, within 0\.0\d+ mm", lines[2])
+    assert re.fullmatch(r"  fibre 1: w1, within 0\.000 mm", lines[2])
     assert re.fullmatch(r"  fibre 2: w0, within 0\.0\d+ mm, ends moved by 0\.030 mm", lines[3])
     pad = Morphology.load(tmp_path / "out/plan/morphology.json")
     assert pad.provenance["command"] == "padforge design import"
