@@ -14,10 +14,8 @@ from typing import Any
 import numpy as np
 
 from padforge.design.common.progress import OnProgress, ignore_progress
-from padforge.design.common.validation import InputError
 from padforge.sense.arrays import Array, Mask
 from padforge.sense.localizer.features import NOW
-from padforge.sense.localizer.model_files import check_arrays
 from padforge.sense.localizer.response_model import grid_positions, interpolate_grid
 
 COMPONENTS = 6  # discriminant directions of a fibre: those in which positions differ most for their scatter
@@ -36,7 +34,6 @@ MIN_STD = 1e-2  # smallest standard deviation on the grid, a tenth of a cell
 N_SUMMARY = 9
 """Numbers of a posterior summary: position, log variances, mean on the grid, its log variances, and correlation."""
 MIN_EXPONENT = -60.0  # smaller exponents count for nothing, and their exponential takes ten times as long
-MAX_COEFFICIENT = 1e12
 PREFIX = "bayes."  # of the names of the arrays in files
 _CHUNK = 2**15
 
@@ -161,22 +158,9 @@ class BayesianLocalizer:
         return {prefix + each.name: getattr(self, each.name).astype(np.float32) for each in fields(self)}
 
     @classmethod
-    def from_arrays(cls, arrays: Mapping[str, Any], number: int, fibres: int, n_features: int) -> "BayesianLocalizer":
-        """Read what `to_arrays` returned, and check shapes and values; KeyError if an array is missing."""
-        bayes = cls(**{each.name: arrays[f"{PREFIX}{number}.{each.name}"].astype(np.float64) for each in fields(cls)})
-        n_grid, side = (len(part) if part.ndim else 0 for part in (bayes.grid, bayes.linearization))
-        shapes = {
-            "projection": (fibres, n_features, COMPONENTS),
-            "grid": (max(n_grid, 1), 2),
-            "log_likelihood_coefficients": (fibres * (COMPONENTS * (COMPONENTS + 3) // 2 + 1), n_grid),
-            "linearization": (max(side, 2), side, fibres * 3 * (COMPONENTS + 1)),
-            **{"bounds": (2, 2), "rotation": (2, 2), "shift": (2,)},
-        }
-        check_arrays(vars(bayes), {name: (shape, np.float64) for name, shape in shapes.items()}, MAX_COEFFICIENT)
-        fisher = bayes.linearization[:, :, 3 * fibres * COMPONENTS :].reshape(side, side, fibres, 3)[..., :2]
-        if fisher.min() < 0:
-            raise InputError(f"linearization has a Fisher information of {fisher.min():g}, expected 0 or more")
-        return bayes
+    def from_arrays(cls, arrays: Mapping[str, Any], number: int) -> "BayesianLocalizer":
+        """Read what `to_arrays` returned."""
+        return cls(**{each.name: arrays[f"{PREFIX}{number}.{each.name}"].astype(np.float64) for each in fields(cls)})
 
 
 def fit_stages(
