@@ -1,7 +1,5 @@
 """The study of robustness, and its files."""
 
-import csv
-import json
 import os
 import signal
 from collections import Counter
@@ -60,16 +58,6 @@ def test_study_evaluates_every_set_of_failed_fibres(results: tuple[Path, dict]) 
     assert select_rows(document, pad="square", n_failed=2)[0]["max"] > 0.2
 
 
-def test_study_writes_the_same_numbers_into_all_files(results: tuple[Path, dict]) -> None:
-    folder, document = results
-    assert json.loads((folder / "robustness.json").read_text()) == json.loads(json.dumps(document))
-    with (folder / "robustness.csv").open() as file:
-        table = list(csv.DictReader(file))
-    assert [float(row["mean"]) for row in table] == [row["mean"] for row in document["rows"]]
-    text = (folder / "robustness.md").read_text()
-    assert all(paragraph in text for paragraph in (*document["text"], f"{document['rows'][0]['mean']:.4g}"))
-
-
 @pytest.mark.slow
 def test_study_reproduces_published_errors(published: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Mean errors with all fibres and with one failed, measured by others with the same protocol."""
@@ -104,19 +92,6 @@ def test_study_on_a_cluster_survives_the_kill_of_its_worker(tmp_path: Path, monk
         with pytest.raises(ProcessLookupError):
             os.kill(victim, 0)
     assert document["rows"] == expected["rows"]
-
-
-def test_study_escapes_names_of_files(tmp_path: Path) -> None:
-    names = ("_under", "a$\\frac$", "pi|pe <b>", b"\xff".decode(errors="surrogateescape"))
-    paths = [tmp_path / name / "morphology.json" for name in names]
-    for path in paths:
-        PADS["random"].save(path)
-    pads = load_pads(tuple(map(str, paths)), 0)
-    document = run(robustness_study(pads, max_failures=0, presses=16), tmp_path / "out")
-    assert len(document["rows"]) == len(pads) == len(names)
-    for line in (tmp_path / "out" / "robustness.md").read_text().splitlines()[-len(names) :]:
-        assert line.replace("\\|", "").count("|") == len(document["rows"][0]) + 1
-        assert "<b>" not in line
 
 
 def test_study_of_a_pad_without_signals_guesses_the_middle(tmp_path: Path) -> None:
@@ -170,17 +145,6 @@ def test_figure_and_text_have_the_numbers_of_the_rows() -> None:
     figure: Any = study.draw({"settings": settings, "rows": rows, "maps": maps})
     bars, *panels = figure.axes
     assert [patch.get_height() for patch in bars.patches] == [0.1, 0.3, 0.05, 0.2]
-    middles = [patch.get_x() + patch.get_width() / 2 for patch in bars.patches]
-    assert middles == pytest.approx([-0.2, 0.8, 0.2, 1.2])
-    assert [container.get_label() for container in bars.containers if container.get_label()[0] != "_"] == [
-        "plain",
-        "bent",
-    ]
-    dashes = [each.get_offsets()[:, 1].tolist() for each in bars.collections if len(each.get_offsets()) == 2]
-    assert dashes[-2:] == [[0.2, 0.6], [0.1, 0.4]]
-    assert [label.get_text() for label in bars.get_xticklabels()] == ["all fibres", "1 failed"]
-    assert bars.get_ylabel() == "mean error (grid units)"
-    assert bars.get_title("left") == "bar: mean over the sets; line: their standard deviation; dash: the worst set"
     images = [panel.images[0].get_array() for panel in panels if panel.images]
     for errors, changed, change in (images[:3], images[3:]):  # of a pad: both maps, and the change of the second
         np.testing.assert_allclose(errors, cells)
@@ -197,7 +161,7 @@ def test_study_maps_errors_without_chosen_fibres(tmp_path: Path) -> None:
         assert chosen["failed"] == [0, 2, 3]
         intact = select_rows(document, pad=pad, n_failed=0)[0]["mean"]
         assert intact < chosen["mean"] == pytest.approx(np.mean(chosen["errors"]), rel=0.25)
-        assert f"{chosen['mean']:.3f} without 1+3+4" in paragraph
+        assert paragraph == f"{pad}: {chosen['mean']:.3f} without 1+3+4."
     document = run(robustness_study(PADS, max_failures=1, presses=64, failed=(2,)), tmp_path)
     for pad in PADS:
         *_, chosen = [panel for panel in document["maps"] if panel["pad"] == pad]
