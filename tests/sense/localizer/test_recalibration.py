@@ -123,7 +123,8 @@ def test_recalibrate_follows_a_remade_pad(localizer: LocalizerModel, recording: 
 def test_recalibrate_keeps_an_unchanged_pad(
     localizer: LocalizerModel, recording: Recording, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("padforge.sense.localizer.recalibration.SUBSETS", 2)
+    monkeypatch.setattr("padforge.sense.localizer.recalibration.SUBSETS", 1)
+    monkeypatch.setattr("padforge.sense.localizer.recalibration.FOLDS", 2)
     now, result = recalibrate(localizer, known_only(recording, NEW))
     assert "corrected" not in result.changes
     # adapting is kept unless new presses speak against it by a standard error

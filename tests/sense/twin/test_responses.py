@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from padforge.design import Morphology
+from padforge.design import Contact, Morphology
 from padforge.sense import RigSettings, simulate
 from padforge.sense.twin.responses import Responses, compute_responses, fit_gp, select_one_depth
 
@@ -21,7 +21,9 @@ def test_response_is_the_held_level_minus_the_rest() -> None:
 
 
 def test_select_one_depth_keeps_the_most_common_and_all_of_unknown_depth() -> None:
-    recording = simulate(Morphology.straight(2), RigSettings(presses=9, depths_mm=(0.5, 3.0, 5.0)))
+    recording = simulate(
+        Morphology.straight(2), RigSettings(presses=9, depths_mm=(0.5, 3.0, 5.0)), Contact(model="profile")
+    )
     selected = select_one_depth(recording)
     assert selected.presses_mm[selected.has_position].tolist() == recording.presses_mm[2::3].tolist()
     unknown = replace(recording, depths_mm=np.full(9, np.nan))
