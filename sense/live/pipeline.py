@@ -18,14 +18,9 @@ from padforge.sense.health.fault_detector import FaultMonitor, FibreFault
 from padforge.sense.health.health_model import HealthModel
 from padforge.sense.health.trace_model import RELEASED
 from padforge.sense.localizer.features import (
-    DOWN,
     MEDIAN,
     MEDIAN_OFFSET,
-    MODULATED,
-    REST,
-    UP,
     PressFeatures,
-    complete_windows,
     compute_features,
     compute_history,
     interpolate_gaps,
@@ -35,6 +30,7 @@ from padforge.sense.localizer.features import (
 )
 from padforge.sense.localizer.model import MEASURE_COLUMNS, LocalizerModel
 from padforge.sense.localizer.model_files import check_same_pad
+from padforge.sense.localizer.moments import DOWN, MODULATED, REST, UP, complete_windows
 from padforge.sense.localizer.scaler import ScaledFeatures
 from padforge.sense.rig.streams import HISTORY, SLACK, RingBuffer
 from padforge.sense.signals.press_detection import RELEASE_DELAY_S, TOUCH_DELAY_S, PressDetector

@@ -6,7 +6,6 @@ From there a few Gauss-Newton steps lead to the maximum a posteriori position, t
 (the steps of an iterated Kalman filter: M. S. Grewal and A. P. Andrews, Kalman filtering, 2015).
 """
 
-from bisect import bisect_right
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, replace
 from typing import Any
@@ -15,13 +14,10 @@ import numpy as np
 
 from padforge.design.common.progress import OnProgress, ignore_progress
 from padforge.sense.arrays import Array, Mask
-from padforge.sense.localizer.features import NOW
+from padforge.sense.localizer.moments import NOW, STAGES
 from padforge.sense.localizer.response_model import grid_positions, interpolate_grid
 
 COMPONENTS = 6  # discriminant directions of a fibre: those in which positions differ most for their scatter
-STAGES = (12, 13, 14, 15, 17)
-"""Numbers of complete windows of a press from which on a localizer of its own answers, the first one after the release
-has shown: before, it errs a third more than a network."""
 LINEARIZED, COARSENING = 2, 3
 """Cells of the response table along a side of a cell of the linearization, and of the posterior's grid."""
 SCATTER_WIDTH, SCATTER_PRIOR_COUNT = 4.0, 10.0
@@ -183,13 +179,6 @@ def fit_stages(
         kept[:, :, :, unused] = 0
         stages.append(BayesianLocalizer.fit(kept, inputs, fibre_mask, positions))
     return tuple(stages)
-
-
-def stage_of(n_complete: int, n_timed: int) -> int | None:
-    """Return which of the localizers of `fit_stages` answers when so many of K windows are complete, if any."""
-    if not n_timed:
-        return 0
-    return bisect_right(STAGES, n_complete) - 1 if n_complete >= STAGES[0] else None
 
 
 def _fit_lda(expected: Array, residual: Array) -> Array:

@@ -18,16 +18,11 @@ from padforge.design.common.validation import InputError, check_type, short_repr
 from padforge.sense.arrays import MAX_RATE_HZ, MIN_RATE_HZ, Array, Floats, Mask
 from padforge.sense.formats.columns import join_names
 from padforge.sense.localizer.bayes import PREFIX as BAYES
-from padforge.sense.localizer.bayes import STAGES, BayesianLocalizer
-from padforge.sense.localizer.features import (
-    N_TIMED,
-    FeatureSet,
-    PressFeatures,
-    compute_features,
-)
+from padforge.sense.localizer.bayes import BayesianLocalizer
+from padforge.sense.localizer.features import FeatureSet, PressFeatures, compute_features
 from padforge.sense.localizer.model_files import check_same_pad, files_of
-from padforge.sense.localizer.moments import FOLLOWING, N_DOWN, PHASES, count_complete
-from padforge.sense.localizer.network import RESIDUAL, Networks, Sliding, Weights, predict
+from padforge.sense.localizer.moments import FOLLOWING, N_DOWN, N_TIMED, PHASES, RESIDUAL, STAGES, count_complete
+from padforge.sense.localizer.network import Networks, Sliding, Weights, predict
 from padforge.sense.localizer.scaler import DOCUMENT_CONFIG, FeatureScaler, ScaledFeatures, array_field
 from padforge.sense.recording.recording import Recording
 from padforge.sense.settings import Method, Split

@@ -27,7 +27,8 @@ from padforge.sense.arrays import MAX_FIBRES, Array, Indices
 from padforge.sense.localizer.calibration import split_presses
 from padforge.sense.localizer.evaluation import ACTIVE, distances
 from padforge.sense.localizer.evaluation import idle_share as recorded_idle_share
-from padforge.sense.localizer.features import N_TIMED, compute_features, interpolate_gaps
+from padforge.sense.localizer.features import compute_features, interpolate_gaps
+from padforge.sense.localizer.moments import N_TIMED
 from padforge.sense.recording.recording import Recording
 from padforge.sense.settings import RigSettings
 from padforge.sense.signals.filters import running_median, total_variation

@@ -11,7 +11,8 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from padforge.sense.arrays import Array, Indices, Mask
-from padforge.sense.localizer.features import DOWN, compute_features
+from padforge.sense.localizer.features import compute_features
+from padforge.sense.localizer.moments import DOWN
 from padforge.sense.localizer.response_model import ResponseModel, remove_history
 from padforge.sense.recording.recording import Recording
 

@@ -12,12 +12,11 @@ from padforge.sense.localizer.bayes import (
     COARSENING,
     N_SUMMARY,
     PRIOR_WEIGHT,
-    STAGES,
     BayesianLocalizer,
     fit_stages,
-    stage_of,
 )
-from padforge.sense.localizer.features import N_FEATURES, N_TIMED, NOW
+from padforge.sense.localizer.features import N_FEATURES
+from padforge.sense.localizer.moments import N_TIMED, NOW, STAGES, stage_of
 
 SIDE, FIBRES, WINDOWS, PRESSES, NOISE = 61, 4, 3, 2500, 0.05
 Response = Callable[[np.ndarray], np.ndarray]

@@ -20,9 +20,9 @@ from padforge.sense.health.fault_detector import FibreFault, mask_faults
 from padforge.sense.localizer import training
 from padforge.sense.localizer.calibration import calibrate_uncertainty, known_measures, split_presses, unlearnt_lines
 from padforge.sense.localizer.evaluation import calibration_lines, distances
-from padforge.sense.localizer.features import DOWN, N_TIMED, compute_features
+from padforge.sense.localizer.features import compute_features
 from padforge.sense.localizer.model import LocalizerModel
-from padforge.sense.localizer.moments import N_DOWN, complete_at
+from padforge.sense.localizer.moments import DOWN, N_DOWN, N_TIMED, complete_at
 from padforge.sense.localizer.network import predict_members
 from padforge.sense.settings import LocalizerSettings
 from padforge.sense.settings import LocalizerSettings as Options

@@ -7,16 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from padforge.sense.localizer.features import (
-    DOWN,
-    N_HISTORY,
-    N_TIMED,
-    NOW,
-    UP,
-    PressFeatures,
-    compute_features,
-    interpolate_gaps,
-)
+from padforge.sense.localizer.features import N_HISTORY, PressFeatures, compute_features, interpolate_gaps
+from padforge.sense.localizer.moments import DOWN, N_TIMED, NOW, UP
 from padforge.sense.localizer.scaler import MAX_INPUT, FeatureScaler
 
 PRESSES, FIBRES, WINDOWS = 5, 3, 4

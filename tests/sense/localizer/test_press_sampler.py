@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from padforge.sense.localizer import press_sampler
-from padforge.sense.localizer.features import DOWN, N_FEATURES, N_TIMED, NOW
-from padforge.sense.localizer.moments import N_DOWN, PHASES, Phase
+from padforge.sense.localizer.features import N_FEATURES
+from padforge.sense.localizer.moments import DOWN, N_DOWN, N_TIMED, NOW, PHASES, Phase
 from padforge.sense.localizer.press_sampler import PressSampler
 from padforge.sense.localizer.response_model import grid_positions, interpolate_grid
 from padforge.sense.localizer.scaler import FeatureScaler, TrainingPresses

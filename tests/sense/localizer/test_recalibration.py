@@ -13,9 +13,8 @@ from padforge.design.common.validation import InputError
 from padforge.sense import Recording, evaluate
 from padforge.sense.localizer import training
 from padforge.sense.localizer.evaluation import distances
-from padforge.sense.localizer.features import N_TIMED
 from padforge.sense.localizer.model import Localization, LocalizerModel
-from padforge.sense.localizer.moments import PHASES
+from padforge.sense.localizer.moments import N_TIMED, PHASES
 from padforge.sense.localizer.recalibration import (
     CrossValidation,
     Recalibration,

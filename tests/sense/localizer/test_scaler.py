@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from padforge.sense import Recording
-from padforge.sense.localizer.features import DOWN, NOW
 from padforge.sense.localizer.model import LocalizerModel
+from padforge.sense.localizer.moments import DOWN, NOW
 from padforge.sense.localizer.scaler import TargetScaler
 
 
