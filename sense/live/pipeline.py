@@ -12,8 +12,8 @@ from typing import Any, Literal
 
 import numpy as np
 
-from padforge.design.common.validation import InputError, check_float, check_int, check_type
-from padforge.sense.arrays import MAX_FIBRES, MAX_RATE_HZ, MIN_RATE_HZ, Array, Mask, check_stream
+from padforge.design.common.validation import InputError
+from padforge.sense.arrays import Array, Mask, check_stream
 from padforge.sense.health.fault_detector import FaultMonitor, FibreFault
 from padforge.sense.health.health_model import HealthModel
 from padforge.sense.health.trace_model import RELEASED
@@ -165,9 +165,7 @@ class Live:
     """
 
     def __init__(self, localizer: LocalizerModel, health: HealthModel | None, fibres: int, rate_hz: float) -> None:
-        fibres = check_int("fibres", fibres, 1, MAX_FIBRES)
-        rate_hz = check_float("rate_hz", rate_hz, MIN_RATE_HZ, MAX_RATE_HZ)
-        check_same_pad(check_type("localizer", localizer, LocalizerModel), "the localizer", fibres, rate_hz)
+        check_same_pad(localizer, "the localizer", fibres, rate_hz)
         if localizer.features == "array":
             raise InputError("the localizer was fitted to arrays of features, expected one that was fitted to readings")
         self._monitor = None if health is None else FaultMonitor(health)

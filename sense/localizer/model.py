@@ -185,7 +185,6 @@ class LocalizerModel(LocalizerDocument):
         """
         if self.features == "array":
             raise InputError("the localizer was fitted to arrays of features, expected such arrays, not a recording")
-        check_type("recording", recording, Recording)
         self.check_recording(recording)
         commands = recording.down_command, recording.up_command
         end = None if until is None else np.asarray(until)
@@ -240,7 +239,6 @@ class LocalizerModel(LocalizerDocument):
         Raises:
             InputError: `failed` are no such fibres, or all; or some, and the method is "published".
         """
-        check_type("presses", presses, ScaledFeatures)
         fibre_mask: Mask = np.logical_and(presses.fibre_mask, self._working(failed))
         chunk = max(1, _CHUNK // self.fibres)
         parts = []

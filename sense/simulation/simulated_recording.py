@@ -16,7 +16,7 @@ from scipy.optimize import nnls
 
 from padforge.design import Contact, Morphology, Twin
 from padforge.design.common.settings import or_default
-from padforge.design.common.validation import MAX_VALUES, InputError, check_int, check_type
+from padforge.design.common.validation import MAX_VALUES, InputError, check_int
 from padforge.design.contact import contact_press
 from padforge.design.settings import PadSettings
 from padforge.design.twin import PARTS, TwinChannel, TwinPart
@@ -212,11 +212,11 @@ def simulate(
             plan that is adaptive or no file of positions, or a twin of which no channel reads a fibre.
     """
     contact, rig = or_default("contact", contact, Contact), or_default("rig", rig, RigSettings)
-    channels = len(pad.channels) if isinstance(pad, Twin) else len(check_type("pad", pad, Morphology).knots)
+    channels = len(pad.channels) if isinstance(pad, Twin) else len(pad.knots)
     check_int("fibres of the pad", channels, 1, MAX_FIBRES)
     _check_plan_kind(rig)
     if measured := pad if isinstance(pad, Twin) else like:
-        rig, contact = measured_rig(check_type("like", measured, Twin), rig), measured.contact()
+        rig, contact = measured_rig(measured, rig), measured.contact()
     rig = rig.for_contact(contact)
     if isinstance(pad, Twin):
         model = model_twin(pad, rig, size)

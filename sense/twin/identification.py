@@ -17,7 +17,7 @@ from threadpoolctl import threadpool_limits
 from padforge.design import Morphology
 from padforge.design.common.progress import OnProgress, ignore_progress
 from padforge.design.common.settings import or_default
-from padforge.design.common.validation import InputError, check_int, check_type
+from padforge.design.common.validation import InputError
 from padforge.design.paths.curves import lengths
 from padforge.design.settings import Contact, sensed_rectangle
 from padforge.design.twin import (
@@ -224,10 +224,9 @@ def identify_pad(
     on_progress: OnProgress = ignore_progress,
 ) -> Identification:
     """Identify a printed pad as `identify`, and return the fit and its evaluation with the twin."""
-    rng = np.random.default_rng(check_int("seed", seed, 0, 2**64 - 1))
-    check_type("pad", pad, Morphology)
+    rng = np.random.default_rng(seed)
     contact = or_default("contact", contact, Contact)
-    recording = select_one_depth(check_type("recording", recording, Recording))
+    recording = select_one_depth(recording)
     positions_mm = recording.presses_mm[recording.has_position]
     _check_positions(positions_mm, pad)
 

@@ -49,7 +49,7 @@ def few_candidates() -> Iterator[None]:
         yield
 
 
-def identified(built: Morphology, told: Morphology, rig: sense_settings.RigSettings) -> Identification:
+def identify_simulated(built: Morphology, told: Morphology, rig: sense_settings.RigSettings) -> Identification:
     """Identify a simulated pad by a plan; its contact and the parts of presses, which take longest, do not count."""
     contact = patch.object(twin_identification, "_measure_contact", lambda *_: None)
     with contact, patch.object(twin_identification, "measure_rig_settings", lambda _: {}):
@@ -63,7 +63,7 @@ def identification(once: Once) -> Identification:
 
     @few_candidates()
     def make(folder: Path) -> Identification:
-        return identified(plan, plan, ideal_rig(presses=120, seed=1))
+        return identify_simulated(plan, plan, ideal_rig(presses=120, seed=1))
 
     return once("identification", make)
 

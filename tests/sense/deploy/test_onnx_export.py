@@ -47,7 +47,7 @@ def graph(exported: tuple[Path, OnnxReport]) -> onnxruntime.InferenceSession:
     return onnxruntime.InferenceSession(exported[0])
 
 
-def inputs_of(recording: Recording, fibre_mask: np.ndarray) -> dict[str, np.ndarray]:
+def graph_inputs(recording: Recording, fibre_mask: np.ndarray) -> dict[str, np.ndarray]:
     commands = {"down_command": recording.down_command, "up_command": recording.up_command}
     return {"readings": interpolate_gaps(recording.readings), **commands, "fibre_mask": fibre_mask}
 
@@ -62,7 +62,7 @@ def test_graph_gives_the_predictions_with_masked_fibres(graph, localizer, record
     for failed in ((), (2,), (0, 3), (0, 1, 2), (0, 1, 2, 3)):
         fibre_mask = presses.fibre_mask & ~np.isin(np.arange(4), failed)
         expected = localizer.predict_features(replace(presses, fibre_mask=fibre_mask))
-        positions_mm, *others = graph.run(names, inputs_of(recording, fibre_mask))
+        positions_mm, *others = graph.run(names, graph_inputs(recording, fibre_mask))
         check_positions(positions_mm, expected)
         for name, values in zip(names[1:], others, strict=True):
             np.testing.assert_allclose(values, getattr(expected, name), rtol=1e-4)
@@ -98,7 +98,7 @@ def test_graph_gives_the_predictions_of_presses_without_pauses(graph, localizer,
     for failed in ((), (1,)):
         fibre_mask = scaled.fibre_mask & ~np.isin(np.arange(4), failed)
         expected = localizer.predict_features(replace(scaled, fibre_mask=fibre_mask))
-        positions_mm, std_mm, r90_mm = graph.run(["positions_mm", "std_mm", "r90_mm"], inputs_of(quick, fibre_mask))
+        positions_mm, std_mm, r90_mm = graph.run(["positions_mm", "std_mm", "r90_mm"], graph_inputs(quick, fibre_mask))
         check_positions(positions_mm, expected)
         np.testing.assert_allclose(std_mm, expected.std_mm, rtol=1e-4)
         np.testing.assert_allclose(r90_mm, expected.r90_mm, rtol=1e-4)
@@ -112,7 +112,7 @@ def test_graph_clips_what_is_far_beyond_the_training(graph, localizer, recording
     presses = localizer.scaled_features(strong)
     assert (np.abs(presses.inputs) == MAX_INPUT).any()
     expected = localizer.predict_features(presses)
-    positions_mm, r90_mm = graph.run(["positions_mm", "r90_mm"], inputs_of(strong, presses.fibre_mask))
+    positions_mm, r90_mm = graph.run(["positions_mm", "r90_mm"], graph_inputs(strong, presses.fibre_mask))
     check_positions(positions_mm, expected)
     np.testing.assert_allclose(r90_mm, expected.r90_mm, rtol=1e-4)
 
@@ -125,7 +125,7 @@ def test_graph_masks_a_fibre_whose_readings_are_missing(graph, localizer, record
     fibre_mask = np.array(presses.fibre_mask)
     expected_mask = fibre_mask.copy()
     expected_mask[first:, 1] = False
-    inputs = inputs_of(recording, fibre_mask) | {"readings": readings}
+    inputs = graph_inputs(recording, fibre_mask) | {"readings": readings}
     positions_mm, r90_mm = graph.run(["positions_mm", "r90_mm"], inputs)
     expected = localizer.predict_features(replace(presses, fibre_mask=expected_mask))
     check_positions(positions_mm, expected)
@@ -143,7 +143,7 @@ def test_graph_follows_a_finger_that_slides(graph, localizer, recording) -> None
     inputs = scaled.inputs, scaled.fibre_mask, scaled.seen
     *_, slid = predict(localizer.networks, *inputs, *localizer.corrected, sliding=localizer.sliding)
     assert 20 < slid.sum() < 280
-    positions_mm, r90_mm = graph.run(["positions_mm", "r90_mm"], inputs_of(sliding, scaled.fibre_mask))
+    positions_mm, r90_mm = graph.run(["positions_mm", "r90_mm"], graph_inputs(sliding, scaled.fibre_mask))
     expected = localizer.predict_features(scaled)
     check_positions(positions_mm, expected)
     np.testing.assert_allclose(r90_mm, expected.r90_mm, rtol=1e-4)
@@ -159,7 +159,7 @@ def test_graph_gives_depth_and_force(deep_localizer, deep_recording, deeply_expo
     for failed in ((), (0, 1, 2, 3)):
         fibre_mask = presses.fibre_mask & ~np.isin(np.arange(4), failed)
         expected = deep_localizer.predict_features(replace(presses, fibre_mask=fibre_mask))
-        values = graph.run(names, inputs_of(deep_recording, fibre_mask))
+        values = graph.run(names, graph_inputs(deep_recording, fibre_mask))
         columns = [column for each in expected.measures.values() for column in (each.values, each.r90)]
         np.testing.assert_allclose(np.array(values), np.array(columns), rtol=1e-4, atol=1e-4)
 

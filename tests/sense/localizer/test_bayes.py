@@ -34,7 +34,7 @@ def waves(places: np.ndarray) -> np.ndarray:
     return np.stack(parts, axis=1).reshape(len(places), FIBRES, WINDOWS)
 
 
-def fitted(answer: Response, noise: float = NOISE, seed: int = 0) -> "Fitted":
+def fit_bayes(answer: Response, noise: float = NOISE, seed: int = 0) -> "Fitted":
     """A Bayesian localizer of a pad of this response, with new presses: inputs and positions."""
     rng = np.random.default_rng(seed)
     grid = np.linspace(-1, 1, SIDE)
@@ -52,12 +52,12 @@ Fitted = tuple[BayesianLocalizer, np.ndarray, np.ndarray]
 
 @pytest.fixture(scope="module")
 def fitted_waves() -> Fitted:
-    return fitted(waves)
+    return fit_bayes(waves)
 
 
 @pytest.fixture(scope="module")
 def fitted_line() -> Fitted:
-    return fitted(linear)
+    return fit_bayes(linear)
 
 
 @pytest.mark.parametrize("lost", [(), (0,), (1, 3), (0, 1, 2)])
@@ -98,7 +98,7 @@ def test_predict_spreads_over_positions_of_equal_response() -> None:
     def even(places: np.ndarray) -> np.ndarray:
         return linear(np.stack([np.square(places[:, 0]), places[:, 1]], axis=1))
 
-    bayes, _, _ = fitted(even)
+    bayes, _, _ = fit_bayes(even)
     press = even(np.array([[0.6, 0.1]]))
     found, summary = bayes.predict(press, np.ones((1, FIBRES), dtype=bool))
     on_grid = np.exp(2 * (summary[0, 6:8] - 1))  # standard deviations

@@ -1,7 +1,6 @@
 """Readings as pads give them at their worst: results are finite, or one line says why there is none."""
 
 import json
-import tracemalloc
 from typing import Any
 
 import numpy as np
@@ -11,7 +10,6 @@ from padforge.design.common.validation import InputError
 from padforge.sense import Recording, calibrate, evaluate, recalibrate
 from padforge.sense.localizer import training
 from padforge.sense.localizer.model import LocalizerModel
-from padforge.sense.localizer.response_model import ResponseModel
 from padforge.sense.settings import LocalizerSettings
 from tests.sense.health.pads import faulty
 
@@ -83,16 +81,3 @@ def test_recalibrate_follows_or_refuses(localizer: LocalizerModel, brief: Record
             return
     require_finite(now, one, result.to_dict())
     assert (now.interval_factors >= localizer.interval_factors).all()
-
-
-@pytest.mark.slow
-def test_fit_takes_memory_in_chunks() -> None:
-    """The basis functions of all of them at once would take 350 MB, and as much again beside their history."""
-    rng, presses = np.random.default_rng(0), 100_000
-    windows, fibre_mask = rng.standard_normal((presses, 1, 3)), np.ones((presses, 1), dtype=bool)
-    tracemalloc.start()
-    try:
-        ResponseModel.fit(rng.uniform(-1, 1, (presses, 2)), windows, np.empty((presses, 1, 0)), fibre_mask)
-        assert tracemalloc.get_traced_memory()[1] < 300e6
-    finally:
-        tracemalloc.stop()

@@ -66,7 +66,7 @@ def least_by_search(y, lam):
     return cost.min()
 
 
-@settings(max_examples=50)
+@settings(max_examples=25)
 @given(READINGS, LAMS)
 def test_total_variation_meets_the_optimality_conditions(y, lam):
     # heights of steps are multiples of 2^-40, which the sums of the check do not know
@@ -75,7 +75,7 @@ def test_total_variation_meets_the_optimality_conditions(y, lam):
     assert excess_squares(y, total_variation(y, lam, "squares"), lam) <= 1e-12 * (1 + min(lam, 400))
 
 
-@settings(max_examples=50)
+@settings(max_examples=25)
 @given(PRESENT, LAMS)
 def test_robust_total_variation_is_the_least_of_an_exhaustive_search(y, lam):
     x = total_variation(y, lam)
@@ -83,7 +83,7 @@ def test_robust_total_variation_is_the_least_of_an_exhaustive_search(y, lam):
     assert y.min() <= x.min() <= x.max() <= y.max()
 
 
-@settings(max_examples=50)
+@settings(max_examples=25)
 @given(READINGS, LAMS, FIDELITY)
 def test_total_variation_of_missing_negated_and_scaled_readings(y, lam, fidelity):
     x = total_variation(y, lam, fidelity)
@@ -158,7 +158,7 @@ def test_filters_take_any_shape_layout_and_type(fidelity):
         assert running_median(np.empty(shape), 5).shape == shape
 
 
-@settings(max_examples=50)
+@settings(max_examples=25)
 @given(READINGS, st.sampled_from([1, 3, 5, 15, 99, 2**31 - 1]), st.booleans())
 def test_running_median_is_that_of_numpy(y, width, causal):
     before, after = (width - 1, 0) if causal else (width // 2, width // 2)

@@ -99,15 +99,6 @@ def test_study_of_a_pad_without_signals_guesses_the_middle(tmp_path: Path) -> No
     assert all(0.3 < row["mean"] < 0.5 for row in document["rows"])
 
 
-def test_maps_cover_the_pressed_rectangle(tmp_path: Path) -> None:
-    """Of 2 verticals 8 mm apart and 3 horizontals 15 mm apart."""
-    pad = Morphology.straight((3, 2), (8.0, 15.0))
-    document = run(robustness_study({"tall": pad}, max_failures=0, presses=16), tmp_path)
-    left, right, low, high = document["maps"][0]["extent"]
-    assert ((right - left) * pad.unit_mm, (high - low) * pad.unit_mm) == pytest.approx((8, 30))
-    assert document["rows"][0]["mean_mm"] == pytest.approx(document["rows"][0]["mean"] * np.sqrt(8 * 15))
-
-
 @pytest.mark.usefixtures("blank")
 def test_every_mean_is_over_sixteen_networks_or_more(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """One set of failed fibres takes 16, four take 4 each, and six 3."""
