@@ -149,6 +149,7 @@ def test_graph_follows_a_finger_that_slides(graph, localizer, recording) -> None
     np.testing.assert_allclose(r90_mm, expected.r90_mm, rtol=1e-4)
 
 
+@pytest.mark.slow
 def test_graph_gives_depth_and_force(deep_localizer, deep_recording, deeply_exported) -> None:
     path, report = deeply_exported
     assert report.position_difference_mm < MAX_DIFFERENCE_MM
@@ -178,18 +179,18 @@ def test_graph_describes_itself(exported: tuple[Path, OnnxReport]) -> None:
 
 
 def test_export_refuses_other_localizers_and_a_graph_that_differs(
-    deep_localizer, deep_recording, deeply_exported, tmp_path, monkeypatch
+    localizer, brief, exported, tmp_path, monkeypatch
 ) -> None:
-    """The graph is the one that torch has exported of the same localizer before, in a second."""
-    path, localizer, exported = tmp_path / "l.onnx", deep_localizer, deeply_exported[0].read_bytes()
-    monkeypatch.setattr("torch.onnx.export", lambda module, inputs, file, **options: file.write(exported))
+    """The graph is the one that torch has exported of the same localizer before, which takes long."""
+    path, content = tmp_path / "l.onnx", exported[0].read_bytes()
+    monkeypatch.setattr("torch.onnx.export", lambda module, inputs, file, **options: file.write(content))
     with pytest.raises(InputError, match="method published, expected ensemble"):
         export_onnx(replace(localizer, method="published"), DIGEST, path)
     with pytest.raises(InputError, match="of features array, expected windows"):
         export_onnx(replace(localizer, features="array"), DIGEST, path)
     monkeypatch.setattr(onnx_export, "MAX_DIFFERENCE_MM", 1e-9)
     with pytest.raises(Fault, match="not written, positions by onnxruntime differ"):
-        export_onnx(localizer, DIGEST, path, first_presses(deep_recording, 3))
+        export_onnx(localizer, DIGEST, path, first_presses(brief, 2))
     assert not list(tmp_path.iterdir())
 
 

@@ -188,6 +188,7 @@ def test_dead_channels_are_ignored(pad: Recording) -> None:
     assert detect_later(model, plant(pad, "noisy", readings=readings), pad)[0].fibres == (1,)
 
 
+@pytest.mark.slow
 def test_single_fibre_detects_faults_of_its_own_readings(pad: Recording) -> None:
     readings = pad.readings[:, 1:2].copy()
     model = fit(readings, pad, FEW)

@@ -50,7 +50,7 @@ def test_fit_power_law_never_rises(errors: list[float]) -> None:
 def quick() -> Iterator[None]:
     """Few resamplings, and a coarse response model."""
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr("padforge.sense.studies.learning_curve.RESAMPLINGS", 40)
+        patched.setattr("padforge.sense.studies.learning_curve.RESAMPLINGS", 20)
         patched.setattr("padforge.sense.localizer.response_model.RBF_SIDE", 7)
         yield
 

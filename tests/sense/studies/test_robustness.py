@@ -24,8 +24,8 @@ PADS = {"square": Morphology.straight(2), "random": Morphology.random(2, 3, 0)}
 @pytest.fixture(autouse=True, scope="module")
 def small() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(robustness, "HIDDEN", 10)
-        patched.setattr(robustness, "TEST", 300)
+        patched.setattr(robustness, "HIDDEN", 8)
+        patched.setattr(robustness, "TEST", 150)
         patched.setattr(robustness, "MIN_NETWORKS", 4)
         yield
 
@@ -94,6 +94,7 @@ def test_study_on_a_cluster_survives_the_kill_of_its_worker(tmp_path: Path, monk
     assert document["rows"] == expected["rows"]
 
 
+@pytest.mark.usefixtures("blank")
 def test_study_of_a_pad_without_signals_guesses_the_middle(tmp_path: Path) -> None:
     document = run(robustness_study(PADS, max_failures=1, presses=16, contact=Contact(radius=1e-6)), tmp_path)
     assert all(0.3 < row["mean"] < 0.5 for row in document["rows"])
@@ -143,9 +144,10 @@ def test_figure_and_text_have_the_numbers_of_the_rows() -> None:
         np.testing.assert_allclose(change, cells)
 
 
+@pytest.mark.usefixtures("blank")
 def test_study_maps_errors_without_chosen_fibres(tmp_path: Path) -> None:
     """However many fail otherwise, and as for the set that is evaluated anyway."""
-    document = run(robustness_study(PADS, max_failures=1, presses=64, failed=(3, 0, 2)), tmp_path)
+    document = run(robustness_study(PADS, max_failures=1, presses=36, failed=(3, 0, 2)), tmp_path)
     assert [row["n_failed"] for row in document["rows"]] == [0, 1] * 2
     for pad, paragraph in zip(PADS, document["text"][1:], strict=False):
         *_, chosen = [panel for panel in document["maps"] if panel["pad"] == pad]
@@ -153,7 +155,7 @@ def test_study_maps_errors_without_chosen_fibres(tmp_path: Path) -> None:
         intact = select_rows(document, pad=pad, n_failed=0)[0]["mean"]
         assert intact < chosen["mean"] == pytest.approx(np.mean(chosen["errors"]), rel=0.25)
         assert paragraph == f"{pad}: {chosen['mean']:.3f} without 1+3+4."
-    document = run(robustness_study(PADS, max_failures=1, presses=64, failed=(2,)), tmp_path)
+    document = run(robustness_study(PADS, max_failures=1, presses=16, failed=(2,)), tmp_path)
     for pad in PADS:
         *_, chosen = [panel for panel in document["maps"] if panel["pad"] == pad]
         [row] = [row for row in document["by_subset"] if (row["pad"], row["failed"]) == (pad, [2])]

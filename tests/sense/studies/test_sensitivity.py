@@ -17,7 +17,7 @@ PADS = {"square": Morphology.straight(3)}
 
 @pytest.fixture(autouse=True)
 def small(monkeypatch: pytest.MonkeyPatch) -> None:
-    for name, value in (("SIDE", 16), ("TEST", 200), ("MEMBERS", 2), ("HIDDEN", 12), ("RADII", (0.6, 1.0))):
+    for name, value in (("SIDE", 12), ("TEST", 150), ("MEMBERS", 2), ("HIDDEN", 10), ("RADII", (0.6, 1.0))):
         monkeypatch.setattr(sensitivity, name, value)
 
 
