@@ -161,17 +161,6 @@ def test_predict_ignores_masked_fibres_and_agrees_with_torch(fitted_waves: Fitte
         assert np.isfinite(np.asarray(about)).all()
 
 
-@pytest.mark.parametrize("places", [np.zeros((9, 2)), np.linspace([-1, 0], [1, 0], 9)], ids=["one place", "a line"])
-def test_fit_takes_presses_on_a_point_or_line(places: np.ndarray) -> None:
-    grid = np.linspace(-1, 1, SIDE)
-    table = linear(np.stack(np.meshgrid(grid, grid, indexing="ij"), axis=-1).reshape(-1, 2))
-    table = table.reshape(SIDE, SIDE, FIBRES, WINDOWS)
-    bayes = BayesianLocalizer.fit(table, linear(places), np.ones((9, FIBRES), dtype=bool), places)
-    found, summary = bayes.predict(linear(places), np.ones((9, FIBRES), dtype=bool))
-    np.testing.assert_allclose(found, places, atol=0.02)
-    assert np.isfinite(summary).all()
-
-
 def test_transformed_can_be_repeated(fitted_waves: Fitted) -> None:
     bayes, inputs, _ = fitted_waves
     turn, shift = np.array([[0.9, -0.2], [0.3, 1.1]]), np.array([0.1, -0.4])

@@ -15,7 +15,6 @@ from padforge.sense.settings import RigSettings
 from padforge.sense.simulation.simulated_recording import simulate
 from padforge.sense.studies import drift
 from padforge.sense.studies.drift import COMPENSATIONS, FILTERS, drift_study, level_indices, network_inputs
-from padforge.sense.studies.strokes import strokes_study
 from padforge.sense.studies.study import run
 from tests.sense.live.conftest import first_presses
 
@@ -103,12 +102,6 @@ def test_study_computes_idle_shares(document: dict[str, Any]) -> None:
         *(("real", f"recorded readings{end}") for end in ("", ", filtered")),
     }
     assert shares["square", "simulated readings, filtered"] > shares["square", "simulated readings"]
-
-
-def test_studies_of_simulated_recordings_refuse_large_pads_before_they_begin() -> None:
-    for make in (lambda pads: drift_study(pads, {}), strokes_study):
-        with pytest.raises(InputError, match="fibres of square@300 is 600, allowed is a whole number from 1 to 512"):
-            make({"square@300": Morphology.straight(300)})
 
 
 def test_drift_study_rejects_duplicate_and_short_recordings(recorded: Recording) -> None:

@@ -33,9 +33,6 @@ def test_force_study_estimates_depth_and_force_better_than_guessing(
     for quiet, noisy in zip(force["rows"][::2], force["rows"][1::2], strict=True):
         assert quiet["depth_mm"] < noisy["depth_mm"]
         assert quiet["position_one_depth_mm"] < noisy["position_one_depth_mm"]
-    curve, row = force["curves"][0], force["rows"][0]
-    pressed_n, predicted_n = (press_forces_n(curve[key]) for key in ("pressed_mm", "predicted_mm"))
-    assert np.abs(predicted_n - pressed_n).mean() == pytest.approx(row["force_n"], rel=1e-3)
 
 
 def test_tools_have_one_size_and_the_layer_of_the_contact() -> None:
@@ -64,12 +61,8 @@ def test_shape_study_classifies_better_than_chance(tmp_path: Path, monkeypatch: 
     monkeypatch.setattr(contact, "DEPTH_STEPS", 6)
     shapes = run(shape_study(PADS, sizes=Sizes(500, 200, hidden=12, epochs=25)), tmp_path)
     assert [(row["pad"], row["shapes"]) for row in shapes["rows"]] == [(label, kind) for label in PADS for kind in SETS]
-    for row, matrix in zip(shapes["rows"], shapes["confusions"], strict=True):
-        counts = np.array(matrix["counts"])
-        assert counts.sum() == 200
-        assert row["accuracy_percent"] == pytest.approx(100 * np.trace(counts) / 200)
+    for row in shapes["rows"]:
         assert row["accuracy_percent"] > row["majority_percent"] + 5
-        assert row["worst_percent"] == pytest.approx((100 * np.diag(counts) / counts.sum(axis=1)).min())
         assert 0 < row["position_mm"] < MIDDLE_ERROR_MM
         assert 0 < row["position_shape_known_mm"] < MIDDLE_ERROR_MM
 

@@ -20,7 +20,6 @@ from padforge.sense.studies.multicontact import (
 from padforge.sense.studies.study import Sizes, run
 
 PAD = Morphology.random(4, 3, 0)
-PADS = {"square": Morphology.straight(4), "random": PAD}
 MAX_RATIO = 0.7  # largest error of targets without an order, as a share of that of fixed labels
 
 
@@ -31,30 +30,16 @@ def pairs() -> np.ndarray:
 
 @pytest.mark.slow
 def test_study_localizes_pairs_better_without_an_order_and_counts_contacts(tmp_path: Path) -> None:
-    document = run(multicontact_study(PADS, sizes=Sizes(1000, 300, hidden=20, members=2, epochs=15)), tmp_path)
-    rows = {(row["pad"], row["method"]): row for row in document["rows"]}
-    assert list(rows) == [(label, method) for label in PADS for method in [*METHODS, COUNTING]]
-    for label, pad in PADS.items():
-        labelled = rows[label, LABELLED]
-        assert labelled["of_fixed_labels"] == 1
-        assert labelled["error_mm"] <= labelled["error_by_labels_mm"]
-        for method in ("free", "moments"):
-            row = rows[label, method]
-            assert 0 < row["error_grid"] < MAX_RATIO * labelled["error_grid"]
-            assert pad.pitch_mm * row["error_grid"] == pytest.approx(row["error_mm"])
-            assert row["error_mm"] < row["midpoint_error_mm"]
-    located = [row for row in document["rows"] if row["method"] != COUNTING]
-    for row, curve in zip(located, document["curves"], strict=True):
-        assert (row["pad"], row["method"]) == (curve["pad"], curve["method"])
-        assert np.mean(curve["error_mm"]) == pytest.approx(row["error_mm"], rel=0.05)
-        if row["resolution_mm"] is not None:
-            at = curve["distance_mm"].index(row["resolution_mm"])
-            assert np.all(np.array(curve["error_mm"]) < np.array(curve["distance_mm"]) / 4, where=np.arange(16) >= at)
-    for label, matrix in zip(PADS, document["confusions"], strict=True):
-        row, counts = rows[label, COUNTING], np.array(matrix["counts"])
-        assert (counts.shape, counts.sum()) == ((4, 4), 300)
-        assert row["accuracy_percent"] == pytest.approx(100 * np.trace(counts) / 300)
-        assert row["accuracy_percent"] > row["majority_percent"] + 30
+    sizes = Sizes(1000, 300, hidden=20, members=2, epochs=15)
+    document = run(multicontact_study({"random": PAD}, sizes=sizes), tmp_path)
+    rows = {row["method"]: row for row in document["rows"]}
+    assert list(rows) == [*METHODS, COUNTING]
+    labelled = rows[LABELLED]
+    assert labelled["error_mm"] <= labelled["error_by_labels_mm"]
+    for method in ("free", "moments"):
+        assert 0 < rows[method]["error_grid"] < MAX_RATIO * labelled["error_grid"]
+        assert rows[method]["error_mm"] < rows[method]["midpoint_error_mm"]
+    assert rows[COUNTING]["accuracy_percent"] > rows[COUNTING]["majority_percent"] + 30
 
 
 def test_unordered_distances_and_moments_do_not_depend_on_the_order(pairs: np.ndarray) -> None:

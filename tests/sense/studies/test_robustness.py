@@ -1,12 +1,9 @@
 """The study of robustness, and its files."""
 
-import os
-import signal
 from collections import Counter
 from collections.abc import Iterator
-from concurrent.futures import Executor
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import pytest
@@ -68,30 +65,6 @@ def test_study_reproduces_published_errors(published: Path, tmp_path: Path, monk
     document = run(robustness_study(pads, max_failures=1), tmp_path)
     for name, errors in expected.items():
         assert [row["mean"] for row in select_rows(document, pad=name)] == pytest.approx(errors, rel=0.15)
-
-
-@pytest.mark.slow
-@pytest.mark.filterwarnings("ignore")
-def test_study_on_a_cluster_survives_the_kill_of_its_worker(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    distributed = pytest.importorskip("distributed")
-    monkeypatch.setattr(robustness, "MIN_NETWORKS", MIN_NETWORKS)  # as workers have it, which are other processes
-    study = robustness_study({"a": Morphology.straight(1), "b": Morphology.random(1, 1)}, max_failures=1, presses=16)
-    expected = run(study, tmp_path / "local")
-    with (
-        distributed.LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address=None) as cluster,
-        distributed.Client(cluster) as client,
-    ):
-        victim = next(iter(client.run(os.getpid).values()))
-
-        def kill(done: int, total: int, name: str) -> None:
-            if done == 1:
-                os.kill(victim, signal.SIGKILL)
-
-        executor = client.get_executor(pure=False, retries=10)
-        document = run(study, tmp_path / "cluster", executor=cast(Executor, executor), on_progress=kill)
-        with pytest.raises(ProcessLookupError):
-            os.kill(victim, 0)
-    assert document["rows"] == expected["rows"]
 
 
 @pytest.mark.usefixtures("blank")

@@ -6,6 +6,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Callable
+from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
@@ -84,7 +85,8 @@ def test_every_study_writes_table_figure_and_text(name: str, tmp_path: Path, mon
     assert all(paragraph in text for paragraph in document["text"])
 
 
-def test_results_do_not_depend_on_the_order_of_tasks(tmp_path: Path) -> None:
+@pytest.mark.parametrize("executor", [None, ThreadPoolExecutor(2)], ids=["threads", "executor"])
+def test_results_do_not_depend_on_the_order_of_tasks(executor: Executor | None) -> None:
     """The second task ends first."""
     gate = threading.Event()
     tasks = [
@@ -92,7 +94,7 @@ def test_results_do_not_depend_on_the_order_of_tasks(tmp_path: Path) -> None:
         Task("second", lambda: gate.set() or {"value": np.array(2.0)}),
     ]
     reports: list[tuple[int, int, str]] = []
-    states = compute_states(tasks, lambda *report: reports.append(report), jobs=2)
+    states = compute_states(tasks, lambda *report: reports.append(report), jobs=2, executor=executor)
     assert [float(state["value"]) for state in states] == [1.0, 2.0]
     assert reports == [(0, 2, ""), (1, 2, "second"), (2, 2, "first")]
 
