@@ -90,7 +90,7 @@ class HealthModel:
             name: of the files.
 
         Raises:
-            InputError: the provenance is no JSON, or the folder cannot be written.
+            InputError: the folder cannot be written.
         """
         keys = ("fibres", "dead", "rate_hz", "false_alarm_rate", "presses")
         document = {"format": FORMAT, **{key: getattr(self, key) for key in keys}}
@@ -98,7 +98,7 @@ class HealthModel:
         parts = {"pca": asdict(self.pca), "weights": self.weights, "likelihoods": asdict(self.likelihoods)}
         parts["exceedance"] = asdict(self.exceedance)
         arrays = {f"{part}.{key}": np.asarray(value) for part, values in parts.items() for key, value in values.items()}
-        files_of(folder, name).write(document, arrays | {"rest_range_v": self.rest_range_v}, "health")
+        files_of(folder, name).write(document, arrays | {"rest_range_v": self.rest_range_v})
 
     @classmethod
     def load(cls, folder: str | Path, name: str = COMMANDED) -> "HealthModel":

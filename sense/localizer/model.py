@@ -299,7 +299,7 @@ class LocalizerModel(LocalizerDocument):
         arrays |= {TABLE: self.table}
         for number, stage in enumerate(self.bayes):
             arrays |= stage.to_arrays(number)
-        files_of(folder, NAME).write(document, arrays, "localizer")
+        files_of(folder, NAME).write(document, arrays)
 
     @classmethod
     def load(cls, folder: str | Path) -> "LocalizerModel":

@@ -22,14 +22,11 @@ class ModelFiles(NamedTuple):
     document: Path
     weights: Path
 
-    def write(self, document: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]], what: str) -> None:
-        """Write a document with "weights_sha256" added, and arrays, together or not at all; messages say `what`."""
+    def write(self, document: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]]) -> None:
+        """Write a document with "weights_sha256" added, and arrays, together or not at all."""
         content = save({name: np.ascontiguousarray(array) for name, array in arrays.items()})
         document = {**document, "weights_sha256": hashlib.sha256(content).hexdigest()}
-        try:
-            text = json.dumps(document, indent=1, allow_nan=False) + "\n"
-        except (TypeError, ValueError) as error:
-            raise InputError(f"{self.document}: {what} cannot be written as JSON ({error})") from error
+        text = json.dumps(document, indent=1, allow_nan=False) + "\n"
         with atomic_files(self.document.parent) as stage:
             (stage / self.weights.name).write_bytes(content)
             (stage / self.document.name).write_text(text, encoding="utf-8")

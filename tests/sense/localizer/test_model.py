@@ -220,10 +220,6 @@ def test_save_that_fails_changes_nothing(localizer: LocalizerModel, tmp_path: Pa
     localizer.save(tmp_path)
     before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
     other = replace(localizer, table=localizer.table + 1)
-    for value in (np.nan, object()):
-        with pytest.raises(InputError, match="cannot be written as JSON"):
-            replace(other, provenance={"note": value}).save(tmp_path)
-    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
     (tmp_path / "localizer.json").unlink()
     (tmp_path / "localizer.json").mkdir()
     with pytest.raises(InputError, match="is a folder, expected a file or nothing"):
