@@ -68,12 +68,16 @@ def identification(once: Once) -> Identification:
     return once("identification", make)
 
 
+def first_presses(recording: Recording, presses: int) -> Recording:
+    """Return the first presses of a recording, by their positions alone."""
+    end = int(recording.down_command[presses])
+    edges = (getattr(recording, name)[:presses] for name in ("presses_mm", "down_command", "up_command"))
+    return Recording(recording.readings[:end], recording.times_s[:end], *edges)
+
+
 @pytest.fixture(scope="session")
 def brief(recording: Recording) -> Recording:
-    """Its first 40 presses."""
-    end = int(recording.down_command[40])
-    presses = {name: getattr(recording, name)[:40] for name in ("presses_mm", "down_command", "up_command")}
-    return Recording(recording.readings[:end], recording.times_s[:end], **presses)
+    return first_presses(recording, 40)
 
 
 @contextmanager

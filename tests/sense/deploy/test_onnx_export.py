@@ -19,7 +19,7 @@ from padforge.sense.localizer.features import interpolate_gaps
 from padforge.sense.localizer.model import Localization, LocalizerModel
 from padforge.sense.localizer.network import predict
 from padforge.sense.localizer.scaler import MAX_INPUT
-from tests.sense.live.conftest import first_presses
+from tests.sense.conftest import first_presses
 
 DIGEST = "a" * 64
 

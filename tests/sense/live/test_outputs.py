@@ -27,7 +27,7 @@ from padforge.sense.live import outputs
 from padforge.sense.live.outputs import FORMAT, JsonLines, Message, MessageBuilder
 from padforge.sense.live.pipeline import Estimate
 from padforge.sense.localizer.model import LocalizerModel
-from tests.sense.live.conftest import first_presses
+from tests.sense.conftest import first_presses
 
 POSITION = {"press": 4, "x_mm": 1.5, "y_mm": -2.25, "r50_mm": 0.5, "r90_mm": 1.0, "final": True, "failed": []}
 TOUCH = Message(TOUCHES, {}, {"event": "touch", **POSITION})

@@ -17,8 +17,7 @@ from padforge.sense.health.fault_detector import FibreFault
 from padforge.sense.live.pipeline import MAX_TRACK, RELEASE, Estimate, Live
 from padforge.sense.localizer.model import Localization, LocalizerModel
 from padforge.sense.signals.press_detection import PressEvent
-from tests.sense.conftest import QUICK, few_moments
-from tests.sense.live.conftest import first_presses
+from tests.sense.conftest import QUICK, few_moments, first_presses
 
 
 @pytest.fixture(autouse=True, scope="module")

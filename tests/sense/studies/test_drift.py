@@ -16,7 +16,7 @@ from padforge.sense.simulation.simulated_recording import simulate
 from padforge.sense.studies import drift
 from padforge.sense.studies.drift import COMPENSATIONS, FILTERS, drift_study, level_indices, network_inputs
 from padforge.sense.studies.study import run
-from tests.sense.live.conftest import first_presses
+from tests.sense.conftest import first_presses
 
 PAD = Morphology.random(2, knots=3, seed=5)
 STRONG = RigSettings(presses=180, drift_mv=300, creep=0, hysteresis=0)
