@@ -18,7 +18,7 @@ from padforge.sense.localizer.model import LocalizerModel
 from padforge.sense.rig import simulated_board
 from padforge.sense.rig.devices import RigFault
 from tests.helpers.page_names import names_in_view
-from tests.sense.live.conftest import first_presses
+from tests.sense.conftest import first_presses
 
 
 @pytest.fixture

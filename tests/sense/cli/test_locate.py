@@ -14,7 +14,7 @@ from padforge.sense.health.fault_detector import HEALTH_FILES
 from padforge.sense.localizer.model import LocalizerModel
 from padforge.sense.localizer.moments import Moment
 from padforge.sense.signals.press_detection import first_readings
-from tests.sense.live.conftest import first_presses
+from tests.sense.conftest import first_presses
 
 
 def test_locate_excludes_fibres_by_number(few) -> None:

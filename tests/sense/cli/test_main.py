@@ -11,7 +11,7 @@ import pytest
 from padforge.design import Morphology
 from padforge.sense import Recording
 from padforge.sense.cli.options import typed_keys
-from tests.sense.live.conftest import first_presses
+from tests.sense.conftest import first_presses
 
 
 def test_import_loads_neither_torch_nor_matplotlib() -> None:
