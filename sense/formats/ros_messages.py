@@ -133,45 +133,24 @@ def upward(mirrored: bool) -> float:
 
 def to_topics(recording: Recording, epoch_s: float) -> dict[str, TopicSeries]:
     """Return the topics of a recording that have messages, but for RECORDING."""
-    stamps = to_stamps(recording.times_s, epoch_s)
-    measures = recording.depths_mm, recording.reached_mm, recording.forces_n
-    presses = np.column_stack([recording.presses_mm, recording.down_command, recording.up_command, *measures])
-    topics = press_topics(presses.astype(np.float64), stamps, recording.mirrored)
-    return {READINGS: TopicSeries(stamps, recording.readings), **topics}
-
-
-def press_topics(presses: Array, stamps: Indices, mirrored: bool) -> dict[str, TopicSeries]:
-    """Return the topics of presses that have messages.
-
-    Args:
-        presses: (Q, 7) with Q >= 1, a `Press` of a run directory each.
-        stamps: (R,) of all readings, ns.
-        mirrored: whether the pad lay with its tracks up.
-    """
-    x_mm, y_mm, down_command, up_command, depths_mm, reached_mm, forces_n = presses.T
-    down, up = (stamps_at(stamps, readings.astype(np.int64)) for readings in (down_command, up_command))
-    x_y = x_mm / 1000, y_mm / 1000
-    covariances = np.zeros((len(presses), 36))
+    stamps, mirrored = to_stamps(recording.times_s, epoch_s), recording.mirrored
+    depths_mm, reached_mm, forces_n = recording.depths_mm, recording.reached_mm, recording.forces_n
+    down, up = (stamps_at(stamps, readings) for readings in (recording.down_command, recording.up_command))
+    x_y = recording.presses_mm / 1000
+    covariances = np.zeros((len(down), 36))
     covariances[np.isnan(depths_mm), DEPTH_VARIANCE] = UNKNOWN_VARIANCE
 
     def at_presses(valid: Mask, *columns: Array) -> TopicSeries:
         return TopicSeries(down[valid], np.column_stack(columns)[valid])
 
     topics = {
-        PRESSED: TopicSeries(np.column_stack([down, up]).ravel(), np.tile([[1.0], [0.0]], (len(presses), 1))),
-        PLACE: at_presses(~np.isnan(x_mm), *x_y, depths_to_z(depths_mm, mirrored), covariances),
-        REACHED: at_presses(~np.isnan(reached_mm), *x_y, depths_to_z(reached_mm, mirrored)),
+        READINGS: TopicSeries(stamps, recording.readings),
+        PRESSED: TopicSeries(np.column_stack([down, up]).ravel(), np.tile([[1.0], [0.0]], (len(down), 1))),
+        PLACE: at_presses(recording.has_position, x_y, depths_to_z(depths_mm, mirrored), covariances),
+        REACHED: at_presses(~np.isnan(reached_mm), x_y, depths_to_z(reached_mm, mirrored)),
         FORCE: at_presses(~np.isnan(forces_n), upward(mirrored) * forces_n),
     }
     return {topic: series for topic, series in topics.items() if len(series.stamps)}
-
-
-def withdrawn_places(presses: Array, stamps: Indices) -> TopicSeries:
-    """Return PLACE of (Q, 7) presses whose positions turned out to be unknown: NaN in place of those of before."""
-    unknown = np.full((len(presses), 3), np.nan)
-    covariances = np.zeros((len(presses), 36))
-    covariances[:, [0, 7, DEPTH_VARIANCE]] = UNKNOWN_VARIANCE
-    return TopicSeries(stamps_at(stamps, presses[:, 2].astype(np.int64)), np.column_stack([unknown, covariances]))
 
 
 def touches(recording: Recording, annotations: ModelAnnotations, epoch_s: float) -> TopicSeries:
@@ -296,7 +275,7 @@ def from_text(text: str, readings: Array) -> tuple[Recording, float, str] | None
         arrays: dict[str, Any] = {name: np.array(document[name], np.float64) for name in (*_NUMBERS, *_INDICES)}
         recording = Recording(readings=readings, **arrays, source=document["source"])
         return recording, check_float("epoch_s", document["epoch_s"], -MAX_S, MAX_S), str(document["digest"])
-    except (InputError, KeyError, TypeError, ValueError, OverflowError, RecursionError):
+    except (InputError, KeyError, TypeError, ValueError):
         return None
 
 
@@ -304,7 +283,9 @@ def encode_health(
     store: "Typestore", recording: Recording, annotations: ModelAnnotations, stamps: Indices
 ) -> tuple[Indices, list[memoryview]]:
     """Return HEALTH, (n,) stamps and messages: all fibres at the first reading, and whenever a fault was named."""
-    faults = dict.fromkeys(annotations.dead, ("dead", "was dead in the recording that health was learnt from"))
+    faults: dict[int, tuple[str, str]] = dict.fromkeys(
+        annotations.dead, ("dead", "was dead in the recording that health was learnt from")
+    )
     states = [(int(stamps[0]), faults)]
     ends = stamps_at(stamps, recording.up_command).tolist()
     for fault in annotations.faults or ():

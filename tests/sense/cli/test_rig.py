@@ -138,20 +138,6 @@ def test_record_checks_the_tcp_before_anything_moves(
     assert not Path("out").exists()
 
 
-def test_record_says_that_an_mcap_file_is_not_resumed(padforge_sense, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(operation, "record", Mock(return_value=None))
-    monkeypatch.setattr(operation, "opened_rig", Mock())
-    Path("rec.mcap").write_bytes(b"")
-    Path("pad.toml").write_text("[pad]\ngrid = 2\n")
-    PAD.save("pad.json")
-    words = ("record", "--rig", "ur5", "--spec", "pad.toml", "--morphology", "pad.json", "--out", "rec", "--resume")
-    code, _, err = padforge_sense(*words)
-    assert code == 0, err
-    assert err.splitlines()[-1] == (
-        "rec.mcap: stays as it is, without what is recorded now; --resume --mcap goes on with it"
-    )
-
-
 @pytest.fixture
 def finger(padforge_sense) -> Iterator[Finger]:
     """One that presses a pad, whose board pad.toml names, in the folder of the command."""
