@@ -20,8 +20,6 @@ from padforge.sense.localizer.calibration import calibrate
 from padforge.sense.recording.run_directory import read_journal
 from padforge.sense.rig import by_hand
 from padforge.sense.rig.by_hand import (
-    MAP_COLUMNS,
-    MAP_ROWS,
     MIN_PRESSES,
     ROUND,
     SETTLE_S,
@@ -47,8 +45,7 @@ from tests.sense.rig.fakes import Time
 IDENTITY = {"name": "board", "channels": 4, "rate_hz": 1000.0}
 VIEW: dict[str, Any] = {
     **{"phase": "press", "progress": 0.5, "prompt": "press x 5, y 5 mm", "done": 2, "total": 7},
-    **{"message": "counted: x 0, y 0 mm", "target": (16.875, 16.875), "rejected": None},
-    "presses": [{"x_mm": 0.0, "y_mm": 0.0}, {"x_mm": -16.875, "y_mm": 16.875}],
+    "message": "counted: x 0, y 0 mm",
 }
 
 
@@ -84,31 +81,16 @@ def test_plan_targets_rounds_none_into_a_keep_out() -> None:
     assert (positions == np.rint(positions)).mean() > 0.9
 
 
-def test_view_lines_map_positions() -> None:
+def test_view_lines_say_what_to_do_and_pad_view_where() -> None:
     pad = Morphology.straight(2)
     view = pad_view(pad, "hand")
     np.testing.assert_allclose([path[0] for path in view["paths"]], pad.to_mm(pad.knots[:, 0]), atol=0.051)
-    lines = view_lines(view | VIEW)
+    assert view["half_mm"] == [side / 2 for side in pad.layout.size_mm]
+    lines = view_lines(VIEW)
     assert lines[0] == "PRESS X 5, Y 5 MM"
     assert lines[1].count("#") == lines[1].count(".") == 15
-    rows = lines[3 : 3 + MAP_ROWS]
-    assert (rows[0][MAP_COLUMNS], rows[0][1]) == ("O", ".")  # up is up, right is right
-    assert "".join(rows).count("O") == 1
-    assert rows[MAP_ROWS // 2][1 + MAP_COLUMNS // 2] == "."
-    assert "2 of 7 presses" in lines[-2]
-    assert "q: end" in lines[-1]
-    # With the tracks up, what is right on the plan is left on the map; positions stay as planned.
-    lying = view_lines(pad_view(pad, "hand", mirrored=True) | VIEW)
-    assert [row[::-1] for row in lying[3 : 3 + MAP_ROWS]] == rows
-    assert lying[0] == lines[0]
-
-
-def test_view_lines_keep_the_aspect_of_a_rectangle() -> None:
-    view = pad_view(Morphology.straight((1, 5), 8.0), "hand")  # 48 mm wide and 16 mm high
-    lines = view_lines(view | VIEW | {"target": (24.0, 8.0), "rejected": (-24.0, -8.0)})
-    top, bottom = (row for row, line in enumerate(lines) if line.startswith("+"))
-    assert (len(lines[top]), bottom - top - 1) == (MAP_COLUMNS + 2, MAP_ROWS // 3)
-    assert (lines[top + 1][MAP_COLUMNS], lines[bottom - 1][1]) == ("O", "x")
+    assert lines[2].startswith("2 of 7 presses")
+    assert "q: end" in lines[3]
 
 
 @pytest.fixture
