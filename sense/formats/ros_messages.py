@@ -35,7 +35,6 @@ UNKNOWN_VARIANCE = -1.0
 """Variance of an unknown quantity, as in `sensor_msgs/msg/Imu`."""
 Z90 = 1.6449
 """Standard deviations that hold 90 % of a normal distribution, two-sided."""
-_MAX_STAMP_S = 2**31
 _INDICES = ("down_command", "up_command")
 _NUMBERS = ("times_s", "presses_mm", "depths_mm", "reached_mm", "forces_n")
 
@@ -103,10 +102,8 @@ class TopicSeries(NamedTuple):
 
 
 def choose_epoch(times_s: Array) -> float:
-    """Return the time that stamps count from: 0, unless they cannot hold the (n,) times as they are."""
-    if times_s[-1] - times_s[0] >= _MAX_STAMP_S - 2:
-        raise InputError(f"recording lasts {times_s[-1] - times_s[0]:g} s, allowed in a bag are {_MAX_STAMP_S - 2}")
-    return 0.0 if times_s[0] >= 0 and times_s[-1] < _MAX_STAMP_S - 1 else float(np.floor(times_s[0]))
+    """Return the time that stamps count from: 0, unless the (n,) times begin before, which stamps cannot hold."""
+    return min(0.0, float(np.floor(times_s[0])))
 
 
 def to_stamps(times_s: Array, epoch_s: float) -> Indices:
@@ -166,8 +163,7 @@ def touches(recording: Recording, annotations: ModelAnnotations, epoch_s: float)
 
 def arm_poses(states: Array, epoch_s: float) -> TopicSeries:
     """Return ARM from (n, 10) states, in m and with rotation vectors as quaternions; only of times that stamps hold."""
-    is_stamped = (states[:, 0] >= epoch_s) & (states[:, 0] - epoch_s < _MAX_STAMP_S - 1)
-    states = states[np.isfinite(states[:, :7]).all(axis=1) & is_stamped]
+    states = states[np.isfinite(states[:, :7]).all(axis=1) & (states[:, 0] >= epoch_s)]
     angle = np.linalg.norm(states[:, 4:7], axis=1)
     x_y_z = states[:, 4:7] * (np.sinc(angle / (2 * np.pi)) / 2)[:, None]  # sin(angle / 2) along the axis
     return TopicSeries(

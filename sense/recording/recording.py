@@ -270,7 +270,7 @@ def _check_source(source: object) -> None:
         raise InputError(f"source is {short_repr(source)}, expected a mapping")
     try:
         json.dumps(dict(source), allow_nan=False)
-    except (TypeError, ValueError, RecursionError) as error:
+    except (TypeError, ValueError) as error:
         raise InputError(f"source is {short_repr(dict(source))}, expected what JSON can hold ({error})") from error
 
 

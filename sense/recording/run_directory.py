@@ -10,7 +10,6 @@ when a recording is created: a folder without it holds nothing, and a recording 
 import contextlib
 import io
 import json
-import stat
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
@@ -265,7 +264,7 @@ class Recorder:
         document = {"event": event, "press": press, "reading": reading, **more}
         try:
             self._lines.append(json.dumps(document, allow_nan=False) + "\n")
-        except (TypeError, ValueError, RecursionError) as error:
+        except (TypeError, ValueError) as error:
             raise InputError(f"press {press}: {short_repr(document)}, expected what JSON can hold") from error
 
     def sync(self) -> None:
@@ -321,8 +320,7 @@ def check_new_recording(path: Path) -> None:
 def is_uncommitted(path: Path) -> bool:
     """Whether a folder holds only files that are created up to `start.json`, without a reading or press."""
     return all(
-        stat.S_ISREG(file.lstat().st_mode)
-        and (file.name in (START, _NEW_START) or (file.name in _BEFORE_START and file.stat().st_size == 0))
+        file.name in (START, _NEW_START) or (file.name in _BEFORE_START and file.stat().st_size == 0)
         for file in path.iterdir()
         if file.name != LOCK
     )

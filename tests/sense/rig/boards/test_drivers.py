@@ -113,7 +113,6 @@ def test_read_returns_exact_samples_on_time(monkeypatch: pytest.MonkeyPatch) -> 
 @pytest.mark.parametrize(
     ("header", "inputs"),
     [
-        (replace(HEADER, rate_hz=10.0), ()),
         (replace(HEADER, bits=16, channels=12), (11, 3, 0)),  # of a Due
         (LineHeader(333.0, 16, 5.0, 16), (15, 0, 7)),
     ],
