@@ -115,28 +115,6 @@ def test_open_refuses_other_folders(folder: Path, tmp_path: Path) -> None:
         Recording.open(folder)
 
 
-@pytest.mark.parametrize("exists_before", [False, True])
-def test_save_refuses_a_path_that_appeared_meanwhile(
-    recording: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, exists_before: bool
-) -> None:
-    path = tmp_path / "run"
-    if exists_before:
-        path.mkdir()
-    late = replace(recording, times_s=recording.times_s + 1)
-    sync = Recorder.sync
-
-    def overtaken(recorder: Recorder) -> None:
-        sync(recorder)
-        monkeypatch.setattr(Recorder, "sync", sync)
-        recording.save(path, {})
-
-    monkeypatch.setattr(Recorder, "sync", overtaken)
-    with pytest.raises(InputError, match="never written over"):
-        late.save(path, {})
-    assert Recording.open(path) == recording
-    assert [entry.name for entry in tmp_path.iterdir()] == ["run"]
-
-
 def test_measures_are_saved_but_not_in_the_digest(recording: Recording, tmp_path: Path) -> None:
     count = len(recording.down_command)
     unknown = replace(recording, depths_mm=np.empty(0))

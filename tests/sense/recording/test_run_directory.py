@@ -5,7 +5,6 @@ import os
 import resource
 import shutil
 import signal
-import time
 from dataclasses import replace
 from itertools import count
 from pathlib import Path
@@ -145,31 +144,6 @@ def test_resume_after_a_full_disk(tmp_path, limit):
     recording = Recording.open(tmp_path / "run")
     check_as_recorded(recording)
     assert set(recording.presses_mm[:, 0]) == finished
-
-
-@pytest.mark.parametrize("pause_s", [0.01, pytest.param(0.1, marks=pytest.mark.slow)])
-def test_resume_after_a_killed_process(tmp_path, pause_s):
-    counter = tmp_path / "counter"
-    counter.touch()
-
-    def work():
-        with Recorder(tmp_path / "run", FIBRES, {}, {}) as recorder:
-            for press in range(10_000):
-                record(recorder, range(press, press + 1), 2.0 * press)
-                os.truncate(counter, press + 1)
-
-    child = in_a_child(work)
-    while not counter.stat().st_size:
-        time.sleep(0.001)
-    time.sleep(pause_s)
-    os.kill(child, signal.SIGKILL)
-    os.waitpid(child, 0)
-    done = counter.stat().st_size
-    recording = Recording.open(tmp_path / "run")
-    check_as_recorded(recording)
-    assert recording.presses_mm[:, 0].tolist()[:done] == list(range(done))
-    with Recorder.resume(tmp_path / "run") as recorder:
-        assert set(range(done)) <= recorder.done
 
 
 def test_resume_aborts_presses_without_their_readings(tmp_path):

@@ -195,22 +195,6 @@ def test_readings_show_presses_when_tip_goes_down(rig: Rig, tmp_path: Path, monk
     assert np.ptp(nearest) < 0.03  # a reading is a mean over 8 ms, and shallow touches show late
 
 
-def test_line_board_has_every_input_that_is_named() -> None:
-    """Sixteen, or one more than the highest; pad and probe of a printer are where its settings say."""
-    for channels in ((0, 1, 2, 3), (3, 0, 16, 1)):
-        rig = PRINTER.model_copy(update={"channels": channels})
-        emulated = rigs.emulate_printer(PAD, PUBLISHED_CONTACT, rig)
-        with emulated as (settings, robot, _), closing(LineBoard.from_settings(settings, channels)) as driver:
-            identity = driver.connect()
-            assert (identity["inputs"], identity["name"]) == (list(channels), "emulated")
-            samples = driver.read()
-            assert samples.volts.shape[1] == 4
-            assert (samples.volts > 0.1).all()  # a fibre is on each
-            tip = np.array(robot.true_positions(clock.now())[0]) + rig.tcp_mm
-            (x, y), z = rig.pad_mm or (0, 0), rig.contact_mm or 0
-            assert tip == pytest.approx([x, y, z + 2 * rig.clearance_mm])
-
-
 @pytest.mark.usefixtures("steady")
 @pytest.mark.parametrize("rig", ["printer"], indirect=True)
 def test_printer_presses_as_planned_despite_noise(rig: Rig, tmp_path: Path) -> None:
