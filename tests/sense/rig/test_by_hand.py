@@ -446,8 +446,9 @@ def test_validator_follows_the_drift_of_the_baseline(validator: PressValidator) 
 
 
 @pytest.mark.slow
-def test_calibrate_learns_from_a_recording_by_hand(clumsy: tuple[Hands, Recording]) -> None:
-    hand, recording = clumsy
+def test_calibrate_learns_from_a_recording_by_hand(hands) -> None:
+    hand = hands(mishaps=0.2, presses=60)
+    recording = hand.record()
     _, evaluation = calibrate(recording, QUICK.model_copy(update={"members": 1, "epochs": 10}))
     scale_mm = np.linalg.norm(hand.targets - hand.targets.mean(axis=0), axis=1).mean()
     assert evaluation.errors[0]["mean_mm"] < 0.55 * scale_mm
