@@ -122,12 +122,7 @@ def _intact_blocks(path: Path, fibres: int) -> NDArray[np.void]:
         raise InputError(f"{path}: cannot be read ({error.strerror})") from error
     counts = blocks["count"].astype(np.int64)
     is_block = (blocks["magic"] == _MAGIC) & (blocks["crc"] == _checksums(blocks))
-    is_intact = (
-        is_block
-        & (blocks["sequence"] == np.arange(n_blocks))
-        & (blocks["first"] == np.cumsum(counts) - counts)
-        & (counts <= dtype["rows"].shape[0])
-    )
+    is_intact = is_block & (blocks["sequence"] == np.arange(n_blocks)) & (blocks["first"] == np.cumsum(counts) - counts)
     end = int(np.argmin(np.append(is_intact, False)))
     if is_block[end:].any():
         raise InputError(

@@ -77,12 +77,11 @@ def test_read_blocks_refuses_a_lost_block(tmp_path: Path) -> None:
         read_blocks(tmp_path / "s", 6)
 
 
-@pytest.mark.parametrize("count", [3, 2**31])
-def test_read_blocks_refuses_other_counts(tmp_path: Path, count: int) -> None:
+def test_read_blocks_refuses_another_count(tmp_path: Path) -> None:
     write(tmp_path / "s", some_rows(40, 6))
     content = bytearray((tmp_path / "s").read_bytes())
     block = content[8 * 256 : 9 * 256]
-    block[16:20] = count.to_bytes(4, "little")
+    block[16:20] = (3).to_bytes(4, "little")
     block[20:24] = zlib.crc32(block[24:], zlib.crc32(block[:20])).to_bytes(4, "little")
     (tmp_path / "s").write_bytes(content[: 8 * 256] + block + content[9 * 256 :])
     with pytest.raises(InputError, match=r"block [89] .*damaged"):
