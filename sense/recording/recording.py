@@ -247,16 +247,19 @@ class Recording:
 def check_replaceable(path: Path) -> None:
     """Raise InputError unless a path is absent or a simulated recording, which the same seed makes again.
 
-    Nobody may be recording into it.
+    Links are not followed, and nobody may be recording into it.
     """
     advice = "choose another --out"
+    if path.is_symlink():
+        raise InputError(f"{path}: is a link, and none is followed where a recording is replaced; {advice}")
     if not path.exists():
         return
     if not path.is_dir():
         raise InputError(f"{path}: is no folder, expected a simulated recording or nothing; {advice}")
     if (path / START).exists() or not is_uncommitted(path):
-        if others := sorted({file.name for file in path.iterdir()} - {*FILES, LOCK}):
-            raise InputError(f"{path}: holds {others[0]}, which is no part of a recording; {advice}")
+        for file in sorted(path.iterdir()):
+            if file.name not in (*FILES, LOCK) or file.is_symlink():
+                raise InputError(f"{path}: holds {file.name}, which is no part of a recording; {advice}")
         source = read_json(path / START, FORMAT).get("source")
         kind = source.get("kind") if isinstance(source, dict) else None
         if kind != "simulated":
