@@ -258,7 +258,7 @@ def check_replaceable(path: Path) -> None:
         raise InputError(f"{path}: is no folder, expected a simulated recording or nothing; {advice}")
     if (path / START).exists() or not is_uncommitted(path):
         for file in sorted(path.iterdir()):
-            if file.name not in (*FILES, LOCK) or file.is_symlink():
+            if file.name not in (*FILES, LOCK) or file.is_symlink() or not file.is_file():
                 raise InputError(f"{path}: holds {file.name}, which is no part of a recording; {advice}")
         source = read_json(path / START, FORMAT).get("source")
         kind = source.get("kind") if isinstance(source, dict) else None
