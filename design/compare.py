@@ -17,6 +17,7 @@ from padforge.design.common.settings import Spec
 from padforge.design.common.validation import InputError, short_repr
 from padforge.design.contact import half_width_mm
 from padforge.design.contact_comparison import beside_straight, design_contact, errors_by_contact
+from padforge.design.contact_set import served_contacts
 from padforge.design.design_run import run_design
 from padforge.design.morphology import Morphology
 from padforge.design.optimize.search import SearchOptions
@@ -108,8 +109,8 @@ def compare(
 ) -> dict[str, Any]:
     """Design and make every variant in its own folder, evaluate all alike, and write comparison.json and .png.
 
-    A pad is evaluated by its expected errors under its own contact and on its own sensed area, beside straight fibres
-    of the same layout (`errors_by_contact`).
+    A pad is evaluated by its expected errors on its own sensed area, under its own contact and the others that a search
+    for it serves, beside straight fibres of the same layout (`errors_by_contact`).
 
     Returns:
         The document: a row per variant, with errors in mm with 0, 1, ... failed fibres.
@@ -142,8 +143,10 @@ def _evaluate(variant: Variant, pad: Morphology, seed: int | None) -> dict[str, 
     pad_settings = variant.spec.section(PadSettings, **pad.layout.settings)
     contact = design_contact(variant.spec, search)
     with stage("compare"):
-        results = errors_by_contact(beside_straight(pad), {"assumed": contact}, pad_settings, search)
-    errors_mm = {result.pad: list(result.errors_mm) for result in results}
+        contacts = served_contacts(contact, search)
+        results = errors_by_contact(beside_straight(pad), contacts, pad_settings, search)
+    errors_mm = {name: {r.pad: list(r.errors_mm) for r in results if r.contact == name} for name in contacts}
+    main, *others = errors_mm
     return {
         "name": variant.name,
         "fibres": list(pad.layout.counts),
@@ -151,14 +154,21 @@ def _evaluate(variant: Variant, pad: Morphology, seed: int | None) -> dict[str, 
         "knots": pad.knots.shape[1] - 2,
         "length_mm": float(lengths(pad).sum() * pad.unit_mm),
         "crossings": len(crossings(pad)),
-        "errors_mm": errors_mm["designed"],
-        "straight_mm": errors_mm["straight"],
+        "errors_mm": errors_mm[main]["designed"],
+        "straight_mm": errors_mm[main]["straight"],
+        "others": {
+            name: {"errors_mm": errors_mm[name]["designed"], "straight_mm": errors_mm[name]["straight"]}
+            for name in others
+        },
         "contact": contact.model_dump(mode="json"),
     } | ({} if contact.model == "shape" else {"half_width_mm": half_width_mm(contact)})
 
 
 def comparison_lines(document: Mapping[str, Any]) -> list[str]:
-    """Format a comparison as a table of text, with a second row of straight fibres below a pad that differs."""
+    """Format a comparison as a table of text.
+
+    Below a pad that differs from straight fibres are rows of these, under the assumed contact and under others.
+    """
     rows = document["rows"]
     n_errors = max(len(row["errors_mm"]) for row in rows)
     columns = {"half_width_mm": "half width (mm)", **COSTS}
@@ -170,8 +180,11 @@ def comparison_lines(document: Mapping[str, Any]) -> list[str]:
         cells += [str(row["crossings"]), *(f"{row[key]:.3g}" if key in row else "-" for key in costs)]
         table.append([*cells, *(f"{error:.2f}" for error in row["errors_mm"])])
         if row["errors_mm"] != row["straight_mm"]:
-            errors = [f"{error:.2f}" for error in row["straight_mm"]]
-            table.append(["  straight fibres", *[""] * (len(header) - 1), *errors])
+            blank = [""] * (len(header) - 1)
+            table.append(["  straight fibres", *blank, *(f"{error:.2f}" for error in row["straight_mm"])])
+            for contact, other in row["others"].items():
+                pairs = zip(other["errors_mm"], other["straight_mm"], strict=True)
+                table.append([f"  {contact}", *blank, *(f"{a:.2f} / {b:.2f}" for a, b in pairs)])
     return text_table(table)
 
 

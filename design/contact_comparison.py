@@ -11,23 +11,15 @@ from typing import TYPE_CHECKING, Any
 
 from padforge.design.common.files import provenance, write_json
 from padforge.design.common.profiling import stage
+from padforge.design.contact_set import judged_contacts
 from padforge.design.morphology import Morphology
 from padforge.design.objectives.bayes_error import expected_errors
-from padforge.design.settings import (
-    MEASURED_PROFILE,
-    MEASURED_STD_MM,
-    PUBLISHED_CONTACT,
-    Contact,
-    PadSettings,
-    SearchSettings,
-    read_contact,
-)
+from padforge.design.settings import Contact, PadSettings, SearchSettings, read_contact
 
 if TYPE_CHECKING:
     from padforge.design.common.settings import Spec
 
 FORMAT, NAME = "padforge-contacts/1", "contacts.json"
-PROFILE_STD_MM = (5.0, MEASURED_STD_MM, 7.9)  # of the sensitivity profiles, about Gaussian, that are tried
 
 
 @dataclass(frozen=True)
@@ -37,31 +29,6 @@ class ContactErrors:
     contact: str  # name of the contact
     pad: str  # name of the pad
     errors_mm: tuple[float, ...]  # with 0, 1, ... fibres failed
-
-
-def alternative_contacts(assumed: Contact) -> dict[str, Contact]:
-    """Return the assumed contact, first, and others that a pad may really meet, by name; none twice.
-
-    Beside a layer they are presses by a tool half as large or half as deep, and fibres that answer to being pressed
-    flat alone; beside another contact narrower and wider profiles, and the published disc.
-    """
-    if assumed.model == "layer":
-        tool_mm, depth_mm = assumed.tool_radius_mm / 2, assumed.depth_mm / 2
-        changes: dict[str, dict[str, float]] = {
-            f"tool of {tool_mm:g} mm": {"tool_radius_mm": tool_mm},
-            f"{depth_mm:g} mm deep": {"depth_mm": depth_mm},
-            "pressed flat alone": {"squeeze": 1.0, "stretch": 0.0},
-        }
-        others = {name: Contact(**assumed.model_dump() | change) for name, change in changes.items()}
-    else:
-        others = {
-            f"profile of {std:g} mm": Contact(
-                sensitivity_profile=tuple((std / MEASURED_STD_MM * d, weight) for d, weight in MEASURED_PROFILE)
-            )
-            for std in PROFILE_STD_MM
-        }
-        others["published disc, K = 0.6"] = PUBLISHED_CONTACT
-    return {"as assumed": assumed} | {name: other for name, other in others.items() if other != assumed}
 
 
 def errors_by_contact(
@@ -89,7 +56,7 @@ def compare_contacts(spec: "Spec", pad: Morphology, out: Path, seed: int | None 
     """Write and return the errors of a pad and of straight fibres under the contact of `spec` and others."""
     settings = spec.section(SearchSettings, seed=seed)
     size = spec.section(PadSettings, **pad.layout.settings)
-    contacts = alternative_contacts(design_contact(spec, settings))
+    contacts = judged_contacts(design_contact(spec, settings), settings)
     with stage("contacts"):
         errors = errors_by_contact(beside_straight(pad), contacts, size, settings)
     document = {

@@ -293,13 +293,28 @@ def press_sections(document: Mapping[str, Any], max_strain: float | None) -> lis
     return [PageSection("Press", [paragraph(lead), picture, table(head, rows)])]
 
 
-def contact_line(document: Mapping[str, Any]) -> str:
-    """Summarise a `contacts.json`: errors with all fibres under the assumed contact, and their range under others."""
+def contact_lines(document: Mapping[str, Any]) -> list[str]:
+    """Summarise a `contacts.json`: errors with all fibres, by contact, and where straight fibres are as good."""
     parts = []
     for pad in ("designed", "straight"):
         assumed, *others = [row["errors_mm"][0] for row in document["rows"] if row["pad"] == pad]
         parts.append(f"{assumed:.2f} mm under the assumed contact, {min(others):.2f} to {max(others):.2f} mm otherwise")
-    return f"contact: expected error {parts[0]}; of straight fibres {parts[1]}"
+    lines = [f"contact: expected error {parts[0]}; of straight fibres {parts[1]}"]
+    lost = [
+        f"{contact} with {' and '.join(map(str, levels))} failed"
+        for contact, shares in _shares_of_straight(document).items()
+        if (levels := [n_failed for n_failed, share in enumerate(shares) if share >= 1])
+    ]
+    return lines + [f"  straight fibres are as good or better: {'; '.join(lost)}"] * bool(lost)
+
+
+def _shares_of_straight(document: Mapping[str, Any]) -> dict[str, list[float]]:
+    """Return the errors of the designed pad over those of straight fibres, by contact."""
+    errors = {(row["contact"], row["pad"]): row["errors_mm"] for row in document["rows"]}
+    return {
+        contact: [a / b for a, b in zip(errors[contact, "designed"], errors[contact, "straight"], strict=True)]
+        for contact in dict.fromkeys(contact for contact, _ in errors)
+    }
 
 
 def contact_sections(folder: Path, document: Mapping[str, Any]) -> list[PageSection]:
@@ -315,4 +330,6 @@ def contact_sections(folder: Path, document: Mapping[str, Any]) -> list[PageSect
     )
     head = ["contact", "fibres", *(f"{n_failed} failed" for n_failed in levels)]
     body = [[row["contact"], row["pad"], *(f"{error:.2f}" for error in row["errors_mm"])] for row in rows]
+    for row, shares in enumerate(_shares_of_straight(document).values(), 1):  # after the two rows of each contact
+        body.insert(3 * row - 1, ["", "designed / straight", *(f"{share:.0%}" for share in shares)])
     return [PageSection("Contact model", [paragraph(lead), table(head, body)])]

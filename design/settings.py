@@ -467,8 +467,14 @@ class RulesSettings(Settings):
     max_length_mm: float = Field(default=500.0, gt=0, le=1e6, description="greatest length of a fibre, mm")
 
 
+def _check_contacts(value: object) -> object:
+    if isinstance(value, str) and value not in ("plausible", "assumed"):
+        raise ValueError('allowed are "plausible", "assumed" and a list of tables like [contact]')
+    return as_tuple(value)
+
+
 Weight = Annotated[float, Field(ge=0, le=1e6)]
-Contacts = Annotated[tuple[Contact, ...], BeforeValidator(as_tuple)]
+Contacts = Annotated[tuple[Contact, ...] | Literal["plausible", "assumed"], BeforeValidator(_check_contacts)]
 Weights = Annotated[tuple[Weight, Weight, Weight], BeforeValidator(as_tuple)]
 Steps = Annotated[Annotated[int, Field(ge=1, le=1_000_000)] | None, *null_as("contact")]
 MaxFailures = Annotated[
@@ -515,7 +521,8 @@ class SearchSettings(Settings):
         noise: additive scatter; this and the next two default to the scatter measured on a built pad. It is a share of
             the full scale of straight fibres: of the default pad under the default press for a layer, whose responses
             are strains, of the pad itself for other contacts, whose responses have no unit.
-        contacts: further contacts that the pad must serve beside `[contact]`, such as `{radius = 0.9}`.
+        contacts: what the pad must serve beside `[contact]`: "plausible" contacts, which it may really meet
+            (`padforge.design.contact_set`); none, if "assumed"; or a list of tables such as `{radius = 0.9}`.
     """
 
     method: Literal["descent", "genetic"] = Field(
@@ -544,7 +551,10 @@ class SearchSettings(Settings):
     scatter: float = Field(default=0.18, ge=0, le=1, description="scatter of a response between presses, share of it")
     scatter_common: float = Field(default=0.36, ge=0, le=0.99, description="share of its variance common to all fibres")
     sharpness: float = Field(default=0.0, ge=0, le=1e6, description="weight of the signals' mean second difference")
-    contacts: Contacts = Field(default=(), description="further contacts to serve as well, each a table like [contact]")
+    contacts: Contacts = Field(
+        default="plausible",
+        description='contacts to serve as well: "plausible" ones, none if "assumed", or tables like [contact]',
+    )
 
     @property
     def default_contact(self) -> Contact:

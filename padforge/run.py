@@ -155,7 +155,8 @@ def check_run(run: Run) -> None:
     import numpy as np
 
     from padforge.design.contact import describe_large_strain
-    from padforge.design.contact_comparison import alternative_contacts, design_contact
+    from padforge.design.contact_comparison import design_contact
+    from padforge.design.contact_set import judged_contacts
     from padforge.design.design_run import check_design
     from padforge.design.morphology import Morphology
     from padforge.design.settings import PadSettings, SearchSettings
@@ -174,8 +175,9 @@ def check_run(run: Run) -> None:
     pad, rig = run.spec.section(PadSettings), read_rig(run.spec, seed=run.seed)
     FabricationSettings.from_spec(run.spec).require_consistent(pad.layout)
     rig.inputs(pad.layout.fibres)
-    contact = design_contact(run.spec, run.spec.section(SearchSettings))
-    alternative_contacts(contact)
+    search = run.spec.section(SearchSettings)
+    contact = design_contact(run.spec, search)
+    judged_contacts(contact, search)
     plan = plan_simulation(Morphology.straight(pad.layout), rig, contact, pad)
     for notice in filter(None, (describe_other_depth(plan.depths_mm, contact), describe_large_strain(contact))):
         _log.warning(notice)
@@ -226,7 +228,7 @@ def run_stages(
     from padforge.design.contact_comparison import compare_contacts
     from padforge.design.design_run import load_result, run_design, summary_lines
     from padforge.design.optimize.search import SearchOptions
-    from padforge.design.report import contact_line
+    from padforge.design.report import contact_lines
     from padforge.fabricate import FabricationSettings, build
     from padforge.fabricate.cli import mould_lines
     from padforge.sense.localizer.evaluation import calibration_lines
@@ -303,7 +305,8 @@ def run_stages(
     )
     for line in calibration_lines(calibration):
         on_line(f"  {line}")
-    on_line(contact_line(contacts))
+    for line in contact_lines(contacts):
+        on_line(line)
     if cache.reused:
         _log.info("%s: reused from an earlier run: %s", out, ", ".join(cache.reused))
     return int(bool(design.violations) or any(finding["status"] == "fail" for finding in mould["findings"]))

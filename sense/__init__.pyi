@@ -24,9 +24,6 @@ from .recording.recording import Recording as Recording
 from .recording.run_directory import Recorder as Recorder
 from .settings import LocalizerSettings as LocalizerSettings
 from .settings import RigSettings as RigSettings
-from .signals.filters import RunningMedian as RunningMedian
-from .signals.filters import TotalVariation as TotalVariation
-from .signals.filters import find_segment_starts as find_segment_starts
 from .signals.filters import running_median as running_median
 from .signals.filters import total_variation as total_variation
 from .signals.press_detection import PressDetector as PressDetector

@@ -64,6 +64,8 @@ BOUND_WEIGHT, REGRESSION_WEIGHT = 0.85, 0.47
 """Weights of both terms, by which errors agree best with those of trained networks, within 7 % over straight, gently
 and strongly curved pads: a network's mean error is below the root of a variance, and it learns better than the ridge.
 """
+POWER = 12
+"""Of the mean over contacts and numbers of failed fibres of errors as shares of straight fibres'."""
 DEFAULT_FULL_SCALE = 0.182
 """Full scale of straight fibres of the default pad under the default press, a relative stretch."""
 FULL_SCALE_SIDE = 24
@@ -288,22 +290,31 @@ def expected_error(
     return BOUND_WEIGHT * bound + REGRESSION_WEIGHT * regression, gradient
 
 
-def aggregate_failures(errors: Array, masks: Array, shares: tuple[float, ...]) -> tuple[float, Array]:
-    """Return the geometric mean of errors over numbers of failed fibres: relative gains count alike at each.
+def averages(masks: Array, levels: int) -> Array:
+    """Return the weights (K, L) of sets of failed fibres in the means over those of each of K sizes, 0, 1, ... failed.
 
     Args:
-        errors: of each set of failed fibres; shape (L,).
-        masks: the sets; shape (L, F).
-        shares: P(k) of k = 0, 1, ... failed, as far as they occur there.
+        masks: the sets, 1 for a fibre that works; shape (L, F).
+        levels: K.
+    """
+    of_size = (masks == 0).sum(axis=1) == np.arange(levels)[:, None]
+    return of_size / np.maximum(of_size.sum(axis=1, keepdims=True), 1)
+
+
+def relative_error(errors: Array, straight: Array, shares: tuple[float, ...]) -> tuple[float, Array]:
+    """Return the power mean of errors as shares of those of straight fibres: the worst weighs most.
+
+    Args:
+        errors: by contact and number of failed fibres; shape (C, K).
+        straight: of straight fibres; shape (C, K).
+        shares: P(k) of k = 0, 1, ... failed.
 
     Returns:
-        The mean, and its derivatives (L,) by the errors.
+        The mean, and its derivatives (C, K) by the errors.
     """
-    n_failed = (masks == 0).sum(axis=1)
-    levels = [k for k in range(len(shares)) if (n_failed == k).any()]
-    weights = np.array([shares[k] for k in levels]) / sum(shares[k] for k in levels)
-    means = np.array([errors[n_failed == k].mean() for k in levels])
-    value, gradient = float(np.exp(np.log(means) @ weights)), np.zeros(len(errors))
-    for k, weight, mean in zip(levels, weights, means, strict=True):
-        gradient[n_failed == k] = value * weight / (mean * (n_failed == k).sum())
-    return value, gradient
+    weights = np.array(shares[: errors.shape[1]])
+    weights /= weights.sum() * len(errors)
+    ratios = errors / straight
+    total = float((weights * ratios**POWER).sum())
+    value = total ** (1 / POWER)
+    return value, value / total * weights * ratios ** (POWER - 1) / straight

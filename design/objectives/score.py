@@ -20,8 +20,7 @@ from padforge.design.contact import evaluated_signals, fibre_axes, serpentine_pr
 from padforge.design.morphology import Array, Morphology
 from padforge.design.objectives.ambiguity import AMBIGUITY_NOISE, ambiguities
 from padforge.design.objectives.bayes_error import expected_errors
-from padforge.design.objectives.expected_error import SEARCH_SIDE, criterion_errors
-from padforge.design.objectives.fibre_loss import failure_shares
+from padforge.design.objectives.expected_error import SEARCH_SIDE
 from padforge.design.objectives.penalties import PER_SPAN, check_comparisons, penalties
 from padforge.design.published import objective as formula
 from padforge.design.settings import PUBLISHED_CONTACT, Contact, PadSettings, RulesSettings, Scatter, SearchSettings
@@ -48,14 +47,6 @@ class ScoredPad:
                 parts = value if isinstance(value, Mapping) else {"": value}
                 values |= {f"{term.name}_{key}".rstrip("_"): part for key, part in parts.items()}
         return values
-
-    @property
-    def objective(self) -> float:
-        """What a search minimises: the geometric mean of its criterion over failures, and the weighted terms."""
-        errors = criterion_errors(self.pad, self.contact, self.search, self.size)
-        shares = failure_shares(self.search.max_failures)[: len(errors)]
-        total = float(np.exp(np.log(errors) @ shares / sum(shares)))
-        return sum((weight * self.terms([t.name])[t.name] for weight, t in weighted_terms(self.search)), start=total)
 
     @cached_property
     def expected_errors(self) -> list[float]:

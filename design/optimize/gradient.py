@@ -19,8 +19,8 @@ from padforge.design.objectives.score import weighted_terms
 from padforge.design.optimize.problem import SearchProblem
 from padforge.design.paths.curves import refine
 from padforge.design.paths.keep_outs import pass_keep_outs, straight_paths
-from padforge.design.settings import Layout, PadSettings, RulesSettings
-from padforge.design.signal_gradients import FibreCurves
+from padforge.design.settings import Contact, Layout, PadSettings, RulesSettings, Scatter
+from padforge.design.signal_gradients import Differentiate, FibreCurves
 
 
 class Schedule(NamedTuple):
@@ -31,7 +31,7 @@ class Schedule(NamedTuple):
     penalty_weights: tuple[float, float]  # weight of the rules at the first and at the last step
 
 
-GENTLE, STRICT = Schedule(0.02, 2, (0.3, 100.0)), Schedule(0.04, 4, (1.0, 300.0))
+GENTLE, STRICT = Schedule(0.02, 2, (1.6, 530.0)), Schedule(0.04, 4, (5.0, 1600.0))
 """Most starts are gentle: large steps and strong rules shake fibres out of what locates with two and three failed, too.
 But zigzags may tangle so that some rules stay broken, as that on the angle of crossings.
 """
@@ -362,12 +362,12 @@ class GradientSearch:
         return np.stack([found.by_along, found.by_across])
 
     def _objective(self, curves: FibreCurves, noise_factor: float) -> tuple[float, Array]:
-        """Return the expected error on random presses and failures, and the weighted terms; means over the contacts.
+        """Return the relative error on random presses and failures, and the weighted terms, means over the contacts.
 
         With it comes its gradient (3, F, n) by the curves.
         """
-        search, pad = self.problem.search, self.problem.pad
-        length, by_length = curves.lengths()
+        search, pad, contacts = self.problem.search, self.problem.pad, self.problem.contacts
+        length = curves.lengths()
         # 1. a random window, all of the pad unless it is large; another one if it lies in a keep-out; random failures
         presses = None
         while presses is None or not presses.free.any():
@@ -375,31 +375,53 @@ class GradientSearch:
             presses = objective.window_presses(pad, window, objective.SEARCH_SIDE, self.rng)
         shares = failure_shares(search.max_failures)
         masks = sample_failures(pad.layout.fibres, shares, self.rng)
-        stated_scatter, weights = search.response_scatter.scaled(noise_factor), objective.kernel_weights(pad.layout)
-        total, gradient = 0.0, np.zeros((3, *curves.along.shape))
-        for contact, scale in zip(self.problem.contacts, self.scales, strict=True):
-            per_signal = 1 / (scale * length[:, None])
-            # 2. far presses whose responses resemble some of the window
-            positions = presses.positions
-            if len(presses.far):
-                near, far = (
-                    weights[:, None] * per_signal * curves.signals(x, contact)[0]
-                    for x in (presses.positions, presses.far)
-                )
-                positions = presses.with_partners(objective.confusable(near, far, masks))
-            # 3. expected error, and the terms that `[search]` weighs
+        stated_scatter, straight = search.response_scatter.scaled(noise_factor), self.problem.straight_errors
+        # 2. expected errors under each contact, and how straight fibres compare
+        errors, differentiate = [], []
+        for contact, scale in zip(contacts, self.scales, strict=True):
             scatter = objective.scatter_of_full_scale(stated_scatter, contact, scale)
-            signals, differentiate = curves.signals(positions, contact)
-            responses = per_signal * signals
-            where = positions, presses.step, presses.free
-            errors, by_responses = objective.expected_error(responses, *where, masks, scatter, weights)
-            value, by_errors = objective.aggregate_failures(errors, masks, shares)
+            found = self._errors(curves, length, presses, masks, contact, scale, scatter)
+            errors.append(found[0])
+            differentiate.append(found[1])
+        averages = objective.averages(masks, straight.shape[1])
+        total, by_means = objective.relative_error(np.array(errors) @ averages.T, straight, shares)
+        gradient = np.sum([d(by) for d, by in zip(differentiate, by_means @ averages, strict=True)], axis=0)
+        # 3. the terms that `[search]` weighs
+        for weight, term in weighted_terms(search):
+            if term.loss is None:
+                continue
+            for contact in contacts:
+                value, by_curves = term.loss(curves, contact, pad)
+                total += weight * value / len(contacts)
+                gradient = gradient + weight / len(contacts) * by_curves
+        return total, gradient
+
+    def _errors(
+        self,
+        curves: FibreCurves,
+        lengths: tuple[Array, Array],
+        presses: objective.PressWindow,
+        masks: Array,
+        contact: Contact,
+        scale: float,
+        scatter: Scatter,
+    ) -> tuple[Array, Differentiate]:
+        """Return the expected errors (L,) under a contact, and what differentiates: from (L,) to (3, F, n)."""
+        (length, by_length), weights = lengths, objective.kernel_weights(self.problem.pad.layout)
+        per_signal, positions = 1 / (scale * length[:, None]), presses.positions
+        if len(presses.far):  # those whose responses resemble some of the window
+            near, far = (
+                weights[:, None] * per_signal * curves.signals(x, contact)[0] for x in (presses.positions, presses.far)
+            )
+            positions = presses.with_partners(objective.confusable(near, far, masks))
+        signals, by_signals = curves.signals(positions, contact)
+        responses = per_signal * signals
+        where = positions, presses.step, presses.free
+        errors, by_responses = objective.expected_error(responses, *where, masks, scatter, weights)
+
+        def differentiate(by_errors: Array) -> Array:
             by_response = np.tensordot(by_errors, by_responses, axes=1)
-            total += value
-            gradient += differentiate(by_response * per_signal)
-            gradient -= ((by_response * responses).sum(axis=1) / length)[:, None] * by_length
-            for weight, term in weighted_terms(search):
-                if term.loss is not None:
-                    value, by_curves = term.loss(curves, contact, pad)
-                    total, gradient = total + weight * value, gradient + weight * by_curves
-        return total / len(self.problem.contacts), gradient / len(self.problem.contacts)
+            by_lengths = (by_response * responses).sum(axis=1) / length
+            return by_signals(by_response * per_signal) - by_lengths[:, None] * by_length
+
+        return errors, differentiate

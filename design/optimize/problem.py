@@ -1,13 +1,19 @@
 """The problem that a search solves."""
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
+import numpy as np
+
 from padforge.design.common.validation import MAX_VALUES, InputError, check_type
-from padforge.design.morphology import Morphology
+from padforge.design.contact_set import served_contacts
+from padforge.design.morphology import Array, Morphology
 from padforge.design.objectives.ambiguity import free_presses
+from padforge.design.objectives.expected_error import criterion_errors, relative_error
 from padforge.design.objectives.fibre_loss import failure_shares
 from padforge.design.objectives.rules import Violation, check_rules
+from padforge.design.objectives.score import ScoredPad, weighted_terms
 from padforge.design.paths.keep_outs import check_fibre_ends
 from padforge.design.settings import Contact, PadSettings, RulesSettings, SearchSettings
 
@@ -42,6 +48,24 @@ class SearchProblem:
     def violations(self, pad: Morphology) -> list[Violation]:
         """Return the rules that a pad breaks; none if rules are not enforced."""
         return check_rules(pad, self.rules, self.pad) if self.rules.enforce else []
+
+    @cached_property
+    def straight_errors(self) -> Array:
+        """The criterion of straight fibres, grid units, by contact and number of failed fibres; shape (C, K)."""
+        return self._criterion(Morphology.straight(self.pad.layout))
+
+    def objective(self, pad: Morphology) -> float:
+        """Return what a search minimises, always on the same presses."""
+        shares = failure_shares(self.search.max_failures)
+        value, _ = relative_error(self._criterion(pad), self.straight_errors, shares)
+        for contact in self.contacts:
+            scored = ScoredPad(pad, contact, self.search, self.rules, self.pad)
+            for weight, term in weighted_terms(self.search):
+                value += weight * scored.terms([term.name])[term.name] / len(self.contacts)
+        return value
+
+    def _criterion(self, pad: Morphology) -> Array:
+        return np.array([criterion_errors(pad, contact, self.search, self.pad) for contact in self.contacts])
 
     def settings(self) -> dict[str, Any]:
         """Return everything a result depends on, as JSON, by section."""
@@ -86,4 +110,4 @@ def build_problem(
             raise InputError(
                 f"knots is {settings.knots}, allowed is at least the {knots} of the morphology to start from"
             )
-    return SearchProblem(pad, (contact, *settings.contacts), settings, rules, origin)
+    return SearchProblem(pad, tuple(served_contacts(contact, settings).values()), settings, rules, origin)

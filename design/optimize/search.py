@@ -172,8 +172,7 @@ def search(
             candidates.append(Candidate("origin", origin, problem))
         if problem.search.method != "genetic":  # the published method is left as it was published
             candidates.append(straight)
-        # fewest broken rules first, then the least objective, summed over the contacts
-        best = min(candidates, key=lambda c: (len(c.violations), sum(scored.objective for scored in c.scored)))
+        best = min(candidates, key=lambda c: (len(c.violations), c.objective))  # fewest broken rules first
         result = best.to_result(straight)
     history = [
         {"run": _name(problem, start), "step": int(step), "objective": value}
@@ -197,15 +196,20 @@ class Candidate:
         return self.problem.violations(self.pad)
 
     @cached_property
-    def scored(self) -> list[ScoredPad]:
-        """Its scores under each contact."""
+    def objective(self) -> float:
+        """What the search minimises."""
+        return self.problem.objective(self.pad)
+
+    @cached_property
+    def scored(self) -> ScoredPad:
+        """Its scores under the main contact."""
         p = self.problem
-        return [ScoredPad(self.pad, contact, p.search, p.rules, p.pad) for contact in p.contacts]
+        return ScoredPad(self.pad, p.contacts[0], p.search, p.rules, p.pad)
 
     def to_result(self, straight: "Candidate") -> SearchResult:
         """Return the result of a search that ends with it."""
-        terms = self.scored[0].terms(terms_of(self.problem.contacts[0]))
-        beside = straight.scored[0].terms(("expected_error_mm", "ambiguity_mm"))
+        terms = self.scored.terms(terms_of(self.problem.contacts[0]))
+        beside = straight.scored.terms(("expected_error_mm", "ambiguity_mm"))
         return SearchResult(self.pad, terms, self.violations, self.name, beside, self.problem.rules.enforce)
 
 

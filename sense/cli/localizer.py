@@ -227,10 +227,6 @@ def deploy(model: Path, files: tuple[Path, ...]) -> None:
         raise InputError(f"{files[1]}: one argument too many, expected [RECORDING] OUT")
     if path.suffix != ".onnx":
         raise InputError(f"{path}: cannot be written, expected a name that ends in .onnx")
-    if not path.parent.is_dir():
-        raise InputError(f"{path}: cannot be written, there is no folder {path.parent}")
-    if path.exists() and not path.is_file():
-        raise InputError(f"{path}: cannot be written, it is there and no file")
     check_writable(path.parent)
     localizer, digest = LocalizerModel.load(model), sha256(model / "localizer.json")
     opened = None if recording is None else read_recording(recording)

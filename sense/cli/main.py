@@ -65,7 +65,7 @@ def import_(file: Path, columns: str, out: Path | None) -> None:
       press           std_msgs Bool
       x, y, depth, reached
                       std_msgs Float64 or another number
-    A value holds until the next message. An .mcap whose end is missing is imported as far as it goes.
+    A value holds until the next message.
     """
     from padforge.design.common.files import provenance
     from padforge.sense.formats.columns import PRESSES_DETECTED, join_names

@@ -15,7 +15,6 @@ from padforge.sense.cli.options import FILE, FOLDER, recording_line, redrawn_lin
 if TYPE_CHECKING:
     from padforge.design.morphology import Morphology
     from padforge.design.settings import PadSettings
-    from padforge.sense.formats.ros_writer import McapFollower
     from padforge.sense.recording.recording import Recording
     from padforge.sense.rig.config import RigConfig
     from padforge.sense.rig.doctor import Diagnosis
@@ -51,7 +50,7 @@ def check_rig(name: str, simulated: bool = True) -> None:
 @click.option("--model", type=FOLDER, help="Localizer of an adaptive plan, which presses where it is least certain.")
 @click.option("--dry-run", is_flag=True, help="Move through the whole plan above the pad without touching it.")
 @click.option("--resume", is_flag=True, help="Continue an unfinished recording.")
-@click.option("--mcap", is_flag=True, help="Write OUT.mcap as well, for ROS 2 and Foxglove, whole after every press.")
+@click.option("--mcap", is_flag=True, help="At the end, export to OUT.mcap as well, for ROS 2 and Foxglove.")
 @common.seed_option
 @common.spec_option
 @common.out_option(what="Folder of the recording; must be new or empty")
@@ -85,8 +84,7 @@ def record(
     profile, gain and noise are the twin's.
 
     An interrupted recording keeps every finished press; --resume records the others.
-    --mcap writes the file that export would, beside the folder, and resumes it with --resume --mcap; while it
-    is recorded, and after a kill, it holds all finished presses. It needs the extra ros (pip install '.[ros]').
+    --mcap exports it once it is complete, beside the folder, which needs the extra ros (pip install '.[ros]').
     Software is not the emergency stop: keep the robot's own one within reach.
     """
     from padforge.design.contact import describe_large_strain
@@ -111,7 +109,7 @@ def record(
             raise InputError(f"--morphology is needed, of the pad under the arm: there is none at {morphology}")
         folder = common.pad_folder(morphology)
     pad = _load_pad(morphology, settings.section(PadSettings))
-    follower = _make_follower(target, dry_run, resume) if mcap else None
+    bag = _bag_path(target, dry_run, resume) if mcap else None
     inputs = [path for path in (morphology, twin, spec) if path is not None]
     overrides = {"presses": presses, "plan": plan, "seed": seed}
     options, contact = read_rig(settings, **overrides), read_contact(settings)
@@ -133,32 +131,28 @@ def record(
         inputs += [] if options.plan_file is None else [options.plan_file]
         command = f"padforge sense record --rig {rig}"
         pad_settings = settings.section(PadSettings, **pad.layout.settings)
-        config = RigConfig(pad, contact, options, target, command, inputs, pad_settings, folder, follower)
+        config = RigConfig(pad, contact, options, target, command, inputs, pad_settings, folder)
         recording = _record_with(rig, config, model, dry_run, resume)
     common.echo("dry run: every pose reached, nothing kept" if recording is None else recording_line(recording, target))
-    if follower is not None and recording is not None:
+    if bag is not None and recording is not None:
         from padforge.sense.formats.import_export import arm_states, export_file
 
-        export_file(recording, follower.path, states=arm_states(target))
-        common.echo(f"{target} -> {follower.path}")
+        export_file(recording, bag, states=arm_states(target))
+        common.echo(f"{target} -> {bag}")
 
 
-def _make_follower(target: Path, dry_run: bool, resume: bool) -> "McapFollower":
-    """Return what writes the .mcap file beside a recording; raise InputError, before anything moves, if it must not."""
-    from padforge.sense.formats.ros_writer import McapFollower
-    from padforge.sense.recording.run_directory import START
+def _bag_path(target: Path, dry_run: bool, resume: bool) -> Path:
+    """Return the path of the bag of a recording; raise InputError, before anything moves, if it cannot be written."""
+    from padforge.sense.formats.ros_writer import load_typestore
 
     if dry_run:
-        raise InputError("--mcap writes what is recorded, and --dry-run keeps nothing")
-    follower = McapFollower(_mcap_path(target))
-    if follower.path.exists() and not (resume and (target / START).exists()):
-        raise InputError(f"{follower.path}: exists, recordings are never written over; choose another --out")
-    return follower
-
-
-def _mcap_path(target: Path) -> Path:
+        raise InputError("--mcap exports what is recorded, and --dry-run keeps nothing")
     named = target if target.name.strip(".") else target.resolve()  # "." and ".." are no names
-    return named.with_name(f"{named.name}.mcap")
+    path = named.with_name(f"{named.name}.mcap")
+    load_typestore(f"{path}: MCAP")
+    if path.exists() and not resume:
+        raise InputError(f"{path}: exists, recordings are never written over; choose another --out")
+    return path
 
 
 def _load_pad(morphology: Path | None, pad_settings: "PadSettings") -> "Morphology":
@@ -174,8 +168,6 @@ def _record_with(rig: str, config: "RigConfig", model: Path | None, dry_run: boo
 
     if resume and not (config.out / START).exists():
         _warn(f"{config.out}: nothing to resume, a new recording begins")
-    if resume and config.follower is None and (mcap := _mcap_path(config.out)).exists():
-        _warn(f"{mcap}: stays as it is, without what is recorded now; --resume --mcap goes on with it")
     if rig == "hand":
         if dry_run or model:
             raise InputError("--dry-run and --model need an arm, allowed with --rig hand are --plan and --resume")

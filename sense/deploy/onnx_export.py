@@ -26,12 +26,12 @@ from padforge.design.common.files import atomic_file
 from padforge.design.common.parallel import one_torch_thread
 from padforge.design.common.validation import Fault, InputError
 from padforge.sense.arrays import Array, Indices
-from padforge.sense.localizer import features
-from padforge.sense.localizer.bayes import PREFIX, STAGES, BayesianLocalizer
-from padforge.sense.localizer.features import Window, compute_features, interpolate_gaps
+from padforge.sense.localizer import features, moments
+from padforge.sense.localizer.bayes import PREFIX, BayesianLocalizer
+from padforge.sense.localizer.features import compute_features, interpolate_gaps
 from padforge.sense.localizer.model import MEASURE_COLUMNS, UNIFORM, LocalizerModel
-from padforge.sense.localizer.moments import FOLLOWING, N_DOWN, PHASES, SOON, complete_at
-from padforge.sense.localizer.network import LEAST_SLIDE, MAX_LOG_ERROR, MIN_LOG_ERROR, Weights
+from padforge.sense.localizer.moments import FOLLOWING, LEAST_SLIDE, N_DOWN, PHASES, SOON, STAGES, Window, complete_at
+from padforge.sense.localizer.network import MAX_LOG_ERROR, MIN_LOG_ERROR, Weights
 from padforge.sense.localizer.scaler import MAX_INPUT
 from padforge.sense.localizer.torch_network import EnsembleMlp, network_inputs
 from padforge.sense.recording.recording import Recording
@@ -97,11 +97,11 @@ class _FeatureModule(nn.Module):
             index = torch.maximum(origin[:, None] + torch.arange(*window), low[:, None])
             return readings[torch.minimum(index, torch.minimum(high, n_readings)[:, None] - 1)].mean(dim=1)
 
-        means = [mean(down_command, each, down_command, held) for each in features.DOWN]
-        means += [mean(up_command, each, down_command, until) for each in features.UP]
-        means += [mean(held, each, down_command, held) for each in features.NOW]
-        rest = mean(down_command, features.REST, previous_end, down_command)
-        windows = functional.pad(torch.stack(means, dim=2) - rest[:, :, None], (0, len(features.MODULATED)))
+        means = [mean(down_command, each, down_command, held) for each in moments.DOWN]
+        means += [mean(up_command, each, down_command, until) for each in moments.UP]
+        means += [mean(held, each, down_command, held) for each in moments.NOW]
+        rest = mean(down_command, moments.REST, previous_end, down_command)
+        windows = functional.pad(torch.stack(means, dim=2) - rest[:, :, None], (0, len(moments.MODULATED)))
         history = _history(readings, down_command) - self.history_mean_v
         effect = (history.transpose(0, 1) @ self.history_coef).transpose(0, 1)
         scaled = torch.clip((windows - effect - self.mean_v) / self.scale_v, -MAX_INPUT, MAX_INPUT).float()
@@ -109,8 +109,8 @@ class _FeatureModule(nn.Module):
 
 
 def _complete_windows(down_command: Tensor, up_command: Tensor, until: Tensor) -> Tensor:
-    """(Q, K), as `features.complete_windows`."""
-    down_end, up_end = (torch.tensor([end for _, end in each]) for each in (features.DOWN, features.UP))
+    """(Q, K), as `moments.complete_windows`."""
+    down_end, up_end = (torch.tensor([end for _, end in each]) for each in (moments.DOWN, moments.UP))
     released = (until > up_command)[:, None]
     down = (down_command[:, None] + down_end <= until[:, None]) | released
     return torch.cat([down, released & (up_command[:, None] + up_end <= until[:, None])], dim=1)
@@ -136,7 +136,7 @@ def _history(readings: Tensor, down_command: Tensor) -> Tensor:
     for length in features.SLOW:
         offsets = torch.arange(-length, 0, length // features.SLOW_SAMPLES)
         means.append(_median(readings[torch.clamp(down_command[:, None] + offsets, min=0)]))
-    return torch.stack(means, dim=2) - mean(features.REST)[:, :, None]
+    return torch.stack(means, dim=2) - mean(moments.REST)[:, :, None]
 
 
 class _BayesModule(nn.Module):
@@ -175,7 +175,7 @@ class _LocalizerModule(nn.Module):
         self.features = _FeatureModule(model)
         self.networks = nn.ModuleDict({name: EnsembleMlp.from_numpy(each) for name, each in model.networks.items()})
         self.bayes = _BayesModule(*model.corrected) if model.bayes else None
-        for name, array in zip(("now_factor", "now_offset"), scaler.to_now(features.N_TIMED), strict=True):
+        for name, array in zip(("now_factor", "now_offset"), scaler.to_now(moments.N_TIMED), strict=True):
             self.register_buffer(name, torch.from_numpy(array))
         self.scale_mm, self.measures = scaler.scale_mm, scaler.measures
         units = [self.scale_mm] * 3 + [measure.scale for measure in self.measures]
@@ -215,7 +215,7 @@ class _LocalizerModule(nn.Module):
     def _predict(self, scaled: Tensor, fibre_mask: Tensor, x: Tensor, n_complete: Tensor) -> tuple[Tensor, Tensor]:
         """Return (Q, N) targets and their standard deviations, as `network.predict`."""
         outputs: Any = 0.0
-        for name, phase in PHASES[features.N_TIMED].items():
+        for name, phase in PHASES[moments.N_TIMED].items():
             network = self.networks[name]
             answers = (n_complete >= phase.first) & (n_complete < phase.first + len(phase.shares))
             outputs = torch.where(answers[:, None], network(x.expand(network.n_members, -1, -1)), outputs)
@@ -229,7 +229,7 @@ class _LocalizerModule(nn.Module):
 
     def _follow(self, scaled: Tensor, fibre_mask: Tensor, seen: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """`Sliding.follow`."""
-        network, n_timed = self.networks[FOLLOWING], features.N_TIMED
+        network, n_timed = self.networks[FOLLOWING], moments.N_TIMED
 
         def predict_from(scaled: Tensor, n_complete: int) -> tuple[Tensor, Tensor]:
             x = network_inputs(scaled, fibre_mask, seen & (torch.arange(n_timed) < n_complete))
@@ -238,7 +238,7 @@ class _LocalizerModule(nn.Module):
         targets, std = predict_from(scaled, N_DOWN)
         now = [
             scaled[:, :, SOON - 1 - k] * self.now_factor[:, k, SOON - 1 - k] + self.now_offset[:, k, SOON - 1 - k]
-            for k in range(len(features.NOW))
+            for k in range(len(moments.NOW))
         ]
         rest = scaled[:, :, n_timed + len(now) :]
         soon, soon_std = predict_from(torch.cat([scaled[:, :, :n_timed], torch.stack(now, dim=2), rest], dim=2), SOON)
@@ -347,7 +347,7 @@ def _made_up_presses(model: LocalizerModel) -> tuple[Array, Indices, Indices]:
     """Return noise with presses as strong as those of the training, and their commands."""
     rng, scaler = np.random.default_rng(0), model.scaler
     down_command = TRIAL_READINGS // 2 + TRIAL_READINGS * np.arange(N_TRIALS)
-    up_command = down_command + features.DOWN[-1][1]
+    up_command = down_command + moments.DOWN[-1][1]
     readings = 1e-3 * rng.standard_normal(((N_TRIALS + 1) * TRIAL_READINGS, model.fibres))
     response = np.abs(scaler.mean_v).max(axis=1) + scaler.scale_v.max(axis=1)
     for first, end in zip(down_command, up_command, strict=True):
@@ -363,7 +363,7 @@ def _compare(
     filled, last, with_previous = interpolate_gaps(readings), slice(-1, None), slice(-2, None)
     commands = down_command, up_command
     # The readings after the last press may end before all of its windows are complete.
-    ends = {min(int(complete_at(n, *commands)[-1]), len(readings)) for n in range(1, features.N_TIMED + 1)}
+    ends = {min(int(complete_at(n, *commands)[-1]), len(readings)) for n in range(1, moments.N_TIMED + 1)}
     trials = [(slice(None), compute_features(readings, *commands), filled, *commands)]
     for end in sorted(end for end in ends if end > down_command[-1] + 1):
         until = np.full(len(down_command), end)

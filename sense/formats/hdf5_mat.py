@@ -88,7 +88,7 @@ def import_hdf5(path: str | Path, columns: str = "") -> Recording:
         source = file.read_text("source")
     try:
         return Recording(**content, source=json.loads(source or ""))
-    except (InputError, ValueError, RecursionError) as error:
+    except (InputError, ValueError) as error:
         raise InputError(f"{path}: {error}") from error
 
 

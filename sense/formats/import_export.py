@@ -76,7 +76,7 @@ def find_reader(path: Path) -> Reader:
 def arm_states(path: Path) -> Array | None:
     """Return the (n, 10) states of the arm in a run directory, by `STATE_COLUMNS`; None if it has none."""
     file = path / STATES
-    return np.column_stack(read_blocks(file, len(STATE_COLUMNS) - 1)[:2]) if file.is_file() else None
+    return np.column_stack(read_blocks(file, len(STATE_COLUMNS) - 1)) if file.is_file() else None
 
 
 def export_file(

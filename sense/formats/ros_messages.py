@@ -35,7 +35,6 @@ UNKNOWN_VARIANCE = -1.0
 """Variance of an unknown quantity, as in `sensor_msgs/msg/Imu`."""
 Z90 = 1.6449
 """Standard deviations that hold 90 % of a normal distribution, two-sided."""
-_MAX_STAMP_S = 2**31
 _INDICES = ("down_command", "up_command")
 _NUMBERS = ("times_s", "presses_mm", "depths_mm", "reached_mm", "forces_n")
 
@@ -103,10 +102,8 @@ class TopicSeries(NamedTuple):
 
 
 def choose_epoch(times_s: Array) -> float:
-    """Return the time that stamps count from: 0, unless they cannot hold the (n,) times as they are."""
-    if times_s[-1] - times_s[0] >= _MAX_STAMP_S - 2:
-        raise InputError(f"recording lasts {times_s[-1] - times_s[0]:g} s, allowed in a bag are {_MAX_STAMP_S - 2}")
-    return 0.0 if times_s[0] >= 0 and times_s[-1] < _MAX_STAMP_S - 1 else float(np.floor(times_s[0]))
+    """Return the time that stamps count from: 0, unless the (n,) times begin before, which stamps cannot hold."""
+    return min(0.0, float(np.floor(times_s[0])))
 
 
 def to_stamps(times_s: Array, epoch_s: float) -> Indices:
@@ -133,45 +130,24 @@ def upward(mirrored: bool) -> float:
 
 def to_topics(recording: Recording, epoch_s: float) -> dict[str, TopicSeries]:
     """Return the topics of a recording that have messages, but for RECORDING."""
-    stamps = to_stamps(recording.times_s, epoch_s)
-    measures = recording.depths_mm, recording.reached_mm, recording.forces_n
-    presses = np.column_stack([recording.presses_mm, recording.down_command, recording.up_command, *measures])
-    topics = press_topics(presses.astype(np.float64), stamps, recording.mirrored)
-    return {READINGS: TopicSeries(stamps, recording.readings), **topics}
-
-
-def press_topics(presses: Array, stamps: Indices, mirrored: bool) -> dict[str, TopicSeries]:
-    """Return the topics of presses that have messages.
-
-    Args:
-        presses: (Q, 7) with Q >= 1, a `Press` of a run directory each.
-        stamps: (R,) of all readings, ns.
-        mirrored: whether the pad lay with its tracks up.
-    """
-    x_mm, y_mm, down_command, up_command, depths_mm, reached_mm, forces_n = presses.T
-    down, up = (stamps_at(stamps, readings.astype(np.int64)) for readings in (down_command, up_command))
-    x_y = x_mm / 1000, y_mm / 1000
-    covariances = np.zeros((len(presses), 36))
+    stamps, mirrored = to_stamps(recording.times_s, epoch_s), recording.mirrored
+    depths_mm, reached_mm, forces_n = recording.depths_mm, recording.reached_mm, recording.forces_n
+    down, up = (stamps_at(stamps, readings) for readings in (recording.down_command, recording.up_command))
+    x_y = recording.presses_mm / 1000
+    covariances = np.zeros((len(down), 36))
     covariances[np.isnan(depths_mm), DEPTH_VARIANCE] = UNKNOWN_VARIANCE
 
     def at_presses(valid: Mask, *columns: Array) -> TopicSeries:
         return TopicSeries(down[valid], np.column_stack(columns)[valid])
 
     topics = {
-        PRESSED: TopicSeries(np.column_stack([down, up]).ravel(), np.tile([[1.0], [0.0]], (len(presses), 1))),
-        PLACE: at_presses(~np.isnan(x_mm), *x_y, depths_to_z(depths_mm, mirrored), covariances),
-        REACHED: at_presses(~np.isnan(reached_mm), *x_y, depths_to_z(reached_mm, mirrored)),
+        READINGS: TopicSeries(stamps, recording.readings),
+        PRESSED: TopicSeries(np.column_stack([down, up]).ravel(), np.tile([[1.0], [0.0]], (len(down), 1))),
+        PLACE: at_presses(recording.has_position, x_y, depths_to_z(depths_mm, mirrored), covariances),
+        REACHED: at_presses(~np.isnan(reached_mm), x_y, depths_to_z(reached_mm, mirrored)),
         FORCE: at_presses(~np.isnan(forces_n), upward(mirrored) * forces_n),
     }
     return {topic: series for topic, series in topics.items() if len(series.stamps)}
-
-
-def withdrawn_places(presses: Array, stamps: Indices) -> TopicSeries:
-    """Return PLACE of (Q, 7) presses whose positions turned out to be unknown: NaN in place of those of before."""
-    unknown = np.full((len(presses), 3), np.nan)
-    covariances = np.zeros((len(presses), 36))
-    covariances[:, [0, 7, DEPTH_VARIANCE]] = UNKNOWN_VARIANCE
-    return TopicSeries(stamps_at(stamps, presses[:, 2].astype(np.int64)), np.column_stack([unknown, covariances]))
 
 
 def touches(recording: Recording, annotations: ModelAnnotations, epoch_s: float) -> TopicSeries:
@@ -187,8 +163,7 @@ def touches(recording: Recording, annotations: ModelAnnotations, epoch_s: float)
 
 def arm_poses(states: Array, epoch_s: float) -> TopicSeries:
     """Return ARM from (n, 10) states, in m and with rotation vectors as quaternions; only of times that stamps hold."""
-    is_stamped = (states[:, 0] >= epoch_s) & (states[:, 0] - epoch_s < _MAX_STAMP_S - 1)
-    states = states[np.isfinite(states[:, :7]).all(axis=1) & is_stamped]
+    states = states[np.isfinite(states[:, :7]).all(axis=1) & (states[:, 0] >= epoch_s)]
     angle = np.linalg.norm(states[:, 4:7], axis=1)
     x_y_z = states[:, 4:7] * (np.sinc(angle / (2 * np.pi)) / 2)[:, None]  # sin(angle / 2) along the axis
     return TopicSeries(
@@ -296,7 +271,7 @@ def from_text(text: str, readings: Array) -> tuple[Recording, float, str] | None
         arrays: dict[str, Any] = {name: np.array(document[name], np.float64) for name in (*_NUMBERS, *_INDICES)}
         recording = Recording(readings=readings, **arrays, source=document["source"])
         return recording, check_float("epoch_s", document["epoch_s"], -MAX_S, MAX_S), str(document["digest"])
-    except (InputError, KeyError, TypeError, ValueError, OverflowError, RecursionError):
+    except (InputError, KeyError, TypeError, ValueError):
         return None
 
 
@@ -304,7 +279,9 @@ def encode_health(
     store: "Typestore", recording: Recording, annotations: ModelAnnotations, stamps: Indices
 ) -> tuple[Indices, list[memoryview]]:
     """Return HEALTH, (n,) stamps and messages: all fibres at the first reading, and whenever a fault was named."""
-    faults = dict.fromkeys(annotations.dead, ("dead", "was dead in the recording that health was learnt from"))
+    faults: dict[int, tuple[str, str]] = dict.fromkeys(
+        annotations.dead, ("dead", "was dead in the recording that health was learnt from")
+    )
     states = [(int(stamps[0]), faults)]
     ends = stamps_at(stamps, recording.up_command).tolist()
     for fault in annotations.faults or ():

@@ -1,29 +1,22 @@
 """Recordings from and to bags of ROS 2: bags that `export_bag` wrote, and any others by a mapping of their topics.
 
-An MCAP file that lacks its end, since its recorder was killed or a copy broken off, is read as far as its messages are
-whole, and the recording says so. Otherwise damage is an error.
-
-MCAP is read by the library rosbags, in sequence, whatever an index says; SQLite, read-only, by the standard library. Of
-a folder only the storage files directly in it are opened.
+The library rosbags reads and writes them. A file without its end is refused; `ros2 bag reindex` and `mcap recover`
+repair it.
 """
 
-import re
-import sqlite3
-import struct
-from collections.abc import Callable, Generator, Iterator, Mapping
-from contextlib import closing, contextmanager
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import replace
 from heapq import merge
 from itertools import repeat
 from operator import itemgetter
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, BinaryIO, NamedTuple
-from urllib.parse import quote
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from padforge.design.common.files import UNFINISHED, atomic_files, check_file, read_bytes, reraise_write_error
+from padforge.design.common.files import UNFINISHED, atomic_files, check_file, reraise_write_error
 from padforge.design.common.validation import InputError, short_repr
 from padforge.sense.arrays import MAX_BYTES, Array, Indices, check_numbers
 from padforge.sense.formats import ros_messages
@@ -66,14 +59,6 @@ SUFFIXES = (".mcap", ".db3")
 METADATA = "metadata.yaml"
 """The file that makes a folder a rosbag2 bag."""
 
-_MAGIC = b"\x89MCAP0\r\n"
-_HEADER = struct.Struct("<BQ")  # of a record: opcode and length
-_FOOTER, _FOOTER_BYTES = _HEADER.pack(2, 20), 9 + 20 + len(_MAGIC)
-_DATA_OPCODES = {1, 3, 4, 5, 6, 7, 9, 12, *range(128, 256)}  # of records before the index, and of extensions
-_MESSAGE, _MIN_MESSAGE, _CHUNK, _DATA_END = 5, 22, 6, 15
-_SCANNED = {3, 4, _CHUNK}  # schemas and channels as well
-_CHUNK_HEADER = struct.Struct("<B4QIIQ")  # of one that is not packed: the name of its compression has length 0
-
 QUANTITIES = ("fibres", "positions", "x", "y", "depth", "reached", "force", "press")
 """Quantities that topics may hold."""
 _NUMBERS = ("Float32", "Float64", "Int8", "Int16", "Int32", "Int64", "UInt8", "UInt16", "UInt32", "UInt64")
@@ -106,11 +91,10 @@ _Arrays = list[tuple[ColumnEntry, NDArray[Any]]]
 
 
 class BagContent(NamedTuple):
-    """The topics of a bag that were asked for and have messages, the types of all topics, by name, and what is lost."""
+    """The topics of a bag that were asked for and have messages, and the types of all topics, by name."""
 
     topics: dict[str, RawMessages]
     types: dict[str, str]
-    note: dict[str, str]  # NOTE says it, for the source of a recording; empty if nothing is
 
 
 def read_bag(path: Path, is_wanted: Callable[[str], bool]) -> BagContent:
@@ -120,162 +104,31 @@ def read_bag(path: Path, is_wanted: Callable[[str], bool]) -> BagContent:
         path: of the file or folder.
         is_wanted: whether a topic is asked for, by its name.
     """
-    topics, types, notes = dict[str, RawMessages](), dict[str, str](), list[str]()
-    for file in _storage_files(path):
-        check_file(file, MAX_BYTES)
-        with _one_line_errors(file), closing(_read_storage(file, types, notes, is_wanted)) as messages:
-            for name, stamp, message in messages:
-                topic = topics.setdefault(name, RawMessages(types[name], [], []))
+    from rosbags.rosbag2 import Reader
+
+    if not path.is_dir():
+        check_file(path, MAX_BYTES)
+    topics = dict[str, RawMessages]()
+    with _one_line_errors(path), Reader(path) as reader:
+        types = {connection.topic: connection.msgtype for connection in reader.connections}
+        # None at all would be all topics.
+        if wanted := [connection for connection in reader.connections if is_wanted(connection.topic)]:
+            for connection, stamp, message in reader.messages(wanted):
+                topic = topics.setdefault(connection.topic, RawMessages(connection.msgtype, [], []))
                 topic.stamps.append(stamp)
                 topic.messages.append(message)
-    return BagContent(topics, types, {NOTE: "; ".join(notes)} if notes else {})
-
-
-def _storage_files(path: Path) -> list[Path]:
-    """Return the files of a bag in the order in which they were recorded."""
-    if not path.is_dir():
-        return [path]
-    metadata = read_bytes(path / METADATA).decode(errors="replace")
-    mode = re.search(r"^[ \t]*compression_mode:[ \t]*[\"']?(file|message)\b", metadata, re.IGNORECASE | re.MULTILINE)
-    if mode:
-        raise InputError(f"{path}: is compressed by {mode[1]}, expected none or by chunk (ros2 bag convert)")
-
-    def number(file: Path) -> tuple[int, str]:
-        suffix = re.search(r"_(\d{1,9})$", file.stem)
-        return (int(suffix[1]) if suffix else -1, file.name)
-
-    files = sorted((file for file in path.iterdir() if file.suffix.lower() in SUFFIXES), key=number)
-    if not files:
-        raise InputError(f"{path}: has {METADATA}, but no file that ends in {' or '.join(SUFFIXES)}")
-    return files
+    return BagContent(topics, types)
 
 
 @contextmanager
 def _one_line_errors(path: Path) -> Iterator[None]:
     try:
         yield
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from error
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror or error})") from error
-    except Exception as error:  # rosbags raises many kinds on torn files
+    except Exception as error:  # rosbags raises many kinds on files that are cut off
         reason = " ".join(f"{error or type(error).__name__}".replace(str(path), path.name).split())[:200]
         raise InputError(f"{path}: no bag, or cut off or damaged ({reason})") from error
-
-
-def _read_storage(
-    path: Path, types: dict[str, str], notes: list[str], is_wanted: Callable[[str], bool]
-) -> Generator[tuple[str, int, bytes], None, None]:
-    """Yield topic, stamp and content of the messages asked for; add the types of all topics, and what is lost."""
-
-    def is_selected(name: str, msgtype: str, encoding: str) -> bool:
-        msgtype = msgtype if msgtype.count("/") == 2 else msgtype.replace("/", "/msg/")  # the short form of ROS 1
-        if types.setdefault(name, msgtype) != msgtype:
-            raise InputError(f"topic {short_repr(name)} is of {short_repr(types[name])} and of {short_repr(msgtype)}")
-        if is_wanted(name) and encoding != "cdr":
-            raise InputError(f"topic {short_repr(name)} is written as {short_repr(encoding)}, expected 'cdr'")
-        return is_wanted(name)
-
-    return _read_mcap(path, is_selected, notes) if path.suffix.lower() == ".mcap" else _read_sqlite(path, is_selected)
-
-
-def _read_mcap(
-    path: Path, is_selected: Callable[[str, str, str], bool], notes: list[str]
-) -> Generator[tuple[str, int, bytes], None, None]:
-    from rosbags.rosbag2.storage_mcap import McapReader
-
-    storage = McapReader(path)
-    if lacks_end := _lacks_end(path):
-        storage.bio = path.open("rb")
-    else:
-        storage.open()
-    with closing(storage):
-        parts = [(storage.data_start, storage.data_end)]
-        if lacks_end:
-            parts, note = _recover(storage, path.stat().st_size)
-            notes.append(note)
-        selected = [
-            connection
-            for connection in storage.connections
-            if is_selected(connection.topic, connection.msgtype, connection.ext.serialization_format)  # pyright: ignore
-        ]
-        n_messages, n_expected = 0, sum(connection.msgcount for connection in selected)
-        for storage.data_start, storage.data_end in parts:
-            for connection, stamp, message in storage.messages_scan(selected):
-                n_messages += 1
-                yield connection.topic, stamp, message
-    if n_messages < n_expected:  # rosbags ends without an error at a record that is longer than its chunk
-        raise InputError(f"is cut off or damaged ({n_messages} of {n_expected} messages can be read)")
-
-
-def _lacks_end(path: Path) -> bool:
-    """Whether an MCAP file ends otherwise than with the footer of its index."""
-    with path.open("rb") as file:
-        if file.read(len(_MAGIC)) != _MAGIC:
-            return False  # not one at all
-        file.seek(max(path.stat().st_size - _FOOTER_BYTES, 0))
-        end = file.read()
-    return not (end.startswith(_FOOTER) and end.endswith(_MAGIC))
-
-
-def _recover(storage: Any, size: int) -> tuple[list[tuple[int, int]], str]:
-    """Have rosbags open a file of a size without its end; return the parts that are whole, and what is lost."""
-    end, n_messages, opcode = _scan(storage, len(_MAGIC), size)
-    parts = [(len(_MAGIC), end)]
-    chunk = _read_at(storage.bio, end, _CHUNK_HEADER.size)
-    if opcode == _CHUNK and len(chunk) == _CHUNK_HEADER.size and _CHUNK_HEADER.unpack(chunk)[-2] == 0:
-        # The records in a chunk that is not packed are like those of the file itself.
-        start = end + len(chunk)
-        end, n_more, _ = _scan(storage, start, size)
-        parts.append((start, end))
-        n_messages += n_more
-    if not n_messages:
-        raise InputError("is cut off before its first whole message")
-    if opcode == _DATA_END:
-        return parts, "is cut off in its index, and lacks no message"
-    return parts, f"is cut off; read are {end} bytes of whole messages, {size - end} more are left out"
-
-
-def _scan(storage: Any, start: int, size: int) -> tuple[int, int, int]:
-    """Return where whole records end, how many messages they have, and the opcode of the next one; 0 without."""
-    end, n_messages = start, 0
-    while len(header := _read_at(storage.bio, end, _HEADER.size)) == _HEADER.size:
-        opcode, length = _HEADER.unpack(header)
-        after = end + _HEADER.size + length
-        if opcode not in _DATA_OPCODES or after > size or (opcode == _MESSAGE and length < _MIN_MESSAGE):
-            return end, n_messages, opcode
-        if opcode in _SCANNED:
-            storage.data_start, storage.data_end = end, after
-            try:
-                storage.meta_scan()  # unpacks a chunk: its length may be right, and its content not written
-            except Exception:  # rosbags raises many kinds
-                return end, n_messages, opcode
-            n_messages += storage.statistics.message_count
-        n_messages += opcode == _MESSAGE
-        end = after
-    return end, n_messages, 0
-
-
-def _read_at(file: BinaryIO, position: int, size: int) -> bytes:
-    file.seek(position)
-    return file.read(size)
-
-
-def _read_sqlite(
-    path: Path, is_selected: Callable[[str, str, str], bool]
-) -> Generator[tuple[str, int, bytes], None, None]:
-    with closing(sqlite3.connect(f"file:{quote(str(path.absolute()))}?mode=ro&immutable=1", uri=True)) as database:
-        topics = {
-            number: str(name)
-            for number, name, *types in database.execute("SELECT id, name, type, serialization_format FROM topics")
-            if is_selected(str(name), *map(str, types))
-        }
-        # Row by row as they are stored: to sort them, SQLite would keep all.
-        for number, stamp, message in database.execute("SELECT topic_id, timestamp, data FROM messages NOT INDEXED"):
-            if number in topics:
-                if not isinstance(stamp, int) or not isinstance(message, bytes):
-                    raise InputError(f"a message has a {type(message).__name__} where rosbag2 has bytes")
-                yield topics[number], stamp, message
 
 
 def import_bag(path: str | Path, columns: str = "") -> Recording:
@@ -296,13 +149,13 @@ def import_bag(path: str | Path, columns: str = "") -> Recording:
 def _import_exported(store: "Typestore", path: Path) -> Recording:
     """Read a bag that was exported: exactly as it was if all messages still agree, else as the messages say."""
     number_topics = (READINGS, PRESSED, PLACE, REACHED, FORCE)
-    raw, types, note = read_bag(path, {*number_topics, RECORDING}.__contains__)
+    raw, types = read_bag(path, {*number_topics, RECORDING}.__contains__)
     if READINGS not in raw:
         raise InputError(
             f"{path}: has no topic {READINGS}; columns (--columns) say what other topics hold, "
             f"there are {join_names(list(types))}"
         )
-    source = {"kind": "ros", "file": path.name, **note}
+    source = {"kind": "ros", "file": path.name}
     with naming_file(path):
         for name, topic in raw.items():
             if topic.msgtype != TOPICS[name].msgtype:
@@ -312,9 +165,9 @@ def _import_exported(store: "Typestore", path: Path) -> Recording:
         }
         if RECORDING in raw:
             if (recording := _restore(ros_messages.decode_text(store, raw[RECORDING]), topics)) is not None:
-                return replace(recording, source={**recording.source, **note}) if note else recording
-            source.setdefault(NOTE, f"was changed since it was exported; {RECORDING} is left out")
-        arrays = _to_arrays(topics, is_cut=bool(note))
+                return recording
+            source[NOTE] = f"was changed since it was exported; {RECORDING} is left out"
+        arrays = _to_arrays(topics)
     return assemble_recording(path, arrays, source)
 
 
@@ -332,13 +185,13 @@ def _restore(text: str, topics: Mapping[str, TopicSeries]) -> Recording | None:
     return replace(recording, source={**recording.source, NOTE: "readings are not those that were exported"})
 
 
-def _to_arrays(topics: Mapping[str, TopicSeries], is_cut: bool) -> _Arrays:
+def _to_arrays(topics: Mapping[str, TopicSeries]) -> _Arrays:
     """Return what the messages of an exported bag say by themselves."""
     stamps, readings = topics[READINGS]
     arrays: _Arrays = [(ColumnEntry("time", ""), stamps / 1e9), (ColumnEntry("fibres", READINGS), readings)]
     if PRESSED not in topics:
         return arrays
-    down, up = _find_commands(topics[PRESSED], stamps, is_cut)
+    down, up = _find_commands(topics[PRESSED], stamps)
 
     def in_presses(topic: str, column: int, factor: float = 1e3) -> Array:
         """Return the number of the last message in each press; NaN without one."""
@@ -364,17 +217,15 @@ def _commands(down: Indices, up: Indices) -> _Arrays:
     return [(ColumnEntry("down_command", "", 1.0), down / 1e9), (ColumnEntry("up_command", "", 1.0), up / 1e9)]
 
 
-def _find_commands(pressed: TopicSeries, readings: Indices, is_cut: bool) -> tuple[Indices, Indices]:
+def _find_commands(pressed: TopicSeries, readings: Indices) -> tuple[Indices, Indices]:
     """Return the (Q,) stamps at which presses begin and end; the first reading is before all presses.
 
-    A press that is held at the end of the bag ends with its last reading, or is left out of a file without its end.
+    A press that is held at the end of the bag ends with its last reading.
     """
     is_down = pressed.values[:, 0] != 0
     was_down = np.append(False, is_down[:-1])
     down, up = pressed.stamps[is_down & ~was_down], pressed.stamps[~is_down & was_down]
-    if len(up) < len(down) and is_cut:
-        down = down[:-1]
-    elif len(up) < len(down):
+    if len(up) < len(down):
         up = np.append(up, ros_messages.stamps_at(readings, np.array([len(readings)])))
     valid = (down > readings[0]) & (down <= readings[-1])
     if not valid.any():
@@ -384,7 +235,7 @@ def _find_commands(pressed: TopicSeries, readings: Indices, is_cut: bool) -> tup
 
 def _import_mapped(store: "Typestore", path: Path, columns: str) -> Recording:
     entries = parse_columns(columns, QUANTITIES)
-    raw, types, note = read_bag(path, lambda name: any(matches(name, entry.name) for entry in entries))
+    raw, types = read_bag(path, lambda name: any(matches(name, entry.name) for entry in entries))
     names = sorted(types)  # bags list topics as they were discovered, each bag in another order
     with naming_file(path):
         series = [(entry, _decode_entry(store, entry, raw)) for entry, _ in match_columns(entries, names)]
@@ -392,7 +243,7 @@ def _import_mapped(store: "Typestore", path: Path, columns: str) -> Recording:
         arrays: _Arrays = [(ColumnEntry("time", ""), clock / 1e9)]
         for entry, topic in series:
             if entry.quantity == "press":
-                arrays += _commands(*_find_commands(topic, clock, is_cut=bool(note)))
+                arrays += _commands(*_find_commands(topic, clock))
                 continue
             if entry.factor is None and UNITS[entry.quantity] is MILLIMETRES:
                 entry = entry._replace(factor=MILLIMETRES["m"])
@@ -401,7 +252,7 @@ def _import_mapped(store: "Typestore", path: Path, columns: str) -> Recording:
                 values = np.linalg.norm(values, axis=1, keepdims=True)
             values = values if entry.quantity in ("fibres", "positions") else values[:, 0]
             arrays.append((entry, _hold(topic.stamps, values, clock)))
-    return assemble_recording(path, arrays, {"kind": "ros", "file": path.name, "columns": columns, **note})
+    return assemble_recording(path, arrays, {"kind": "ros", "file": path.name, "columns": columns})
 
 
 def _decode_entry(store: "Typestore", entry: ColumnEntry, raw: Mapping[str, RawMessages]) -> TopicSeries:

@@ -10,7 +10,6 @@ from math import exp, hypot, sqrt
 
 import numpy as np
 
-from padforge.design.common.validation import check_type
 from padforge.sense.arrays import Array, Mask
 from padforge.sense.health.health_model import HealthModel
 from padforge.sense.localizer.features import mean_at_rest
@@ -70,9 +69,8 @@ def detect_shifts(
     Raises:
         InputError: as `LocalizerModel.raw_features`.
     """
-    check_type("health", health, HealthModel)
     shifts = _rest_shifts(health, recording, fibre_mask)
-    if check_type("localizer", localizer, LocalizerModel).features == "windows":
+    if localizer.features == "windows":
         shifts += _gain_shifts(localizer, health.presses, recording, fibre_mask)
     return shifts
 

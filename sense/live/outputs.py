@@ -4,13 +4,13 @@ A message is a `publish` operation of the rosbridge protocol with a standard mes
 has in an exported bag, so that a bridge has nothing to convert. Beside it stand the same values in mm and V.
 """
 
-import contextlib
 import hmac
 import json
 import math
 import queue
 import socketserver
 import threading
+from collections import deque
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, Protocol
@@ -24,9 +24,7 @@ from padforge.sense.live.pipeline import Estimate, Event, Live
 
 FORMAT = "padforge-live/3"
 MAX_QUEUED = 4096  # lines that wait for a subscriber; one that is further behind is disconnected
-MAX_SUBSCRIBERS = 32
 SEND_TIMEOUT_S = 10.0  # a subscriber that receives nothing for this time is disconnected
-MAX_COMMANDS = 16  # of a page that wait to be read: a button may be hit again and again
 _OK, _ERROR = 0, 2  # levels of a `DiagnosticStatus`
 
 
@@ -153,15 +151,11 @@ class JsonLines(ConnectionServer):
                 subscriber.put(None)
             self._changed.wait_for(lambda: not self._subscribers, timeout_s)
 
-    def subscribe(self, subscriber: "_Subscriber") -> bool:
-        """Add a subscriber; return False if there are too many."""
+    def subscribe(self, subscriber: "_Subscriber") -> None:
         with self._changed:
-            if len(self._subscribers) >= MAX_SUBSCRIBERS:
-                return False
             self._subscribers.add(subscriber)
             if self._health is not None:
                 subscriber.put(self._health)
-            return True
 
     def unsubscribe(self, subscriber: "_Subscriber") -> None:
         with self._changed:
@@ -188,8 +182,7 @@ class _Subscriber(socketserver.StreamRequestHandler):
         token = self.server.token.encode()
         if token and not hmac.compare_digest(self.rfile.readline(len(token) + 2).rstrip(b"\r\n"), token):
             return
-        if not self.server.subscribe(self):
-            return
+        self.server.subscribe(self)
         try:
             while not self._is_behind and (line := self._lines.get()) is not None:
                 self.wfile.write(line)
@@ -206,18 +199,17 @@ class LivePage(LocalPage):
     def __init__(
         self, port: int, page: str = "live.html", commands: Collection[str] = (), *, host: str = HOST, token: str = ""
     ) -> None:
-        self._allowed, self._commands = frozenset(commands), queue.Queue[str](MAX_COMMANDS)
+        self._allowed, self._commands = frozenset(commands), deque[str]()
         text = page_text("padforge.sense.live", f"pages/{page}", "pages/common.css", "pages/common.js")
         super().__init__(port, text, {"/command": self._on_command}, host=host, token=token)
 
     def read_commands(self) -> list[str]:
         """Return the commands that the page has sent since the last call, oldest first."""
-        return [self._commands.get_nowait() for _ in range(self._commands.qsize())]
+        return [self._commands.popleft() for _ in range(len(self._commands))]
 
     def _on_command(self, body: bytes) -> None:
         command = body.decode("ascii", "replace")
         if command not in self._allowed:
             allowed = ", ".join(sorted(self._allowed)) or "none"
             raise InputError(f"command is {short_repr(command)}, allowed are {allowed}")
-        with contextlib.suppress(queue.Full):
-            self._commands.put_nowait(command)
+        self._commands.append(command)

@@ -12,20 +12,15 @@ from typing import Any, Literal
 
 import numpy as np
 
-from padforge.design.common.validation import InputError, check_float, check_int, check_type
-from padforge.sense.arrays import MAX_FIBRES, MAX_RATE_HZ, MIN_RATE_HZ, Array, Mask, check_stream
+from padforge.design.common.validation import InputError
+from padforge.sense.arrays import Array, Mask, check_stream
 from padforge.sense.health.fault_detector import FaultMonitor, FibreFault
 from padforge.sense.health.health_model import HealthModel
 from padforge.sense.health.trace_model import RELEASED
 from padforge.sense.localizer.features import (
-    DOWN,
     MEDIAN,
     MEDIAN_OFFSET,
-    MODULATED,
-    REST,
-    UP,
     PressFeatures,
-    complete_windows,
     compute_features,
     compute_history,
     interpolate_gaps,
@@ -35,6 +30,7 @@ from padforge.sense.localizer.features import (
 )
 from padforge.sense.localizer.model import MEASURE_COLUMNS, LocalizerModel
 from padforge.sense.localizer.model_files import check_same_pad
+from padforge.sense.localizer.moments import DOWN, MODULATED, REST, UP, complete_windows
 from padforge.sense.localizer.scaler import ScaledFeatures
 from padforge.sense.rig.streams import HISTORY, SLACK, RingBuffer
 from padforge.sense.signals.press_detection import RELEASE_DELAY_S, TOUCH_DELAY_S, PressDetector
@@ -169,9 +165,7 @@ class Live:
     """
 
     def __init__(self, localizer: LocalizerModel, health: HealthModel | None, fibres: int, rate_hz: float) -> None:
-        fibres = check_int("fibres", fibres, 1, MAX_FIBRES)
-        rate_hz = check_float("rate_hz", rate_hz, MIN_RATE_HZ, MAX_RATE_HZ)
-        check_same_pad(check_type("localizer", localizer, LocalizerModel), "the localizer", fibres, rate_hz)
+        check_same_pad(localizer, "the localizer", fibres, rate_hz)
         if localizer.features == "array":
             raise InputError("the localizer was fitted to arrays of features, expected one that was fitted to readings")
         self._monitor = None if health is None else FaultMonitor(health)

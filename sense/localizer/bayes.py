@@ -6,7 +6,6 @@ From there a few Gauss-Newton steps lead to the maximum a posteriori position, t
 (the steps of an iterated Kalman filter: M. S. Grewal and A. P. Andrews, Kalman filtering, 2015).
 """
 
-from bisect import bisect_right
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, replace
 from typing import Any
@@ -14,16 +13,11 @@ from typing import Any
 import numpy as np
 
 from padforge.design.common.progress import OnProgress, ignore_progress
-from padforge.design.common.validation import InputError
 from padforge.sense.arrays import Array, Mask
-from padforge.sense.localizer.features import NOW
-from padforge.sense.localizer.model_files import check_arrays
+from padforge.sense.localizer.moments import NOW, STAGES
 from padforge.sense.localizer.response_model import grid_positions, interpolate_grid
 
 COMPONENTS = 6  # discriminant directions of a fibre: those in which positions differ most for their scatter
-STAGES = (12, 13, 14, 15, 17)
-"""Numbers of complete windows of a press from which on a localizer of its own answers, the first one after the release
-has shown: before, it errs a third more than a network."""
 LINEARIZED, COARSENING = 2, 3
 """Cells of the response table along a side of a cell of the linearization, and of the posterior's grid."""
 SCATTER_WIDTH, SCATTER_PRIOR_COUNT = 4.0, 10.0
@@ -36,7 +30,6 @@ MIN_STD = 1e-2  # smallest standard deviation on the grid, a tenth of a cell
 N_SUMMARY = 9
 """Numbers of a posterior summary: position, log variances, mean on the grid, its log variances, and correlation."""
 MIN_EXPONENT = -60.0  # smaller exponents count for nothing, and their exponential takes ten times as long
-MAX_COEFFICIENT = 1e12
 PREFIX = "bayes."  # of the names of the arrays in files
 _CHUNK = 2**15
 
@@ -161,22 +154,9 @@ class BayesianLocalizer:
         return {prefix + each.name: getattr(self, each.name).astype(np.float32) for each in fields(self)}
 
     @classmethod
-    def from_arrays(cls, arrays: Mapping[str, Any], number: int, fibres: int, n_features: int) -> "BayesianLocalizer":
-        """Read what `to_arrays` returned, and check shapes and values; KeyError if an array is missing."""
-        bayes = cls(**{each.name: arrays[f"{PREFIX}{number}.{each.name}"].astype(np.float64) for each in fields(cls)})
-        n_grid, side = (len(part) if part.ndim else 0 for part in (bayes.grid, bayes.linearization))
-        shapes = {
-            "projection": (fibres, n_features, COMPONENTS),
-            "grid": (max(n_grid, 1), 2),
-            "log_likelihood_coefficients": (fibres * (COMPONENTS * (COMPONENTS + 3) // 2 + 1), n_grid),
-            "linearization": (max(side, 2), side, fibres * 3 * (COMPONENTS + 1)),
-            **{"bounds": (2, 2), "rotation": (2, 2), "shift": (2,)},
-        }
-        check_arrays(vars(bayes), {name: (shape, np.float64) for name, shape in shapes.items()}, MAX_COEFFICIENT)
-        fisher = bayes.linearization[:, :, 3 * fibres * COMPONENTS :].reshape(side, side, fibres, 3)[..., :2]
-        if fisher.min() < 0:
-            raise InputError(f"linearization has a Fisher information of {fisher.min():g}, expected 0 or more")
-        return bayes
+    def from_arrays(cls, arrays: Mapping[str, Any], number: int) -> "BayesianLocalizer":
+        """Read what `to_arrays` returned."""
+        return cls(**{each.name: arrays[f"{PREFIX}{number}.{each.name}"].astype(np.float64) for each in fields(cls)})
 
 
 def fit_stages(
@@ -199,13 +179,6 @@ def fit_stages(
         kept[:, :, :, unused] = 0
         stages.append(BayesianLocalizer.fit(kept, inputs, fibre_mask, positions))
     return tuple(stages)
-
-
-def stage_of(n_complete: int, n_timed: int) -> int | None:
-    """Return which of the localizers of `fit_stages` answers when so many of K windows are complete, if any."""
-    if not n_timed:
-        return 0
-    return bisect_right(STAGES, n_complete) - 1 if n_complete >= STAGES[0] else None
 
 
 def _fit_lda(expected: Array, residual: Array) -> Array:

@@ -1,8 +1,8 @@
 """Features of presses: means of each fibre's readings over windows about a press, and its history before it.
 
-Windows are counted in readings from the command; where one would reach into a neighbouring press, the nearest reading
-that does not is repeated. A feature is made of one fibre's readings alone, so that a failed fibre can be masked and
-affects no other. Short gaps (NaN) are interpolated, and a fibre that lacks too much of a press is masked in it.
+Windows lie as `moments` has them; where one would reach into a neighbouring press, the nearest reading that does not is
+repeated. A feature is made of one fibre's readings alone, so that a failed fibre can be masked and affects no other.
+Short gaps (NaN) are interpolated, and a fibre that lacks too much of a press is masked in it.
 """
 
 from dataclasses import dataclass
@@ -11,20 +11,10 @@ from typing import Literal
 import numpy as np
 
 from padforge.sense.arrays import Array, Indices, Mask
+from padforge.sense.localizer.moments import DOWN, MODULATED, N_TIMED, NOW, REST, UP, Window, complete_windows
 
-Window = tuple[int, int]
-
-REST: Window = (-10, 0)  # readings before the probe is sent down; the other windows are measured from their mean
-DOWN: tuple[Window, ...] = ((1, 2), (2, 3), (3, 4), (4, 5), (5, 6), (6, 8), (8, 12), (12, 16), (16, 20))
-"""Windows after the probe was sent down: fine while it sinks in, broad while it rests in the silicone."""
-UP: tuple[Window, ...] = ((0, 1), (1, 2), (2, 3), (3, 4), (4, 6), (6, 9), (9, 14), (14, 20))
-"""Windows after the probe was sent up: the release depends on the position as much as the press does."""
-NOW: tuple[Window, ...] = ((-1, 0), (-2, -1))
-"""Windows before the moment, or before the release if that is earlier: where the finger is now if it moves."""
-N_TIMED = len(DOWN) + len(UP)  # K, windows of a press in the order in which they are complete
-MODULATED = slice(2, 5), slice(5, 9), slice(12, 17)  # windows whose sensitivity is modulated together
 FeatureSet = Literal["windows", "published", "array"]
-"""What is computed of a press: the windows above, the published running medians, or arrays that a caller computed."""
+"""What is computed of a press: windows, the published running medians, or arrays that a caller computed."""
 PAST: tuple[Window, ...] = (
     *((-2, 0), (-5, -2), (-10, -5), (-15, -10), (-18, -15), (-20, -18), (-30, -20), (-40, -30)),
     *((-50, -40), (-60, -50), (-80, -60), (-100, -80), (-120, -100), (-160, -120)),
@@ -92,16 +82,6 @@ def valid_fibres(readings: Array, down_command: Indices, up_command: Indices, un
     first, ends = np.maximum(down_command + REST[0], 0), np.minimum(until, up_command + UP[-1][1])
     counts = np.vstack([np.zeros((1, readings.shape[1])), np.cumsum(~np.isnan(readings), axis=0)])
     return counts[ends] - counts[first] >= MIN_PRESENT * (ends - first)[:, None]
-
-
-def complete_windows(down_command: Indices, up_command: Indices, until: Indices) -> Mask:
-    """Return (Q, K) which windows of `DOWN` and `UP` are complete before the readings `until` (Q,).
-
-    A press that is shorter than `DOWN` has all of it once it has ended: its last reading is repeated.
-    """
-    released = (until > up_command)[:, None]
-    down = (down_command[:, None] + [end for _, end in DOWN] <= until[:, None]) | released
-    return np.hstack([down, released & (up_command[:, None] + [end for _, end in UP] <= until[:, None])])
 
 
 def interpolate_gaps(readings: Array) -> Array:

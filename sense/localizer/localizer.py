@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from padforge.design.common.progress import OnProgress, ignore_progress
 from padforge.design.common.settings import validate
-from padforge.design.common.validation import InputError, check_float, check_type
+from padforge.design.common.validation import InputError, check_float
 from padforge.sense.arrays import MAX_MM, MAX_VOLTS, Array, check_magnitude, check_numbers
 from padforge.sense.localizer.calibration import MAX_TIME_BUDGET_S, CalibrationData, calibrate, fit_model
 from padforge.sense.localizer.evaluation import Evaluation, distances, evaluate
@@ -55,7 +55,7 @@ class Localizer:
         Args:
             settings: the section `[localizer]` of `pad.toml`.
         """
-        options = check_type("settings", settings, LocalizerSettings).model_dump()
+        options = settings.model_dump()
         return cls(random_state=options.pop("seed"), **options)
 
     def get_params(self, deep: bool = True) -> dict[str, Any]:

@@ -4,11 +4,9 @@ Where it was trained on presses of several depths, it predicts depth too, and fo
 """
 
 import json
-import textwrap
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from reprlib import repr as shortened
 from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
@@ -19,21 +17,13 @@ from padforge.design.common.files import read_json, reraise_write_error, write_t
 from padforge.design.common.validation import InputError, check_type, short_repr
 from padforge.sense.arrays import MAX_RATE_HZ, MIN_RATE_HZ, Array, Floats, Mask
 from padforge.sense.formats.columns import join_names
-from padforge.sense.localizer.bayes import N_SUMMARY, STAGES, BayesianLocalizer
 from padforge.sense.localizer.bayes import PREFIX as BAYES
-from padforge.sense.localizer.features import (
-    N_FEATURES,
-    N_HISTORY,
-    N_TIMED,
-    FeatureSet,
-    PressFeatures,
-    compute_features,
-)
-from padforge.sense.localizer.model_files import check_arrays, check_same_pad, files_of
-from padforge.sense.localizer.moments import FOLLOWING, N_DOWN, PHASES, count_complete
-from padforge.sense.localizer.network import RESIDUAL, Networks, Sliding, Weights, check_weights, predict
-from padforge.sense.localizer.response_model import GRID_CELLS
-from padforge.sense.localizer.scaler import DOCUMENT_CONFIG, MAX_INPUT, FeatureScaler, ScaledFeatures, array_field
+from padforge.sense.localizer.bayes import BayesianLocalizer
+from padforge.sense.localizer.features import FeatureSet, PressFeatures, compute_features
+from padforge.sense.localizer.model_files import check_same_pad, files_of
+from padforge.sense.localizer.moments import FOLLOWING, N_DOWN, N_TIMED, PHASES, RESIDUAL, STAGES, count_complete
+from padforge.sense.localizer.network import Networks, Sliding, Weights, predict
+from padforge.sense.localizer.scaler import DOCUMENT_CONFIG, FeatureScaler, ScaledFeatures, array_field
 from padforge.sense.recording.recording import Recording
 from padforge.sense.settings import Method, Split
 
@@ -195,7 +185,6 @@ class LocalizerModel(LocalizerDocument):
         """
         if self.features == "array":
             raise InputError("the localizer was fitted to arrays of features, expected such arrays, not a recording")
-        check_type("recording", recording, Recording)
         self.check_recording(recording)
         commands = recording.down_command, recording.up_command
         end = None if until is None else np.asarray(until)
@@ -250,7 +239,6 @@ class LocalizerModel(LocalizerDocument):
         Raises:
             InputError: `failed` are no such fibres, or all; or some, and the method is "published".
         """
-        check_type("presses", presses, ScaledFeatures)
         fibre_mask: Mask = np.logical_and(presses.fibre_mask, self._working(failed))
         chunk = max(1, _CHUNK // self.fibres)
         parts = []
@@ -311,7 +299,7 @@ class LocalizerModel(LocalizerDocument):
         arrays |= {TABLE: self.table}
         for number, stage in enumerate(self.bayes):
             arrays |= stage.to_arrays(number)
-        files_of(folder, NAME).write(document, arrays, "localizer")
+        files_of(folder, NAME).write(document, arrays)
 
     @classmethod
     def load(cls, folder: str | Path) -> "LocalizerModel":
@@ -332,26 +320,16 @@ class LocalizerModel(LocalizerDocument):
             name = files.document.name
             raise InputError(f"{folder}: no {name}, expected a folder that `padforge sense calibrate` wrote") from error
         document, digest = _read_document(content, str(files.document))
-        scaler, method = document.scaler, document.method
         n_timed = len(document.interval_factors) - 1
-        n_inputs, n_measures = scaler.n_inputs(method, n_timed), len(scaler.measures)
-        with files.arrays(digest, "the localizer") as arrays:
-            table, shape = arrays.pop(TABLE), (GRID_CELLS + 1, GRID_CELLS + 1, *scaler.mean_v.shape)
-            check_arrays({TABLE: table}, {TABLE: (shape, np.float32)}, MAX_INPUT)
-            networks: dict[str, dict[str, Any]] = {name: {} for name in (*PHASES[n_timed], RESIDUAL)}
-            for name in [name for name in arrays if not name.startswith(BAYES)]:
-                phase, _, part = name.partition(".")
-                networks[phase][part] = arrays.pop(name)
-            residual_network = networks.pop(RESIDUAL)
-            for weights in networks.values():
-                check_weights(weights, n_inputs, method, n_measures)
-            bayes: tuple[BayesianLocalizer, ...] = ()
-            if arrays or residual_network:
-                if method != "ensemble" or n_measures:
-                    raise InputError("a Bayesian localizer is there beside measures or method published, expected none")
-                stages = range(len(STAGES) if n_timed else 1)
-                bayes = tuple(BayesianLocalizer.from_arrays(arrays, n, *scaler.mean_v.shape) for n in stages)
-                check_weights(residual_network, n_inputs + N_SUMMARY, method)
+        arrays = files.read_arrays(digest)
+        table = arrays.pop(TABLE)
+        networks: dict[str, dict[str, Any]] = {name: {} for name in (*PHASES[n_timed], RESIDUAL)}
+        for name in [name for name in arrays if not name.startswith(BAYES)]:
+            phase, _, part = name.partition(".")
+            networks[phase][part] = arrays.pop(name)
+        residual_network = networks.pop(RESIDUAL)
+        stages = range((len(STAGES) if n_timed else 1) if residual_network else 0)
+        bayes = tuple(BayesianLocalizer.from_arrays(arrays, number) for number in stages)
         return cls(**vars(document), networks=networks, table=table, bayes=bayes, residual_network=residual_network)
 
 
@@ -362,42 +340,10 @@ def _read_document(document: Mapping[str, Any], where: str) -> tuple[LocalizerDo
         read = _DOCUMENT.validate_json(json.dumps(values))
     except ValidationError as error:
         first = error.errors()[0]
-        key, value = (
-            ".".join(map(str, first["loc"])),
-            textwrap.shorten(shortened(first["input"]), 100, placeholder=" ..."),
-        )
-        raise InputError(f"{where}: {key} is {value}: {first['msg'].lower()}") from error
-    scaler, shape = read.scaler, read.scaler.mean_v.shape
-    names = [each.name for each in scaler.measures]
-    if names != ["depth_mm", "force_n"][: len(names)] or (names and read.method == "published"):
-        raise InputError(
-            f"{where}: scaler.measures are {', '.join(names)} of method {read.method}, expected none, depth_mm, or "
-            "depth_mm and force_n, and of method ensemble"
-        )
-    if (read.method == "published") != (read.features == "published"):
-        raise InputError(
-            f"{where}: method is {read.method}, features are {read.features}, expected both published or neither"
-        )
-    fibres, given = (shape[0], shape[-1]) if shape else (0, 0)
-    n_features = {"windows": N_FEATURES, "published": 3, "array": given}[read.features]
-    n_history = N_HISTORY if read.features == "windows" else 0
-    n_timed = N_TIMED if read.features == "windows" else 0
-    expected = {
-        "mean_v": (fibres, n_features),
-        "scale_v": (fibres, n_features),
-        "history_coef": (fibres, n_history, n_features) if n_history else (fibres, 0),
-        "history_mean_v": (fibres, n_history),
-        "origin_mm": (2,),
-        "half_size_mm": (2,),
-    }
-    shapes = {f"scaler.{name}": (getattr(scaler, name).shape, size) for name, size in expected.items()}
-    levels = [max(size, 1) for size in read.interval_factors.shape[1:2]]
-    shapes["interval_factors"] = read.interval_factors.shape, (n_timed + 1, *levels, 3 + len(names))
-    for name, (size, wanted) in shapes.items():
-        if size != wanted or 0 in size[:1]:
-            raise InputError(f"{where}: {name} has shape {size}, expected {wanted} of features {read.features}")
-    if len(set(read.test)) != len(read.test):
-        raise InputError(f"{where}: test names a press twice, expected different ones")
-    coef = scaler.history_coef.reshape(fibres, n_history, n_features)  # an empty list has no last axis
+        key = ".".join(map(str, first["loc"]))
+        raise InputError(f"{where}: {key} is {short_repr(first['input'])}: {first['msg'].lower()}") from error
+    scaler = read.scaler
+    # an empty list has no last axis
+    coef = scaler.history_coef.reshape(*scaler.history_mean_v.shape, scaler.mean_v.shape[-1])
     digest = check_type(f"{where}: weights_sha256", document.get("weights_sha256"), str)
     return replace(read, scaler=replace(scaler, history_coef=coef)), digest

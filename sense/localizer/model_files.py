@@ -2,19 +2,16 @@
 
 import hashlib
 import json
-import re
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from safetensors import SafetensorError
 from safetensors.numpy import load, save
 
 from padforge.design.common.files import atomic_files, read_bytes
-from padforge.design.common.validation import InputError, check_path, check_type, short_repr
+from padforge.design.common.validation import InputError, check_path
 
 RATE_TOLERANCE = 0.25  # windows are counted in readings, so the rate must be about that of the training
 
@@ -25,35 +22,28 @@ class ModelFiles(NamedTuple):
     document: Path
     weights: Path
 
-    def write(self, document: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]], what: str) -> None:
-        """Write a document with "weights_sha256" added, and arrays, together or not at all; messages say `what`."""
+    def write(self, document: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]]) -> None:
+        """Write a document with "weights_sha256" added, and arrays, together or not at all."""
         content = save({name: np.ascontiguousarray(array) for name, array in arrays.items()})
         document = {**document, "weights_sha256": hashlib.sha256(content).hexdigest()}
-        try:
-            text = json.dumps(document, indent=1, allow_nan=False) + "\n"
-        except (TypeError, ValueError) as error:
-            raise InputError(f"{self.document}: {what} cannot be written as JSON ({error})") from error
+        text = json.dumps(document, indent=1, allow_nan=False) + "\n"
         with atomic_files(self.document.parent) as stage:
             (stage / self.weights.name).write_bytes(content)
             (stage / self.document.name).write_text(text, encoding="utf-8")
 
-    @contextmanager
-    def arrays(self, digest: str, what: str) -> Iterator[dict[str, NDArray[Any]]]:
-        """Yield the arrays of a document of this digest, to be checked in the body of `with`; messages say `what`."""
-        content, name = read_bytes(self.weights), self.document.name
+    def read_arrays(self, digest: str) -> dict[str, NDArray[Any]]:
+        """Read the arrays that were written with a document of this digest."""
+        content = read_bytes(self.weights)
         if hashlib.sha256(content).hexdigest() != digest:
-            raise InputError(f"{self.weights}: not the weights that {name} was written with; calibrate again")
-        try:
-            yield load(content)
-        except (KeyError, TypeError, ValueError, SafetensorError) as error:
-            raise InputError(f"{self.weights}: no weights of {what} that {name} describes ({error})") from error
+            raise InputError(
+                f"{self.weights}: not the weights that {self.document.name} was written with; calibrate again"
+            )
+        return load(content)
 
 
 def files_of(folder: str | Path, name: str) -> ModelFiles:
     """Return the files of a model in a folder."""
     folder = check_path("folder", folder)
-    if not re.fullmatch(r"\w{1,100}", check_type("name", name, str)):
-        raise InputError(f"name is {short_repr(name)}, expected letters, digits and underscores")
     return ModelFiles(folder / f"{name}.json", folder / f"{name}.safetensors")
 
 

@@ -1,17 +1,45 @@
-"""Phases of a press: how much of it has been read, and which network answers then.
+"""Moments of a press: the windows of its readings, which of them are complete, and who answers then.
 
-The windows of a press are complete one after the other, those of the touch first, then those of the release: their
-number says how far it is. Each phase has a network of its own, as one for all of them learns each of them less well.
+Windows are counted in readings from a command of the probe; here of a press of 20 readings, up to its release::
+
+    reading  -10     0       4       8       12      16      20      24      28      32      36      40
+    command          down_command                            up_command
+    REST     |       |
+    DOWN               |0|1|2|3|4| 5 |   6   |   7   |   8   |
+    UP                                                       |0|1|2|3| 4 |  5  |    6    |     7     |
+    NOW                                                  |1|0|
+
+They are complete one after the other, so that their number K = 0 .. N_TIMED says how far a press is. Each phase of it
+has a network of its own (`PHASES`), as one for all of them learns each of them less well::
+
+    complete     what is known        network                       and
+    0                                                               the press may be anywhere
+    1 .. 8       the touch            "touched"
+    9            it rests             "settled"                     "touched", where the finger has slid since SOON
+    10 .. 17     the release          "released"                    from 12 on the Bayesian localizer of the last of
+                                                                    `STAGES`, corrected by the network "residual"
 """
 
-from collections.abc import Mapping
+from bisect import bisect_right
+from collections.abc import Container, Mapping
 from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 
 from padforge.sense.arrays import Indices, Mask
-from padforge.sense.localizer.features import DOWN, N_TIMED, UP
+
+Window = tuple[int, int]
+
+REST: Window = (-10, 0)  # readings before the probe is sent down; the other windows are measured from their mean
+DOWN: tuple[Window, ...] = ((1, 2), (2, 3), (3, 4), (4, 5), (5, 6), (6, 8), (8, 12), (12, 16), (16, 20))
+"""Windows after the probe was sent down: fine while it sinks in, broad while it rests in the silicone."""
+UP: tuple[Window, ...] = ((0, 1), (1, 2), (2, 3), (3, 4), (4, 6), (6, 9), (9, 14), (14, 20))
+"""Windows after the probe was sent up: the release depends on the position as much as the press does."""
+NOW: tuple[Window, ...] = ((-1, 0), (-2, -1))
+"""Windows before the moment, or before the release if that is earlier: where the finger is now if it moves."""
+N_DOWN, N_TIMED = len(DOWN), len(DOWN) + len(UP)  # K, windows of a press in the order in which they are complete
+MODULATED = slice(2, 5), slice(5, 9), slice(12, 17)  # windows whose sensitivity is modulated together
 
 
 @dataclass(frozen=True)
@@ -46,7 +74,6 @@ class Phase:
         return isinstance(n_complete, int) and self.first <= n_complete < self.first + len(self.shares)
 
 
-N_DOWN = len(DOWN)
 PHASES: Mapping[int, Mapping[str, Phase]] = {
     N_TIMED: {
         "touched": Phase(1, (0.05, 0.12, 0.26, 0.15, 0.11, 0.09, 0.08, 0.07, 0.07), 1.4, sliding=0.3),
@@ -58,10 +85,27 @@ PHASES: Mapping[int, Mapping[str, Phase]] = {
 }
 """Networks by K, the number of windows that are complete one after the other: all of them, those of the touch alone, or
 none, if features know no moment. The last one that is trained for a moment answers."""
-FOLLOWING = "touched"  # the network that follows a finger which slides; others know fingers at rest alone
-SOON = 5  # complete windows soon after the touch: where a finger was then shows whether it slid later
+FOLLOWING, RESIDUAL = "touched", "residual"
+"""The network that follows a finger which slides, as others know fingers at rest alone; and the one that corrects the
+Bayesian localizers."""
+SOON, LEAST_SLIDE = 5, 3.0
+"""Complete windows soon after the touch: a finger that is farther from where it was then than so many standard
+deviations is believed to have slid. Of presses at rest, hardly one is."""
+STAGES = (12, 13, 14, 15, 17)
+"""Numbers of complete windows of a press from which on a Bayesian localizer of its own answers, the first one after the
+release has shown: before, it errs a third more than a network."""
 CORRECTED = Phase(N_DOWN + 3, (0.15, 0.1, 0.15, 0.1, 0.05, 0.45))
 """When the Bayesian localizer answers, with the network that corrects it."""
+
+
+def complete_windows(down_command: Indices, up_command: Indices, until: Indices) -> Mask:
+    """Return (Q, K) which windows of `DOWN` and `UP` are complete before the readings `until` (Q,).
+
+    A press that is shorter than `DOWN` has all of it once it has ended: its last reading is repeated.
+    """
+    released = (until > up_command)[:, None]
+    down = (down_command[:, None] + [end for _, end in DOWN] <= until[:, None]) | released
+    return np.hstack([down, released & (up_command[:, None] + [end for _, end in UP] <= until[:, None])])
 
 
 def complete_at(n_complete: int, down_command: Indices, up_command: Indices) -> Indices:
@@ -74,3 +118,16 @@ def complete_at(n_complete: int, down_command: Indices, up_command: Indices) -> 
 def count_complete(seen: Mask) -> Indices:
     """Return the number (Q,) of complete windows of presses."""
     return seen.sum(axis=1)
+
+
+def stage_of(n_complete: int, n_timed: int) -> int | None:
+    """Return which of the Bayesian localizers answers when so many of K windows are complete, if any."""
+    if not n_timed:
+        return 0
+    return bisect_right(STAGES, n_complete) - 1 if n_complete >= STAGES[0] else None
+
+
+def answering(networks: Container[str], n_complete: int, n_timed: int, has_bayes: bool) -> list[str]:
+    """Return the names of the networks that answer when so many of K windows are complete, in their order."""
+    names = [name for name, phase in PHASES[n_timed].items() if n_complete in phase and name in networks][-1:]
+    return [*names, RESIDUAL] if has_bayes and stage_of(n_complete, n_timed) is not None else names

@@ -14,10 +14,19 @@ import numpy as np
 
 from padforge.design.common.validation import InputError
 from padforge.sense.arrays import Floats, Mask
-from padforge.sense.localizer.bayes import BayesianLocalizer, stage_of
-from padforge.sense.localizer.features import NOW
+from padforge.sense.localizer.bayes import BayesianLocalizer
 from padforge.sense.localizer.model_files import check_arrays
-from padforge.sense.localizer.moments import FOLLOWING, N_DOWN, PHASES, SOON, count_complete
+from padforge.sense.localizer.moments import (
+    FOLLOWING,
+    LEAST_SLIDE,
+    N_DOWN,
+    NOW,
+    RESIDUAL,
+    SOON,
+    answering,
+    count_complete,
+    stage_of,
+)
 
 Weights = Mapping[str, Floats]
 """`first.w` (E, D, H), `first.b` (E, 1, H), `hidden.w` (L, E, H, H), `hidden.b` (L, E, 1, H), `last.w` (E, H, 2 N) and
@@ -73,14 +82,6 @@ def forward(weights: Weights, x: Floats) -> Floats:
 
 Networks = Mapping[str, Weights]
 """Networks by phase, see `moments.PHASES`."""
-RESIDUAL = "residual"
-"""Name of the network that corrects the Bayesian localizers."""
-
-
-def answering(networks: Networks, n_complete: int, n_timed: int, has_bayes: bool) -> list[str]:
-    """Return the names of the networks that answer when so many of K windows are complete, in their order."""
-    names = [name for name, phase in PHASES[n_timed].items() if n_complete in phase and name in networks][-1:]
-    return [*names, RESIDUAL] if has_bayes and stage_of(n_complete, n_timed) is not None else names
 
 
 def predict_members(
@@ -141,10 +142,6 @@ def predict(
         slid[rows] = following.moved > LEAST_SLIDE
         targets[slid], std[slid] = (part[slid[rows]] for part in following[:2])
     return targets, std, slid
-
-
-LEAST_SLIDE = 3.0
-"""`Followed.moved` from which on a finger is believed to slide: of presses at rest, hardly one has it."""
 
 
 class Followed(NamedTuple):

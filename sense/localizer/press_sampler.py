@@ -14,9 +14,8 @@ import torch
 
 from padforge.design.common.compilation import inline_kernel, inner_kernel, kernel
 from padforge.sense.arrays import Array, Floats, Indices, Mask
-from padforge.sense.localizer.bayes import N_SUMMARY, BayesianLocalizer, stage_of
-from padforge.sense.localizer.features import DOWN, NOW
-from padforge.sense.localizer.moments import N_DOWN, Phase
+from padforge.sense.localizer.bayes import N_SUMMARY, BayesianLocalizer
+from padforge.sense.localizer.moments import DOWN, N_DOWN, NOW, Phase, stage_of
 from padforge.sense.localizer.response_model import interpolate_grid
 from padforge.sense.localizer.scaler import TrainingPresses
 

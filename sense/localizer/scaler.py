@@ -13,7 +13,8 @@ from pydantic import ConfigDict, Field, PlainSerializer, PlainValidator
 from pydantic_core import PydanticCustomError
 
 from padforge.sense.arrays import MAX_MM, MAX_VOLTS, MIN_SCALE_V, Array, Floats, Indices, Mask
-from padforge.sense.localizer.features import DOWN, NOW, PressFeatures
+from padforge.sense.localizer.features import PressFeatures
+from padforge.sense.localizer.moments import DOWN, NOW
 from padforge.sense.localizer.response_model import ResponseModel, interpolate_grid, leverages, remove_history
 
 MAX_INPUT = 1e4  # largest scaled feature, in standard deviations; beyond lies no press, and features are clipped

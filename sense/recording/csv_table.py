@@ -1,15 +1,15 @@
 """Columns of numbers from CSV files of any program.
 
 Values are separated by commas, semicolons or tabs, whichever the header has most of; without commas as separators, a
-comma is a decimal point. Lines that begin with # are comments; the last one is the header if only numbers follow. An
-empty cell is missing.
+comma is a decimal point. Lines that begin with # are comments; the last one is the header if only numbers follow. Empty
+lines are skipped; an empty cell is missing.
 """
 
 import csv
-import io
 import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from itertools import chain
 from pathlib import Path
 from typing import TextIO
 
@@ -21,14 +21,13 @@ from padforge.sense.arrays import MAX_BYTES, Array
 
 UNKNOWN = -1.7e308
 """Stands for `?` among numbers, far from all others."""
-_BATCH = 2**23  # characters that are read at a time
 
 
 class CsvTable:
-    """A CSV file whose header, `names`, has been read; with `skip_empty`, empty lines between others are skipped."""
+    """A CSV file whose header, `names`, has been read."""
 
-    def __init__(self, path: Path, skip_empty: bool = False) -> None:
-        self.path, self._skip_empty = check_file(path, MAX_BYTES), skip_empty
+    def __init__(self, path: Path) -> None:
+        self.path = check_file(path, MAX_BYTES)
         with _open_csv(self.path) as file:
             self._n_header, header = _read_header(file)
             self._separator = _find_separator(header)
@@ -37,15 +36,10 @@ class CsvTable:
 
     def read_columns(self, columns: Sequence[int], may_be_unknown: Sequence[int] = ()) -> Array:
         """Return columns by their indices (R, n), NaN where a cell is empty; `?` is UNKNOWN where it is allowed."""
-        parts = [np.empty((0, len(columns)))]
         self._skipped = []
         with _open_csv(self.path) as file:
-            for _ in range(self._n_header):
-                file.readline()
-            for number, text in self._read_batches(file):
-                part = self._parse_plain(text, columns, may_be_unknown)
-                parts.append(self._parse_lines(number, text, columns, may_be_unknown) if part is None else part)
-        return np.concatenate(parts)
+            rows = self._parse_rows(file, columns, may_be_unknown)
+            return np.fromiter(chain.from_iterable(rows), np.float64).reshape(-1, len(columns))
 
     def line_number(self, row: int) -> int:
         """Return the number of the line, from 1, that a row was read from."""
@@ -57,45 +51,13 @@ class CsvTable:
     def _split(self, line: str) -> list[str]:
         return next(csv.reader([line], delimiter=self._separator, strict=True), [])
 
-    def _read_batches(self, file: TextIO) -> Iterator[tuple[int, str]]:
-        """Yield complete lines, and the number of the first of them; empty lines at the end are left out."""
-        number, newlines = self._n_header + 1, ""
-        while batch := file.read(_BATCH):
-            batch = newlines + batch + file.readline()
-            text = batch.rstrip("\n")
-            newlines = batch[len(text) + bool(text) :]
-            if text:
-                yield number, text
-                number += text.count("\n") + 1
-
-    def _parse_plain(self, text: str, columns: Sequence[int], may_be_unknown: Sequence[int]) -> Array | None:
-        """Parse lines at once by NumPy, if they are as plain as in most files; else return None."""
-        if not text.isascii() or '"' in text or text.startswith("#") or "\n#" in text:
-            return None
-        separator = self._separator
-        codes = np.frombuffer(text.encode(), np.uint8)
-        ends = np.append(np.flatnonzero(codes == ord("\n")), len(codes))
-        n_cells = np.diff(np.searchsorted(np.flatnonzero(codes == ord(separator)), ends), prepend=0) + 1
-        if (n_cells != len(self.names)).any():
-            return None
-        if separator != ",":
-            text = text.replace(",", ".")
-        for before, after in ((separator, separator), (separator, separator), (separator, "\n"), ("\n", separator)):
-            text = text.replace(before + after, f"{before}nan{after}")
-        text = "nan" * text.startswith(separator) + text + "nan" * text.endswith(separator)
-        text = text.replace("?", f"{UNKNOWN} ")  # the space keeps ?5 from being a number
-        try:
-            values = np.loadtxt(io.StringIO(text), delimiter=separator, comments=None, usecols=columns, ndmin=2)
-        except ValueError:
-            return None
-        has_unknown = (values == UNKNOWN).any(axis=0)
-        return None if (has_unknown & ~np.isin(columns, may_be_unknown)).any() or len(values) != len(ends) else values
-
-    def _parse_lines(self, first: int, text: str, columns: Sequence[int], may_be_unknown: Sequence[int]) -> Array:
-        """Parse lines one by one; the number of the first is `first`."""
-        rows = []
-        for number, line in enumerate(text.split("\n"), first):
-            if line.startswith("#") or (self._skip_empty and not line):
+    def _parse_rows(self, file: TextIO, columns: Sequence[int], may_be_unknown: Sequence[int]) -> Iterator[list[float]]:
+        """Yield the numbers of each line after the header."""
+        for number, line in enumerate(file, 1):
+            line = line.rstrip("\n")
+            if number <= self._n_header:
+                continue
+            if line.startswith("#") or not line:
                 self._skipped.append(number)
                 continue
             try:
@@ -105,10 +67,9 @@ class CsvTable:
             if len(cells) != len(self.names):
                 raise InputError(f"{self.path}: line {number} has {len(cells)} values, expected {len(self.names)}")
             try:
-                rows.append([self._parse_cell(cells[column], column in may_be_unknown) for column in columns])
+                yield [self._parse_cell(cells[column], column in may_be_unknown) for column in columns]
             except ValueError as error:
                 raise InputError(f"{self.path}: line {number} holds no numbers ({error})") from error
-        return np.array(rows).reshape(-1, len(columns))
 
     def _parse_cell(self, cell: str, may_be_unknown: bool) -> float:
         cell = cell.strip()
@@ -153,7 +114,7 @@ def _is_number(cell: str) -> bool:
 
 
 def _parse_number(cell: str) -> float:
-    """Parse a number as programs write them; float() would take 1_0 and digits of other scripts as well."""
-    if "_" in cell or not cell.isascii():
+    """Parse a number as programs write them; float() would take 1_0 as well."""
+    if "_" in cell:
         raise ValueError(f"could not convert string to float: {cell!r}")
     return float(cell)

@@ -228,7 +228,7 @@ def read_plan(path: Path, depths_mm: Sequence[float]) -> PressPlan:
         path: file with the columns x_mm, y_mm and, optionally, depth_mm.
         depths_mm: depths that presses take in turn where the file has none.
     """
-    table = CsvTable(path, skip_empty=True)
+    table = CsvTable(path)
     if tuple(table.names) not in (COLUMNS, COLUMNS[:2]):
         raise InputError(f"{path}: header is {','.join(table.names)[:60]!r}, expected x_mm,y_mm or x_mm,y_mm,depth_mm")
     values = table.read_columns(range(len(table.names)))

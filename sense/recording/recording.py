@@ -53,7 +53,7 @@ from padforge.sense.recording.run_directory import (
 
 _ARRAYS = dict.fromkeys(("readings", "times_s", "presses_mm"), np.float64)
 _ARRAYS |= dict.fromkeys(("down_command", "up_command"), np.int64)
-_CHUNK_BYTES, _CHUNK_PRESSES = 2**18, 2**12  # of readings and presses that are written at once
+_CHUNK_BYTES = 2**18  # of readings that are written at once
 FIBRE_NAMES = "fibre_names"
 """Key in the source of a recording for what its fibres are called in the file that it was imported from."""
 _MEASURES = {"depths_mm": (MAX_MM, "mm"), "reached_mm": (MAX_MM, "mm"), "forces_n": (MAX_N, "N")}
@@ -179,9 +179,9 @@ class Recording:
         """
         path = check_path("path", path)
         fibres = read_fibres(path)
-        # The journal first: its objects are gone before the readings come, which the journal never precedes.
+        # The journal first, which never precedes the readings: some may be recorded meanwhile.
         done = np.array(list(read_journal(path / JOURNAL).values()), dtype=np.float64).reshape(-1, len(Press._fields))
-        times_s, readings, _ = read_blocks(path / READINGS, fibres)
+        times_s, readings = read_blocks(path / READINGS, fibres)
         table = done[done[:, 3] <= len(times_s)]
         for array in (times_s, readings):
             array.setflags(write=False)
@@ -237,13 +237,11 @@ class Recording:
                 recorder.append(self.times_s[first : first + step], self.readings[first : first + step])
             measures = np.column_stack([getattr(self, name) for name in _MEASURES])
             presses = zip(self.presses_mm, self.down_command, self.up_command, measures, strict=True)
-            for number, (position_mm, down, up, measured) in enumerate(presses, 1):
+            for position_mm, down, up, measured in presses:
                 depth, reached, force = measured.tolist()
                 recorder.begin(position_mm, int(down), **({} if isnan(depth) else {"depth_mm": depth}))
                 at_mm = {} if isnan(reached) else {"at_mm": [None, None, reached]}
                 recorder.finish(int(up), **at_mm, **({} if isnan(force) else {"force_n": force}))
-                if number % _CHUNK_PRESSES == 0:
-                    recorder.sync()  # only now its lines leave the memory
 
 
 def check_replaceable(path: Path) -> None:
@@ -258,11 +256,10 @@ def check_replaceable(path: Path) -> None:
         return
     if not path.is_dir():
         raise InputError(f"{path}: is no folder, expected a simulated recording or nothing; {advice}")
-    if not is_uncommitted(path):
+    if (path / START).exists() or not is_uncommitted(path):
         for file in sorted(path.iterdir()):
             if file.name not in (*FILES, LOCK) or file.is_symlink() or not file.is_file():
                 raise InputError(f"{path}: holds {file.name}, which is no part of a recording; {advice}")
-    if (path / START).exists() or not is_uncommitted(path):
         source = read_json(path / START, FORMAT).get("source")
         kind = source.get("kind") if isinstance(source, dict) else None
         if kind != "simulated":
@@ -276,7 +273,7 @@ def _check_source(source: object) -> None:
         raise InputError(f"source is {short_repr(source)}, expected a mapping")
     try:
         json.dumps(dict(source), allow_nan=False)
-    except (TypeError, ValueError, RecursionError) as error:
+    except (TypeError, ValueError) as error:
         raise InputError(f"source is {short_repr(dict(source))}, expected what JSON can hold ({error})") from error
 
 

@@ -10,11 +10,9 @@ when a recording is created: a folder without it holds nothing, and a recording 
 import contextlib
 import io
 import json
-import stat
 from collections.abc import Mapping
 from pathlib import Path
-from reprlib import repr as shortened
-from typing import Any, BinaryIO, NamedTuple, Protocol
+from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -32,8 +30,8 @@ from padforge.design.common.files import (
     write_json,
 )
 from padforge.design.common.validation import InputError, check_int, check_mapping, check_path, short_repr
-from padforge.sense.arrays import MAX_FIBRES, MAX_INDEX, MAX_MM, MAX_N, Array, check_numbers
-from padforge.sense.recording.block_file import BlockWriter, open_in_place, read_blocks, write_at
+from padforge.sense.arrays import MAX_FIBRES, MAX_INDEX, Array, check_numbers
+from padforge.sense.recording.block_file import BlockWriter, read_blocks, write_at
 
 FORMAT = "padforge-recording/2"
 START, JOURNAL, READINGS, STATES = FILES = "start.json", "journal.ndjson", "readings.bin", "states.bin"
@@ -58,86 +56,34 @@ class Press(NamedTuple):
 
 def read_journal(path: Path) -> dict[int, Press]:
     """Return the presses that are done by their numbers, ascending; one that was repeated counts as begun last."""
-    content = read_bytes(path)
-    started: dict[int, Mapping[str, Any]] = {}  # and neither done nor aborted: entries take much memory
+    started: dict[int, Mapping[str, Any]] = {}  # and neither done nor aborted
     done: dict[int, Press] = {}
-    for line_number, line in enumerate(io.BytesIO(content), start=1):
+    for line_number, line in enumerate(io.BytesIO(read_bytes(path)), start=1):
         if not line.endswith(b"\n"):
             break  # a torn line
         try:
-            event = json.loads(line.decode())
-            if not isinstance(event, dict):
-                raise ValueError(f"{shortened(event)}, expected an object")
-            press, kind = _index(event, "press"), event.get("event")
-            _index(event, "reading")
+            event = json.loads(line)
+            press, kind = event["press"], event["event"]
             if kind == "started":
-                for key, default in (("x_mm", "missing"), ("y_mm", "missing"), ("depth_mm", None)):
-                    _number(event, key, MAX_MM, default)
                 started[press] = event
                 done.pop(press, None)
             elif kind == "done" and press in started:
                 done[press] = _finished_press(started.pop(press), event)
-            elif kind == "aborted" and (press in started or press in done):
+            elif kind == "aborted":
                 started.pop(press, None)
                 done.pop(press, None)
             else:
-                raise ValueError(f"event {shortened(kind)} of press {press}")
-        except (ValueError, RecursionError) as error:
+                raise ValueError(f"event {kind!r} of press {press}")
+        except (KeyError, IndexError, TypeError, ValueError) as error:
             raise InputError(f"{path}: line {line_number} is no journal entry ({error})") from error
     return dict(sorted(done.items()))
 
 
 def _finished_press(started: Mapping[str, Any], done: Mapping[str, Any]) -> Press:
-    at_mm = done.get("at_mm", [None] * 3)
-    if not isinstance(at_mm, list) or len(at_mm) != 3:
-        raise ValueError(f"at_mm is {shortened(at_mm)}, expected x, y and depth")
-    return Press(
-        x_mm=_number(started, "x_mm", MAX_MM),
-        y_mm=_number(started, "y_mm", MAX_MM),
-        down_command=_index(started, "reading"),
-        up_command=_index(done, "reading"),
-        depth_mm=_number(started, "depth_mm", MAX_MM, None),
-        reached_mm=_number({"at_mm": at_mm[2]}, "at_mm", MAX_MM),
-        force_n=_number(done, "force_n", MAX_N, None),
-    )
-
-
-def _index(event: Mapping[str, Any], key: str) -> int:
-    value = event.get(key)
-    if type(value) is not int or not 0 <= value <= MAX_INDEX:
-        raise ValueError(f"{key} is {shortened(value)}, expected a whole number from 0 to {MAX_INDEX}")
-    return value
-
-
-def _number(event: Mapping[str, Any], key: str, limit: float, default: object = "missing") -> float:
-    value = event.get(key, default)
-    if value is None:
-        return float("nan")
-    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= limit:
-        raise ValueError(f"{key} is {shortened(value)}, expected a number from {-limit:g} to {limit:g}, or null")
-    return float(value)
-
-
-class Follower(Protocol):
-    """Whatever writes a recording in another form while it is recorded; none of its methods raises."""
-
-    def start(self, source: Mapping[str, Any]) -> None:
-        """Note what is recorded."""
-
-    def append(self, rows: Array) -> None:
-        """Add (n, 1 + C) rows of time and volts."""
-
-    def append_states(self, rows: Array) -> None:
-        """Add (n, 10) states of the arm, by `STATE_COLUMNS`."""
-
-    def finish(self, number: int, press: Press) -> None:
-        """Add a press that is done; one whose number was there before takes its place."""
-
-    def sync(self) -> None:
-        """Put everything on the disk; only then the journal says that presses are done."""
-
-    def close(self) -> None:
-        """Write no more."""
+    depth_mm, reached_mm, force_n = started.get("depth_mm"), done.get("at_mm", [None] * 3)[2], done.get("force_n")
+    x_y_and_measures = (started["x_mm"], started["y_mm"], depth_mm, reached_mm, force_n)
+    x, y, depth, reached, force = (float("nan") if value is None else float(value) for value in x_y_and_measures)
+    return Press(x, y, int(started["reading"]), int(done["reading"]), depth, reached, force)
 
 
 class Recorder:
@@ -186,8 +132,6 @@ class Recorder:
         self._path, self._blocks, self.fibres = path, blocks, blocks.fibres
         self._journal_bytes = journal_bytes
         self._states: tuple[BlockWriter, BinaryIO] | None = None
-        self._follower: Follower | None = None
-        self._started: Mapping[str, Any] = {}  # entry of the press that has begun
         self._lines: list[str] = []
         self._press, self._is_down = 0, False
         self.done: set[int] = set()
@@ -202,7 +146,7 @@ class Recorder:
             path: of the run directory.
 
         Raises:
-            InputError: other damage, a link in it, or a recording that is finished.
+            InputError: other damage.
         """
         fibres = read_fibres(path := check_path("path", path))
         self = cls.__new__(cls)
@@ -211,10 +155,10 @@ class Recorder:
             if is_uncommitted(path):  # broken off before the first reading
                 for name in (JOURNAL, READINGS):
                     (path / name).touch()
-            self._journal = open_in_place(path / JOURNAL)
+            self._journal = (path / JOURNAL).open("r+b", buffering=0)
             try:
                 journal = read_journal(path / JOURNAL)
-                times_s, _, _ = read_blocks(path / READINGS, fibres)
+                times_s, _ = read_blocks(path / READINGS, fibres)
                 if (journal and not len(times_s)) or not (np.diff(times_s) > 0).all():
                     # No break leaves that, so nothing may be cut off.
                     what = f"the readings of {len(journal)} presses of {fibres} fibres in the journal"
@@ -240,21 +184,6 @@ class Recorder:
         self._press = max(self.done, default=-1) + 1
         return self
 
-    def attach(self, follower: Follower) -> None:
-        """Hand over what was recorded so far, and from now on everything as it is recorded.
-
-        Args:
-            follower: that writes it, too; closed with the recorder.
-        """
-        follower.start(read_json(self._path / START, FORMAT)["source"])
-        follower.append(np.column_stack(read_blocks(self._path / READINGS, self.fibres)[:2]))
-        if self._states is not None:
-            follower.append_states(np.column_stack(read_blocks(self._path / STATES, len(STATE_COLUMNS) - 1)[:2]))
-        for number, press in read_journal(self._path / JOURNAL).items():
-            follower.finish(number, press)
-        follower.sync()
-        self._follower = follower
-
     def append(self, times_s: ArrayLike, readings: ArrayLike) -> None:
         """Add readings; after an OSError (the disk is full or gone) nothing was added.
 
@@ -270,8 +199,6 @@ class Recorder:
             )
         rows = np.column_stack([times, volts])
         self._blocks.append(rows)
-        if self._follower is not None:
-            self._follower.append(rows)
         self._update_last_time(rows[:, 0])
         self.n_readings += len(rows)
 
@@ -286,8 +213,6 @@ class Recorder:
             sync(self._path)
             self._states = (BlockWriter(file, len(STATE_COLUMNS) - 1), file)
         self._states[0].append(rows)
-        if self._follower is not None:
-            self._follower.append_states(rows)
         self._update_last_time(rows[:, 0])
 
     def _update_last_time(self, times_s: Array) -> None:
@@ -304,14 +229,12 @@ class Recorder:
             more: JSON that is added to the entry, such as `depth_mm`.
         """
         position = check_numbers(position_mm, np.float64, "position")
-        if position.shape != (2,) or not (np.isnan(position).all() or (np.abs(position) <= MAX_MM).all()):
-            raise InputError(
-                f"position is {short_repr(position_mm)}, expected x and y up to {MAX_MM:g} mm, or NaN twice"
-            )
+        if position.shape != (2,) or not (np.isnan(position).all() or np.isfinite(position).all()):
+            raise InputError(f"position is {short_repr(position_mm)}, expected x and y in mm, or NaN twice")
         number = self._press if press is None else check_int("press", press, 0, MAX_INDEX)
         reading = check_int("reading", reading, 0, MAX_INDEX)
         x, y = (None if np.isnan(value) else value for value in position.tolist())
-        self._started = self._write_event("started", number, reading, x_mm=x, y_mm=y, **more)
+        self._write_event("started", number, reading, x_mm=x, y_mm=y, **more)
         self._press, self._is_down = number, True
 
     def finish(self, reading: int, **more: Any) -> None:
@@ -323,9 +246,7 @@ class Recorder:
         """
         if not self._is_down:
             raise InputError(f"press {self._press} was not begun, so it cannot be finished")
-        done = self._write_event("done", self._press, check_int("reading", reading, 0, MAX_INDEX), **more)
-        if self._follower is not None:
-            self._follower.finish(self._press, _finished_press(self._started, done))
+        self._write_event("done", self._press, check_int("reading", reading, 0, MAX_INDEX), **more)
         self.done.add(self._press)
         self._press, self._is_down = self._press + 1, False
 
@@ -339,13 +260,12 @@ class Recorder:
             self._is_down = False
             self._write_event("aborted", self._press, self.n_readings, reason=reason)
 
-    def _write_event(self, event: str, press: int, reading: int, **more: Any) -> Mapping[str, Any]:
+    def _write_event(self, event: str, press: int, reading: int, **more: Any) -> None:
         document = {"event": event, "press": press, "reading": reading, **more}
         try:
             self._lines.append(json.dumps(document, allow_nan=False) + "\n")
-        except (TypeError, ValueError, RecursionError) as error:
+        except (TypeError, ValueError) as error:
             raise InputError(f"press {press}: {short_repr(document)}, expected what JSON can hold") from error
-        return document
 
     def sync(self) -> None:
         """Put everything on the disk: first the readings and states, then the journal about them."""
@@ -354,8 +274,6 @@ class Recorder:
         if self._states is not None:
             self._states[0].flush()
             to_disk(self._states[1].fileno())
-        if self._follower is not None:
-            self._follower.sync()
         lines = "".join(self._lines).encode()
         write_at(self._journal, self._journal_bytes, lines)
         self._journal_bytes += len(lines)
@@ -369,8 +287,6 @@ class Recorder:
         with self._lock, contextlib.ExitStack() as files:
             for file in (self._journal, self._stream, *(self._states or ())[1:]):
                 files.enter_context(file)
-            if self._follower is not None:
-                files.callback(self._follower.close)
             with contextlib.suppress(*([OSError] if kind else [])):  # do not hide the error under way
                 self.sync()
 
@@ -404,8 +320,7 @@ def check_new_recording(path: Path) -> None:
 def is_uncommitted(path: Path) -> bool:
     """Whether a folder holds only files that are created up to `start.json`, without a reading or press."""
     return all(
-        stat.S_ISREG(file.lstat().st_mode)
-        and (file.name in (START, _NEW_START) or (file.name in _BEFORE_START and file.stat().st_size == 0))
+        file.name in (START, _NEW_START) or (file.name in _BEFORE_START and file.stat().st_size == 0)
         for file in path.iterdir()
         if file.name != LOCK
     )

@@ -2,7 +2,7 @@
 
 Targets come in an order with short ways that still covers the whole pad every few presses. A rejected press stays in
 the recording at an unknown position: its effect on the pad shows in the presses around it. The view of a session is
-JSON, for the page (`live/pages/hand.html`) and as text for the terminal.
+JSON, for the page (`live/pages/hand.html`), and a few lines of text for the terminal.
 """
 
 from collections import deque
@@ -15,7 +15,7 @@ import numpy as np
 from padforge.design.common.validation import InputError
 from padforge.design.morphology import Morphology
 from padforge.design.paths.curves import flatten
-from padforge.sense.arrays import MAX_MM, Array, check_magnitude, check_numbers
+from padforge.sense.arrays import Array
 from padforge.sense.localizer.features import REST, interpolate_gaps
 from padforge.sense.recording.press_plan import fit_pad_settings, make_plan, pressable_test
 from padforge.sense.recording.recording import Recording
@@ -39,7 +39,6 @@ COMMANDS = (
 )
 """Commands of a person, by a key or a button."""
 PATH_TOLERANCE = 0.02  # of the paths drawn, grid units
-MAP_COLUMNS, MAP_ROWS = 49, 21  # at most, of the map on a terminal, whose characters are twice as high as wide
 BAR = 30  # characters of the progress bar
 
 # In the published recording, with presses detected as here, one press in 370 is weaker than MIN_RESPONSE of the usual
@@ -104,10 +103,7 @@ def open_recorder_by_hand(config: RigConfig, board: Mapping[str, Any], resume: b
     is_resumed = resume and (config.out / START).exists()
     if is_resumed:
         presses = read_source(config, config.rig, KIND)["plan"]["presses"]
-        targets_mm = check_numbers(presses, np.float64, "positions of the plan")
-        if targets_mm.ndim != 2 or targets_mm.shape[1] != 2:
-            raise InputError(f"{config.out}: its plan has shape {targets_mm.shape}, expected (Q, 2)")
-        check_magnitude("positions of the plan", targets_mm, MAX_MM, "mm")
+        targets_mm = np.array(presses, np.float64)
     else:
         targets_mm = plan_targets(config)
     recorder = open_recorder(config, config.rig, targets_mm.tolist(), config.out, resume, {"board": board}, KIND)
@@ -517,32 +513,11 @@ def pad_view(pad: Morphology, title: str, mirrored: bool = False) -> dict[str, A
 
 
 def view_lines(view: Mapping[str, Any]) -> list[str]:
-    """Write the view (`pad_view` and `HandSession.view`) as text, with the pad as a map seen from above."""
+    """Write the view of `HandSession.view` as text."""
     full = round(BAR * view["progress"])
     return [
         view["prompt"].upper(),
         f"[{'#' * full}{'.' * (BAR - full)}]",
-        *_map_lines(view),
         f"{view['done']} of {view['total']} presses   {view['message']}",
         "   ".join(f"{row['key']}: {row['text'].lower()}" for row in COMMANDS),
     ]
-
-
-def _map_lines(view: Mapping[str, Any]) -> list[str]:
-    """The pad's edge, the last accepted presses (.), a rejected one (x), and the target (O)."""
-    width, height = view["half_mm"]
-    columns = max(round(MAP_COLUMNS * width / max(width, height)), 3)
-    rows = [[" "] * columns for _ in range(max(round(MAP_ROWS * height / max(width, height)), 3))]
-
-    def put(position_mm: Position, mark: str) -> None:
-        x, y = np.clip((np.array(position_mm) / (width, height) + 1) / 2, 0, 1).tolist()
-        right = 1 - x if view["mirrored"] else x
-        rows[round((1 - y) * (len(rows) - 1))][round(right * (columns - 1))] = mark
-
-    for press in view["presses"]:
-        put((press["x_mm"], press["y_mm"]), ".")
-    for name, mark in (("rejected", "x"), ("target", "O")):
-        if view[name] is not None:
-            put(view[name], mark)
-    edge = f"+{'-' * columns}+"
-    return [edge, *(f"|{''.join(row)}|" for row in rows), edge]

@@ -29,7 +29,7 @@ from padforge.sense.recording.press_plan import (
     pad_source,
     pressable_test,
 )
-from padforge.sense.recording.run_directory import FORMAT, START, Follower, Recorder
+from padforge.sense.recording.run_directory import FORMAT, START, Recorder
 from padforge.sense.rig.devices import Pose, RigFault
 from padforge.sense.settings import SIMULATED, Millimetres, RigSettings
 
@@ -162,7 +162,6 @@ class RigConfig:
     inputs: Sequence[Path] = ()
     pad_settings: PadSettings | None = None  # which part of the pad is pressed, unless a file says where
     folder: Path = Path()  # of the pad, with what fabricate has written
-    follower: Follower | None = None  # writes the recording in another form meanwhile
 
 
 def load_or_make_plan(config: RigConfig, rig: RigSettings, resume: bool) -> PressPlan:
@@ -220,15 +219,11 @@ def open_recorder(
             for key in _IDENTITY_KEYS[device]:
                 if (before := _get(_get(stored, device), key)) != (now := identity.get(key)):
                     raise InputError(f"{device}: {key} is {now}, the recording in {folder} was begun with {before}")
-        recorder = Recorder.resume(folder)
-    else:
-        plan = {"columns": list(COLUMNS[: len(presses[0])]), "presses": presses}
-        source = {"kind": kind, "devices": devices, **_settings_and_pad(config, rig), "plan": plan}
-        made_by = provenance(config.command, rig.seed, config.inputs)
-        recorder = Recorder(folder, len(config.pad.knots), source, made_by)
-    if config.follower is not None:
-        recorder.attach(config.follower)
-    return recorder
+        return Recorder.resume(folder)
+    plan = {"columns": list(COLUMNS[: len(presses[0])]), "presses": presses}
+    source = {"kind": kind, "devices": devices, **_settings_and_pad(config, rig), "plan": plan}
+    made_by = provenance(config.command, rig.seed, config.inputs)
+    return Recorder(folder, len(config.pad.knots), source, made_by)
 
 
 def _settings_and_pad(config: RigConfig, rig: RigSettings) -> dict[str, Any]:

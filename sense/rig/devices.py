@@ -214,11 +214,11 @@ class SerialStream:
 
 def port_fault(port: str, error: Exception) -> RigFault:
     """Translate pyserial's `error` on opening `port` into a fault with advice."""
-    number, text = getattr(error, "errno", None), str(error)  # Windows has the kind in the text only
+    number = getattr(error, "errno", None)
     reason, advice = f"cannot be opened ({error})", "check that it is the right port"
-    if number == errno.ENOENT or "FileNotFoundError" in text:
+    if number == errno.ENOENT:
         reason, advice = "there is no such port", "check the cable; `padforge sense doctor` lists the ports there are"
-    elif number in (errno.EAGAIN, errno.EBUSY) or "PermissionError" in text:
+    elif number in (errno.EAGAIN, errno.EBUSY):
         reason, advice = "another program uses it", "close it; it may be the serial monitor of the Arduino IDE"
     elif number in (errno.EACCES, errno.EPERM):
         reason = "no permission to open it"

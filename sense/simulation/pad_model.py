@@ -21,8 +21,7 @@ from padforge.sense.settings import RigSettings
 from padforge.sense.simulation.built_pad import BuiltPad, PressParts, build_pad, press_contacts
 from padforge.sense.simulation.residual_indentation import MAX_LAG, RETURNED, replaced_residues
 
-SUPPLY_V = 3.3
-ADC_STEPS = 4095
+SUPPLY_V, ADC_STEPS = 3.3, 2**12 - 1  # of the boards and the converter that are simulated
 GAUGE_FACTOR = 0.65  # relative change of a fibre's resistance per strain in a layer
 WEIGHT_GAUGE_FACTOR = 0.4  # and per relative stretch of a contact with weights about 1, pressed FULL_DEPTH_MM deep
 FULL_DEPTH_MM = 5.0
@@ -199,8 +198,8 @@ def divider_voltage(rest_v: Array, change: Array) -> Array:
     return SUPPLY_V / (1 + ratio * (1 + change))
 
 
-def quantize(volts: Array) -> Array:
-    """Quantize voltages as a 12-bit ADC does: whole steps within its range, V."""
+def adc_volts(volts: Array) -> Array:
+    """Return voltages as an ADC of ADC_STEPS reads them: whole steps within its range, V."""
     return np.clip(np.rint(volts / SUPPLY_V * ADC_STEPS), 0, ADC_STEPS) * (SUPPLY_V / ADC_STEPS)
 
 
@@ -224,7 +223,7 @@ class Divider:
         volts = self._rest_v + visible if self._linear else divider_voltage(self._rest_v, visible)
         volts += self._rig.drift_mv * 1e-3 * self._drift(len(volts))
         volts += self._rig.noise_mv * 1e-3 * self._rng.standard_normal(volts.shape)
-        return quantize(volts)
+        return adc_volts(volts)
 
 
 def simulate_readings(

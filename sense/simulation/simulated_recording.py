@@ -16,7 +16,7 @@ from scipy.optimize import nnls
 
 from padforge.design import Contact, Morphology, Twin
 from padforge.design.common.settings import or_default
-from padforge.design.common.validation import MAX_VALUES, InputError, check_int, check_type
+from padforge.design.common.validation import InputError, check_int
 from padforge.design.contact import contact_press
 from padforge.design.settings import PadSettings
 from padforge.design.twin import PARTS, TwinChannel, TwinPart
@@ -208,15 +208,15 @@ def simulate(
         The recording, the same for the same arguments.
 
     Raises:
-        InputError: more fibres or readings than a recording may hold, presses beyond the pad or in its keep-outs, a
+        InputError: more fibres than a recording may have, presses beyond the pad or in its keep-outs, a
             plan that is adaptive or no file of positions, or a twin of which no channel reads a fibre.
     """
     contact, rig = or_default("contact", contact, Contact), or_default("rig", rig, RigSettings)
-    channels = len(pad.channels) if isinstance(pad, Twin) else len(check_type("pad", pad, Morphology).knots)
+    channels = len(pad.channels) if isinstance(pad, Twin) else len(pad.knots)
     check_int("fibres of the pad", channels, 1, MAX_FIBRES)
     _check_plan_kind(rig)
     if measured := pad if isinstance(pad, Twin) else like:
-        rig, contact = measured_rig(check_type("like", measured, Twin), rig), measured.contact()
+        rig, contact = measured_rig(measured, rig), measured.contact()
     rig = rig.for_contact(contact)
     if isinstance(pad, Twin):
         model = model_twin(pad, rig, size)
@@ -226,7 +226,6 @@ def simulate(
         model = model_like_twin(pad, like, rig, size)
     rng = np.random.default_rng(rig.seed)
     plan = make_plan_in(model.corners_mm, rig, rng, model.free)
-    _check_size(len(plan), rig, channels)
     cycle = Cycle(rig.readings_per_press, rig.rate_hz)
     responses = model.responses(plan.positions_mm, plan.depths_mm)
     readings = simulate_readings(responses, plan.positions_mm, cycle, rig, rng, model.noise_v)
@@ -257,7 +256,6 @@ def plan_simulation(pad: Morphology, rig: RigSettings, contact: Contact, size: P
     """
     _check_plan_kind(rig)
     plan = make_plan(pad, rig, np.random.default_rng(rig.seed), size)
-    _check_size(len(plan), rig, len(pad.knots))
     if contact.model == "layer":
         check_depths(plan.depths_mm, contact.thickness_mm, "the thickness of the pad")
         contact_press(deepest_contact(contact, plan.depths_mm))
@@ -267,12 +265,6 @@ def plan_simulation(pad: Morphology, rig: RigSettings, contact: Contact, size: P
 def _check_plan_kind(rig: RigSettings) -> None:
     if rig.plan == "adaptive":
         raise InputError("[rig] plan is adaptive, allowed in a simulation are uniform, grid, serpentine or a .csv file")
-
-
-def _check_size(presses: int, rig: RigSettings, channels: int) -> None:
-    values = presses * rig.readings_per_press * channels
-    if values > MAX_VALUES:
-        raise InputError(f"[rig] presses is {presses}: they have {values} readings, allowed are {MAX_VALUES}")
 
 
 def sample_positions(pad: Morphology, presses: int, rng: np.random.Generator, size: PadSettings | None = None) -> Array:

@@ -17,17 +17,18 @@ from matplotlib.figure import Figure
 
 from padforge.design.common.parallel import State
 from padforge.design.common.plotting import ALARM, CURVES, INK, add_title
-from padforge.design.common.validation import InputError, check_int
+from padforge.design.common.validation import InputError
 from padforge.design.contact import signals
 from padforge.design.morphology import Morphology
 from padforge.design.published.networks import fit_batch, training_presses
 from padforge.design.published.objective import idle_share
 from padforge.design.settings import PUBLISHED_CONTACT, between_fibres
-from padforge.sense.arrays import MAX_FIBRES, Array, Indices
+from padforge.sense.arrays import Array, Indices
 from padforge.sense.localizer.calibration import split_presses
 from padforge.sense.localizer.evaluation import ACTIVE, distances
 from padforge.sense.localizer.evaluation import idle_share as recorded_idle_share
-from padforge.sense.localizer.features import N_TIMED, compute_features, interpolate_gaps
+from padforge.sense.localizer.features import compute_features, interpolate_gaps
+from padforge.sense.localizer.moments import N_TIMED
 from padforge.sense.recording.recording import Recording
 from padforge.sense.settings import RigSettings
 from padforge.sense.signals.filters import running_median, total_variation
@@ -64,13 +65,10 @@ def drift_study(pads: Mapping[str, Morphology], recordings: Mapping[str, Recordi
     """Evaluate every filter with every kind of drift compensation, and how often fibres are idle.
 
     Raises:
-        InputError: a label twice, a pad of more fibres than a recording may have, or a recording with too few presses
-            of known position.
+        InputError: a label twice, or a recording with too few presses of known position.
     """
     if duplicates := sorted(pads.keys() & recordings.keys()):
         raise InputError(f"{duplicates[0]}: label of a morphology and of a recording, expected each label once")
-    for label, pad in pads.items():
-        check_int(f"fibres of {label}", len(pad.knots), 1, MAX_FIBRES)
     rig_seed = int(np.random.default_rng([6, seed]).integers(2**32))
     rig = RIG.model_copy(update={"seed": rig_seed})
     sources: dict[str, Callable[[], Recording]] = {label: partial(simulate, pad, rig) for label, pad in pads.items()}
@@ -234,10 +232,10 @@ def _conclude(
             if name == AS_PUBLISHED:
                 parts = {part: state[part].tolist() for part in ("fibre", "readings", "samples", "levels")}
                 excerpts.append({"recording": label, "kind": kind, **parts})
-    return StudyResult(rows, _describe(settings, rows, idle), {"idle": idle, "excerpts": excerpts})
+    return StudyResult(rows, _describe(settings, idle), {"idle": idle, "excerpts": excerpts})
 
 
-def _describe(settings: Mapping[str, Any], rows: Rows, idle: Rows) -> list[str]:
+def _describe(settings: Mapping[str, Any], idle: Rows) -> list[str]:
     share = 100 * TEST_SHARE
     text = [
         f"Networks of {settings['hidden']} neurons localize presses from readings after {len(settings['filters'])} "
@@ -245,8 +243,6 @@ def _describe(settings: Mapping[str, Any], rows: Rows, idle: Rows) -> list[str]:
         f"{settings['members']} networks, on presses never trained on: {share:g} % drawn at random, and the last "
         f"{share:g} % of the recording, by which the drift has gone on."
     ]
-    for label in dict.fromkeys(row["recording"] for row in rows):
-        text.append(_describe_recording([row for row in rows if row["recording"] == label]))
     if model := [row for row in idle if row["kind"] == "contact model"]:
         shares = _listed([f"{row['idle_percent']:.1f} % ({row['label']})" for row in model])
         text.append(f"By the contact model a fibre is idle in {shares} of the presses of the published serpentine.")
@@ -260,36 +256,6 @@ def _describe(settings: Mapping[str, Any], rows: Rows, idle: Rows) -> list[str]:
         "published recording of the pad of N = 5 gives 16 to 18 % by that rule, whether readings are filtered or not: "
         "the table cannot be reproduced from the data.",
     ]
-
-
-def _describe_recording(rows: Rows) -> str:
-    def least(key: str = "mean_mm", **values: str) -> Mapping[str, Any]:
-        return min((row for row in rows if values.items() <= row.items()), key=lambda row: row[key])
-
-    best, best_last = least(), least("mean_last_mm")
-    plain = least(filter=best["filter"], compensation="none")
-    raw = least(filter=RAW, compensation=best["compensation"])
-    filtered = min(
-        (least(filter=name, compensation=best["compensation"]) for name in FILTERS if name != RAW),
-        key=lambda row: row["mean_mm"],
-    )
-    by_compensation = [least(compensation=compensation) for compensation in COMPENSATIONS]
-    errors = _listed([f"{row['mean_mm']:.2f} mm ({_method(row)})" for row in by_compensation])
-    return (
-        f"{best['recording']}, {best['kind']}: the least error on presses drawn at random is that of {_method(best)}, "
-        f"{best['mean_mm']:.2f} mm (standard deviation over networks {best['std_mm']:.2f} mm), and on the last ones "
-        f"that of {_method(best_last)}, {best_last['mean_last_mm']:.2f} mm. Each compensation with its best filter "
-        f"gives {errors}. With the best filter but without compensation the error is {plain['mean_mm']:.2f} mm, on the "
-        f"last presses {plain['mean_last_mm']:.2f} mm, which is {plain['mean_mm'] - best['mean_mm']:.2f} mm and "
-        f"{plain['mean_last_mm'] - best_last['mean_last_mm']:.2f} mm more than the best. With the best compensation, "
-        f"raw readings give {raw['mean_mm']:.2f} mm, and the best filter, {filtered['filter']}, "
-        f"{filtered['mean_mm']:.2f} mm."
-    )
-
-
-def _method(row: Mapping[str, Any]) -> str:
-    readings = "raw readings" if row["filter"] == RAW else f"readings after {row['filter']}"
-    return f"'{row['compensation']}' of {readings}"
 
 
 def _listed(parts: Sequence[str]) -> str:

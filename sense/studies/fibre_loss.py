@@ -4,7 +4,7 @@ Both methods are tested on the same presses. The published one (paper, figure 9 
 fibres will fail, and trains on the others alone: 42 networks for 6 fibres of which up to 3 fail.
 """
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -19,10 +19,10 @@ from padforge.design.common.parallel import State
 from padforge.design.common.plotting import FAINT, HORIZONTAL, INK, VERTICAL, add_caption, save_figure, style_axes
 from padforge.design.common.progress import OnProgress, ignore_progress
 from padforge.design.common.settings import or_default
-from padforge.design.common.validation import InputError, check_int, check_type
+from padforge.design.common.validation import InputError, check_int
 from padforge.design.objectives.fibre_loss import failure_subsets
 from padforge.sense import settings
-from padforge.sense.arrays import MAX_FIBRES, Array, Indices
+from padforge.sense.arrays import Array, Indices
 from padforge.sense.localizer.calibration import fit_recording, split_unseen
 from padforge.sense.localizer.evaluation import Evaluation, errors_by_loss, errors_by_position
 from padforge.sense.localizer.model import Localization, LocalizerModel
@@ -100,17 +100,12 @@ def fibre_loss_study(
         InputError: neither method, no such fibres or none left, too few presses, a recording used in a recalibration or
             that does not suit the localizer, or a localizer without fibre dropout.
     """
-    check_type("retrain", retrain, bool)
-    if localizer is not None:
-        check_type("localizer", localizer, LocalizerModel)
-    elif not retrain:
+    if localizer is None and not retrain:
         raise InputError("neither a localizer nor retraining is given, expected one of them or both")
     options = or_default("options", options, settings.LocalizerSettings)
-    fibres = check_type("recording", recording, Recording).fibres
-    most = min(check_int("max_failures", max_failures, 0, MAX_FIBRES), fibres - 1)
-    chosen = tuple(
-        sorted({check_int("failed fibre", fibre, 0, fibres - 1) for fibre in check_type("failed", failed, Iterable)})
-    )
+    fibres = recording.fibres
+    most = min(max_failures, fibres - 1)
+    chosen = tuple(sorted({check_int("failed fibre", fibre, 0, fibres - 1) for fibre in failed}))
     if len(chosen) == fibres:
         raise InputError(f"failed are all {fibres} fibres, at least one must be left")
     training, test = split_unseen(recording, localizer, options)

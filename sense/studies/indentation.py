@@ -29,7 +29,7 @@ from padforge.sense.studies.study import (
     draw_confusions,
     fit_and_predict,
     label_axes,
-    quantize,
+    read_counts,
 )
 
 LOG_SCALE = 4.0
@@ -115,7 +115,7 @@ def _estimate_depth(
     positions = fresh_presses(between_fibres(pad.layout), count, int(rng.integers(2**32)))
     depth_mm = contact.depth_mm * rng.uniform(*depths, count)
     responses = indented_signals(pad, positions, depth_mm, contact)
-    inputs = signed_logarithm(quantize(responses, sizes.presses, noise_counts, rng))
+    inputs = signed_logarithm(read_counts(responses, sizes.presses, noise_counts, rng))
     targets = np.column_stack([positions, depth_mm])
     if is_known:
         inputs, targets = np.column_stack([inputs, depth_mm]), positions
@@ -175,10 +175,10 @@ def _conclude_force(
                 "bin_position_mm": means,
             }
             curves.append(curve)
-    return StudyResult(rows, _describe_force(contact, settings, rows), {"curves": curves})
+    return StudyResult(rows, _describe_force(contact, settings), {"curves": curves})
 
 
-def _describe_force(contact: Contact, settings: Mapping[str, Any], rows: list[dict[str, Any]]) -> list[str]:
+def _describe_force(contact: Contact, settings: Mapping[str, Any]) -> list[str]:
     low_mm, high_mm = settings["depths_mm"]
     noises = " or ".join(f"{noise:g}" for noise in FORCE_NOISES)
     model = (
@@ -189,21 +189,16 @@ def _describe_force(contact: Contact, settings: Mapping[str, Any], rows: list[di
         f"and depth from the readings' logarithms; they were trained on {settings['presses']} presses and tested on "
         f"{settings['test']} others."
     )
-    result = (
-        "{pad}, noise of {noise}: the error of the depth is {depth_mm:.2f} mm (guessing the middle depth: "
-        "{depth_guessed_mm:.2f} mm), of the force {force_n:.3f} N or {force_percent:.1f} % of its range (guessing: "
-        "{force_guessed_percent:.1f} %). That of the position is {position_mm:.2f} mm, {position_depth_known_mm:.2f} "
-        "mm where the depth is an input, and {position_one_depth_mm:.2f} mm where all presses are {middle:g} mm deep."
+    columns = (
+        "Errors are those of position, depth and force; of the position too where the depth is an input, and where all "
+        f"presses are {MIDDLE * contact.depth_mm:g} mm deep; and those of guessing the middle depth."
     )
-    results = [
-        result.format(**row, noise=_counts(row["noise_counts"]), middle=MIDDLE * contact.depth_mm) for row in rows
-    ]
     caution = (
         f"Depth and force are related by the mechanics of a linear elastic layer of reduced modulus "
         f"{REDUCED_MODULUS_KPA:.0f} kPa. Silicone stiffens where it is strained, and creeps: forces of a built pad "
         "need a calibration against a load cell."
     )
-    return [model, *results, caution]
+    return [model, columns, caution]
 
 
 def _draw_force(document: Mapping[str, Any]) -> Figure:
@@ -305,7 +300,7 @@ def _simulate_shapes(
             rows = (shape == index) & (size == size_index)
             footprint = Contact(radius=radius * circumradius(sides), sides=sides)
             responses[rows] = signals(pad, positions[rows], footprint)
-    counts = quantize(responses, sizes.presses, SHAPE_NOISE_COUNTS, rng)
+    counts = read_counts(responses, sizes.presses, SHAPE_NOISE_COUNTS, rng)
     return signed_logarithm(counts) if kind == "tools" else counts, positions, shape, rng
 
 
@@ -351,10 +346,10 @@ def _conclude_shape(
             }
             rows.append(row)
             confusions.append({"pad": label, "shapes": kind, "names": list(shapes), "counts": counts.tolist()})
-    return StudyResult(rows, _describe_shape(contact, settings, rows), {"confusions": confusions})
+    return StudyResult(rows, _describe_shape(contact, settings), {"confusions": confusions})
 
 
-def _describe_shape(contact: Contact, settings: Mapping[str, Any], rows: list[dict[str, Any]]) -> list[str]:
+def _describe_shape(contact: Contact, settings: Mapping[str, Any]) -> list[str]:
     low_mm, high_mm = settings["depths_mm"]
     flat_mm = tool_contacts(contact)["flat"].tool_radius_mm
     model = (
@@ -366,16 +361,11 @@ def _describe_shape(contact: Contact, settings: Mapping[str, Any], rows: list[di
         f"drawn for every press; networks of {settings['hidden']} neurons, of which the mean of {settings['members']} "
         f"is taken, were trained on {settings['presses']} presses of a set and tested on {settings['test']} others."
     )
-    result = (
-        "{pad}, {shapes}: {accuracy_percent:.1f} % are classified correctly (always the most frequent: "
-        "{majority_percent:.1f} %), worst the {worst} with {worst_percent:.1f} %. The error of the position is "
-        "{position_mm:.2f} mm, and {position_shape_known_mm:.2f} mm by networks with the shape as an input."
+    columns = (
+        "The majority is what always naming the most frequent shape gives. Errors of the position are also those of "
+        "networks with the shape as an input."
     )
-    results = [result.format(**row) for row in rows]
-    ratios = [row["position_mm"] / row["position_shape_known_mm"] for row in rows]
-    chance = ", where below 1 is chance in training" if min(ratios) < 1 else ""
-    growth = f"{min(ratios):.2f} to {max(ratios):.2f} times as large{chance}"
-    return [model, *results, f"An unknown shape makes the error of the position {growth}."]
+    return [model, columns]
 
 
 def _draw_shape(document: Mapping[str, Any]) -> Figure:

@@ -19,7 +19,7 @@ from padforge.design.common.parallel import one_torch_thread, run_tasks
 from padforge.design.common.plotting import ALARM, FAINT, INK, add_caption, new_figure, save_figure
 from padforge.design.common.progress import OnProgress, ignore_progress
 from padforge.design.common.settings import or_default
-from padforge.design.common.validation import InputError, check_type
+from padforge.design.common.validation import InputError
 from padforge.sense import settings
 from padforge.sense.arrays import Array, Indices
 from padforge.sense.localizer.calibration import fit_recording, split_presses
@@ -78,7 +78,6 @@ def learning_curve(
     Raises:
         InputError: too few presses for a curve.
     """
-    check_type("recording", recording, Recording)
     options = or_default("options", options, settings.LocalizerSettings)
     rng = np.random.default_rng(options.seed)
     presses = np.flatnonzero(recording.has_position)

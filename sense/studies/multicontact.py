@@ -20,9 +20,9 @@ from padforge.design.morphology import Morphology
 from padforge.design.published.networks import fit_batch, fresh_presses
 from padforge.design.settings import between_fibres
 from padforge.sense.arrays import Array
+from padforge.sense.simulation.pad_model import ADC_STEPS
 from padforge.sense.studies.press_model import PUBLISHED_PRESSES, PressModel
 from padforge.sense.studies.study import (
-    ADC_COUNTS,
     Sizes,
     Study,
     StudyResult,
@@ -32,7 +32,7 @@ from padforge.sense.studies.study import (
     describe_pads,
     draw_confusions,
     label_axes,
-    quantize,
+    read_counts,
 )
 
 SIZES = Sizes(8192, 2000, hidden=60, epochs=100)
@@ -148,7 +148,7 @@ def _count_contacts(pad: Morphology, press_model: PressModel, sizes: Sizes, seed
     number = rng.integers(MAX_CONTACTS + 1, size=count)
     present = np.arange(MAX_CONTACTS) < number[:, None]
     summed = press_model.respond(pad, positions, np.random.default_rng([6, seed, 0]), present)
-    return classify(quantize(summed, sizes.presses, NOISE_COUNTS, rng), number, MAX_CONTACTS + 1, rng, sizes)
+    return classify(read_counts(summed, sizes.presses, NOISE_COUNTS, rng), number, MAX_CONTACTS + 1, rng, sizes)
 
 
 def _draw_contacts(pad: Morphology, count: int, contacts: int, rng: np.random.Generator) -> Array:
@@ -187,7 +187,7 @@ def _conclude(
         counts = next(results)["confusions"]
         rows.append(dict.fromkeys(rows[-1]) | {"pad": label, "method": COUNTING} | classification_scores(counts))
         confusions.append({"pad": label, "counts": counts.tolist()})
-    return StudyResult(rows, _describe(settings, responses, rows), {"curves": curves, "confusions": confusions})
+    return StudyResult(rows, [_describe(settings, responses)], {"curves": curves, "confusions": confusions})
 
 
 def _errors_by_distance(errors_mm: Array, distances_mm: Array) -> dict[str, list[float]]:
@@ -206,36 +206,19 @@ def _resolution_mm(curve: Mapping[str, list[float]]) -> float | None:
     return resolved[-1][0] if resolved else None
 
 
-def _describe(settings: Mapping[str, Any], responses: str, rows: list[dict[str, Any]]) -> list[str]:
-    text = [
+def _describe(settings: Mapping[str, Any], responses: str) -> str:
+    return (
         f"Two contacts press at once, each anywhere between the outermost fibres, and their strains add. {responses} "
         f"Networks of {settings['hidden']} neurons, of which the mean of {settings['members']} is taken, were trained "
         f"on {settings['presses']} pairs in at most {settings['epochs']} steps and tested on {settings['test']} "
         "others. An error is the mean distance of both contacts, in the order of the two that makes it less. Fixed "
         "labels are the published method: contacts are learnt in the order they were drawn in. Sorted: by x. Free: in "
-        "the order that the network comes nearest to. Moments: the midpoint and the products of half the difference."
-    ]
-    for label in settings["pads"]:
-        *pairs, counting = (row for row in rows if row["pad"] == label)
-        by_method = {row["method"]: row for row in pairs}
-        labelled, best = by_method[LABELLED], min(pairs, key=lambda row: row["error_mm"])
-        errors = ", ".join(f"{method} {row['error_mm']:.2f} mm" for method, row in by_method.items())
-        resolved = "a quarter of the distance of the two or more even for the farthest pairs"
-        if (from_mm := best["resolution_mm"]) is not None:
-            resolved = (
-                "less than a quarter of the distance of the two, half of that of the midpoint, from about "
-                f"{from_mm:.1f} mm on"
-            )
-        text.append(
-            f"{label}: {errors}. In the order of its labels the error of the published method is "
-            f"{labelled['error_by_labels_mm']:.2f} mm; with the midpoint of the two for both it would be "
-            f"{labelled['midpoint_error_mm']:.2f} mm. Free has {by_method['free']['of_fixed_labels']:.2f} of the error "
-            f"of fixed labels; least is that of {best['method']}, {best['of_fixed_labels']:.2f} of it, which is "
-            f"{resolved}. Of up to {settings['max_contacts']} contacts, read with noise of "
-            f"{settings['noise_counts']:g} of {ADC_COUNTS} counts, {counting['accuracy_percent']:.1f} % are counted "
-            f"correctly (always the most frequent number: {counting['majority_percent']:.1f} %)."
-        )
-    return text
+        "the order that the network comes nearest to. Moments: the midpoint and the products of half the difference. "
+        "The midpoint error is that of the midpoint of the two for both; the resolution is the distance from which on "
+        f"the error is less than a quarter of it. Of up to {settings['max_contacts']} contacts, the number is read "
+        f"with noise of {settings['noise_counts']:g} of {ADC_STEPS} counts; the majority is the share of the most "
+        "frequent one."
+    )
 
 
 def _draw(document: Mapping[str, Any]) -> Figure:

@@ -180,25 +180,9 @@ def _describe(settings: Mapping[str, Any], rows: list[dict[str, Any]], maps: lis
         f"trained several times, so that every mean is of at least {MIN_NETWORKS} networks. The last column is the "
         "paper's own measure, taken over the serpentine, most of which was trained on."
     ]
-    intact, worst = ({row["pad"]: row for row in rows if row["n_failed"] == level} for level in (0, most))
-    for label, row in intact.items():
-        line = f"{label}: {row['mean']:.3f} with all fibres ({row['mean_mm']:.2f} mm)"
-        if label in worst and most:
-            failed = worst[label]
-            line += (
-                f", {failed['mean']:.3f} with {most} failed ({failed['mean'] / row['mean']:.1f} times as much), "
-                f"{failed['max']:.3f} with the worst {most}"
-            )
-        if chosen := settings["failed"]:
-            mapped = [panel for panel in maps if panel["pad"] == label][-1]
-            line += f", {mapped['mean']:.3f} {failed_label(chosen)}"
-        text.append(f"{line}.")
-    if len(worst) > 1:
-        best, *_, last = sorted(worst, key=lambda label: worst[label]["mean"])
-        text.append(
-            f"With {most} failed {best} is the most accurate and {last} the least; its error is "
-            f"{worst[last]['mean'] / worst[best]['mean']:.1f} times as large."
-        )
+    if chosen := settings["failed"]:
+        by_pad = {panel["pad"]: panel["mean"] for panel in maps}  # the last map of a pad is that without these
+        text += [f"{label}: {mean:.3f} {failed_label(chosen)}." for label, mean in by_pad.items()]
     return text
 
 

@@ -182,7 +182,7 @@ def _conclude(
         rows.append(row)
         if method == SPREAD:
             maps.append({"pad": label, "grid": grid, "errors": _error_map(grid, state).tolist()})
-    return StudyResult(rows, _describe(settings, responses, rows), {"maps": maps})
+    return StudyResult(rows, [_describe(settings, responses)], {"maps": maps})
 
 
 def _error_map(grid: int, state: State) -> Array:
@@ -193,34 +193,15 @@ def _error_map(grid: int, state: State) -> Array:
     return np.round(total / np.maximum(count, 1), 4).reshape(CELLS, CELLS)
 
 
-def _describe(settings: Mapping[str, Any], responses: str, rows: list[dict[str, Any]]) -> list[str]:
-    text = [
+def _describe(settings: Mapping[str, Any], responses: str) -> str:
+    return (
         f"Networks of {settings['hidden']} neurons were trained on {settings['presses']} presses, for every size of "
         f"the surface alike, in at most {settings['epochs']} steps. The published method learns the signals of a "
         "serpentine and is evaluated on it, most of which was trained on; the spread method learns each fibre's share "
         f"of its family's signal from presses spread evenly, and is evaluated on {settings['test']} fresh ones. The "
         "shared method learns from the same presses the position in the tile, by one network for all tiles. Errors are "
         f"in grid units. {responses}"
-    ]
-    for label, method in product(settings["pads"], METHODS):
-        cases = [row for row in rows if (row["pad"], row["method"]) == (label, method)]
-        below = ", ".join(str(row["grid"]) for row in cases if row["mean"] < 0.5)
-        half = f"below half a grid unit on grids {below}" if below else "above half throughout"
-        first, last = cases[0], cases[-1]
-        text.append(
-            f"{label}, {method}: {first['mean']:.3f} at {first['grid']} x {first['grid']} to {last['mean']:.3f} at "
-            f"{last['grid']} x {last['grid']}, {first['percent_of_side']:.2f} % to {last['percent_of_side']:.2f} % "
-            f"of the side; {half}. The largest took {last['seconds']:.0f} s."
-        )
-    grid = max(settings["grids"])
-    largest = [row for row in rows if row["grid"] == grid and row["method"] != PUBLISHED]
-    best, *_, worst = sorted(largest, key=lambda row: row["mean"])
-    text.append(
-        f"On fresh presses at {grid} x {grid} the best is {best['pad']}, {best['method']}, with an error of "
-        f"{best['mean']:.3f} grid units or {best['percent_of_side']:.3f} % of the side; that of {worst['pad']}, "
-        f"{worst['method']} is {worst['mean'] / best['mean']:.1f} times as large."
     )
-    return text
 
 
 def _draw(document: Mapping[str, Any]) -> Figure:

@@ -158,7 +158,7 @@ def _conclude(
                 }
                 for tested, errors in zip(objects, next(results)["errors"].T, strict=True)
             ]
-    return StudyResult(rows, _describe(settings, rows))
+    return StudyResult(rows, [_describe(settings)])
 
 
 def _kind(settings: Mapping[str, Any]) -> _Objects:
@@ -171,7 +171,7 @@ def _error_matrix(settings: Mapping[str, Any], rows: list[dict[str, Any]], label
     return np.reshape(means, (math.isqrt(len(means)), -1))
 
 
-def _describe(settings: Mapping[str, Any], rows: list[dict[str, Any]]) -> list[str]:
+def _describe(settings: Mapping[str, Any]) -> str:
     kind = _kind(settings)
     sizes, others = settings[kind.size], settings[kind.other]
     if settings["contact"]["model"] == "layer":
@@ -184,25 +184,11 @@ def _describe(settings: Mapping[str, Any], rows: list[dict[str, Any]]) -> list[s
         what = (
             f"Objects of {len(sizes)} sizes (radius K in grid units) and {len(others)} shapes (D sides) press every pad"
         )
-    text = [
+    return (
         f"{what}; {settings['members']} networks of {settings['hidden']} neurons were trained on "
         f"{settings['presses']} presses with each object, and tested on {settings['test']} fresh presses with that one "
         f"and with every other. Errors are in {kind.unit}."
-    ]
-    small_name, large_name = (kind.names[0].format(size) for size in (sizes[0], sizes[-1]))
-    for label in settings["pads"]:
-        matrix = _error_matrix(settings, rows, label)
-        trained = np.diag(matrix).reshape(len(others), len(sizes))
-        small, *_, large = trained.mean(axis=0)
-        by_other = trained.mean(axis=1)
-        different = matrix[~np.eye(len(matrix), dtype=bool)]
-        text.append(
-            f"{label}: {small:.3f} with {small_name}, {large:.3f} with {large_name}; {kind.names[2]} differ by "
-            f"{100 * (by_other.max() / by_other.min() - 1):.0f} %. The mean error for an object that the networks were "
-            f"not trained with is {different.mean():.3f}, at worst {different.max():.3f}, instead of "
-            f"{trained.mean():.3f}."
-        )
-    return text
+    )
 
 
 def _draw(document: Mapping[str, Any]) -> Figure:

@@ -8,10 +8,9 @@ import numpy as np
 
 from padforge.design.common.parallel import State
 from padforge.design.common.plotting import CURVES, add_title
-from padforge.design.common.validation import check_int
 from padforge.design.morphology import Morphology
 from padforge.design.settings import Contact
-from padforge.sense.arrays import MAX_FIBRES, Array, Indices
+from padforge.sense.arrays import Array, Indices
 from padforge.sense.localizer.calibration import fit_recording
 from padforge.sense.localizer.evaluation import distances
 from padforge.sense.localizer.features import compute_features
@@ -46,12 +45,7 @@ def strokes_study(
         strokes: of each speed.
         options: of the training; the defaults if None.
         seed: of every random choice.
-
-    Raises:
-        InputError: a pad of more fibres than a recording may have.
     """
-    for label, pad in pads.items():
-        check_int(f"fibres of {label}", len(pad.knots), 1, MAX_FIBRES)
     contact = contact or Contact()
     rig = RigSettings(presses=presses, seed=seed)
     options = (options or LocalizerSettings()).model_copy(update={"seed": seed})

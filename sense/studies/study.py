@@ -23,12 +23,11 @@ from padforge.design.morphology import Morphology
 from padforge.design.settings import PUBLISHED_PAD, Layout
 from padforge.sense.arrays import Array, Indices
 from padforge.sense.recording.recording import Recording
+from padforge.sense.simulation.pad_model import ADC_STEPS
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-ADC_COUNTS = 2**12 - 1
-"""Full scale of the converter that studies read signals with."""
 NAMED = re.compile(r"(square|(optimised)|(random|optimised|genetic)-([1-9]\d?))(?:@([1-9]\d{0,2}))?")
 """Pads without a file: straight fibres, random ones of N knots, and those of a search; their grid after an @."""
 
@@ -110,7 +109,7 @@ def run(
     with files.atomic_files(out) as folder:
         save_figure(study.draw(document), folder / f"{study.name}.png")
         files.write_text(folder / f"{study.name}.md", _markdown(document, f"{study.name}.png"))
-        with (folder / f"{study.name}.csv").open("w", encoding="utf-8", errors="backslashreplace", newline="") as file:
+        with (folder / f"{study.name}.csv").open("w", encoding="utf-8", newline="") as file:
             writer = csv.DictWriter(file, list(result.rows[0]), lineterminator="\n")
             writer.writeheader()
             writer.writerows(result.rows)
@@ -152,7 +151,7 @@ def _table_cells(rows: Sequence[Mapping[str, Any]]) -> list[list[str]]:
 
 def _markdown(document: Mapping[str, Any], figure: str) -> str:
     def line(row: list[str]) -> str:
-        return f"| {' | '.join(cell.replace('|', chr(92) + '|').replace('<', '&lt;') for cell in row)} |"
+        return f"| {' | '.join(row)} |"
 
     head, *body = map(line, _table_cells(document["rows"]))
     rule = f"|{' --- |' * len(document['rows'][0])}"
@@ -184,10 +183,8 @@ def _label(parts: Sequence[tuple[str, str, Any]]) -> dict[str, Any]:
     """Return objects by label, from the user's names, labels and objects."""
     labelled: dict[str, Any] = {}
     for name, label, part in parts:
-        # File names may hold what no page or table can. Matplotlib typesets mathematics between $, and leaves labels
-        # that begin with _ out of legends.
-        printable = label.encode("utf-8", "backslashreplace").decode().replace("$", "")
-        label = " ".join(printable.split()).lstrip("_ ") or "pad"
+        # Matplotlib typesets mathematics between $, and leaves labels that begin with _ out of legends.
+        label = label.replace("$", "").lstrip("_ ") or "pad"
         if label in labelled:
             raise InputError(f"{name}: another one is called {label}, expected each label once")
         labelled[label] = part
@@ -235,15 +232,15 @@ def describe_pads(pads: Mapping[str, Morphology]) -> dict[str, Any]:
     }
 
 
-def quantize(signals: Array, training: int, noise_counts: float, rng: np.random.Generator) -> Array:
+def read_counts(signals: Array, training: int, noise_counts: float, rng: np.random.Generator) -> Array:
     """Read signals (Q, C) with a noisy 12-bit converter, in whole counts; a silent fibre reads its noise.
 
     Full scale is the largest magnitude of a fibre's signal in the first `training` presses. Readings begin at 0 unless
     there are negative signals.
     """
-    full_scale, lowest = np.abs(signals[:training]).max(axis=0), -ADC_COUNTS * int(signals.min() < 0)
+    full_scale, lowest = np.abs(signals[:training]).max(axis=0), -ADC_STEPS * int(signals.min() < 0)
     share = np.divide(signals, full_scale, out=np.zeros(signals.shape), where=full_scale > 0)
-    return np.clip(np.rint(ADC_COUNTS * share + rng.normal(0, noise_counts, signals.shape)), lowest, ADC_COUNTS)
+    return np.clip(np.rint(ADC_STEPS * share + rng.normal(0, noise_counts, signals.shape)), lowest, ADC_STEPS)
 
 
 def fit_and_predict(inputs: Array, targets: Array, rng: np.random.Generator, sizes: Sizes) -> Array:

@@ -17,7 +17,7 @@ from threadpoolctl import threadpool_limits
 from padforge.design import Morphology
 from padforge.design.common.progress import OnProgress, ignore_progress
 from padforge.design.common.settings import or_default
-from padforge.design.common.validation import InputError, check_int, check_type
+from padforge.design.common.validation import InputError
 from padforge.design.paths.curves import lengths
 from padforge.design.settings import Contact, sensed_rectangle
 from padforge.design.twin import (
@@ -40,10 +40,8 @@ from padforge.sense.twin.press_parts import smooth_maps, split_presses
 from padforge.sense.twin.responses import (
     Responses,
     compute_responses,
-    explained_by_gps,
-    fit_gp,
+    estimate_noise,
     fit_gps,
-    noise_and_evidence,
     normalize,
     select_one_depth,
 )
@@ -224,10 +222,9 @@ def identify_pad(
     on_progress: OnProgress = ignore_progress,
 ) -> Identification:
     """Identify a printed pad as `identify`, and return the fit and its evaluation with the twin."""
-    rng = np.random.default_rng(check_int("seed", seed, 0, 2**64 - 1))
-    check_type("pad", pad, Morphology)
+    rng = np.random.default_rng(seed)
     contact = or_default("contact", contact, Contact)
-    recording = select_one_depth(check_type("recording", recording, Recording))
+    recording = select_one_depth(recording)
     positions_mm = recording.presses_mm[recording.has_position]
     _check_positions(positions_mm, pad)
 
@@ -240,8 +237,8 @@ def identify_pad(
 
     # 2. Live channels
     gps = fit_gps(responses.select(rows), pad.unit_mm)
-    noise_v, log_bayes_factor = noise_and_evidence(gps)
-    live = np.flatnonzero(log_bayes_factor > MIN_LOG_BAYES_FACTOR)
+    noise_v = np.array([gp.noise_v for gp in gps])
+    live = np.flatnonzero([gp.log_bayes_factor > MIN_LOG_BAYES_FACTOR for gp in gps])
     if not len(live):
         raise InputError("no channel of the recording responds to where the pad is pressed")
     if len(live) > len(pad.knots):
@@ -276,10 +273,11 @@ def identify_pad(
     measured = _measure_contact(_as_deep(contact, recording), fit.pad, on_plan, training, held_out)
     noise_v = np.nan_to_num(noise_v)
     held = parts["held"].pad if parts else fit.pad
-    noise_v[live] = fit_gp(held.residuals(pressed), pad.unit_mm)[0]
+    noise_v[live] = estimate_noise(held.residuals(pressed), pad.unit_mm)
     scatter = estimate_scatter(held, pressed, noise_v[live])
     if readings:  # which contains that of gains that wander
         scatter = replace(scatter, share=float(np.sqrt(max(scatter.share**2 - readings.gain_wander**2, 0))))
+    smooth = np.column_stack([gps[channel].predict(held_out.positions_mm / pad.unit_mm) for channel in live])
     full_scale_v = np.abs(fit.pad.predict(training.positions_mm) - fit.pad.channel_values[:, 1]).max(axis=0)
     return Identification(
         pad=pad,
@@ -287,7 +285,7 @@ def identify_pad(
         live=live,
         explained=held_out.explained_variance(fit.pad.predict(held_out.positions_mm)),
         explained_on_plan=_explained_on_plan(candidates, plan, training, held_out),
-        explained_smooth=explained_by_gps([gps[channel] for channel in live], held_out, pad.unit_mm),
+        explained_smooth=held_out.explained_variance(smooth),
         noise_v=noise_v,
         noise=float(noise_v[live].mean() / full_scale_v.mean()),
         alternatives=[
@@ -420,7 +418,7 @@ def _fit_all(pad: AsBuiltPad, training: Responses, on_progress: OnProgress) -> A
 def _noise_inflation(pad: AsBuiltPad, responses: Responses) -> Array:
     """Return the factor (C,) on the noise by which residuals smooth in position weigh N_COMPARED presses."""
     residuals = pad.residuals(responses)
-    noise_var = fit_gp(residuals, pad.plan.layout.unit_mm)[0] ** 2
+    noise_var = estimate_noise(residuals, pad.plan.layout.unit_mm) ** 2
     systematic_var = np.maximum(residuals.variance - noise_var, 0)
     repeats = max(len(responses) / N_COMPARED, 1)
     return np.sqrt((noise_var + systematic_var * repeats) / (noise_var + systematic_var))

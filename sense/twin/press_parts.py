@@ -12,7 +12,8 @@ import numpy as np
 from scipy.optimize import minimize
 
 from padforge.sense.arrays import MIN_SCALE_V, Array, Mask
-from padforge.sense.localizer.features import N_TIMED, compute_features
+from padforge.sense.localizer.features import compute_features
+from padforge.sense.localizer.moments import N_TIMED
 from padforge.sense.localizer.response_model import ResponseModel, interpolate_grid
 from padforge.sense.recording.recording import Recording
 from padforge.sense.settings import RigSettings

@@ -11,7 +11,8 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from padforge.sense.arrays import Array, Indices, Mask
-from padforge.sense.localizer.features import DOWN, compute_features
+from padforge.sense.localizer.features import compute_features
+from padforge.sense.localizer.moments import DOWN
 from padforge.sense.localizer.response_model import ResponseModel, remove_history
 from padforge.sense.recording.recording import Recording
 
@@ -124,10 +125,10 @@ class GaussianProcess:
         return self.mean_v + np.exp(_squares(points, self.points) * (-0.5 / self.width**2)) @ self.weights
 
 
-def fit_gps(responses: Responses, unit_mm: float) -> list[GaussianProcess | None]:
+def fit_gps(responses: Responses, unit_mm: float) -> list[GaussianProcess]:
     """Fit a Gaussian process to each channel, by maximum likelihood over kernel width and noise.
 
-    None where fewer than MIN_GP_PRESSES presses are valid.
+    Where fewer than MIN_GP_PRESSES presses are valid, it is 0, with noise of NaN.
     """
     points = responses.positions_mm[:GP_PRESSES] / unit_mm
     squares = _squares(points, points)
@@ -137,11 +138,11 @@ def fit_gps(responses: Responses, unit_mm: float) -> list[GaussianProcess | None
         rows = np.frombuffer(valid, bool)
         return np.linalg.eigh(np.exp(squares[np.ix_(rows, rows)] * (-0.5 / width**2)))
 
-    out: list[GaussianProcess | None] = []
+    out = []
     for channel in range(responses.volts.shape[1]):
         valid = np.ascontiguousarray(responses.valid[:GP_PRESSES, channel])
         if valid.sum() < MIN_GP_PRESSES:
-            out.append(None)
+            out.append(GaussianProcess(np.empty((0, 2)), 1.0, np.empty(0), 0.0, np.nan, 0.0))
             continue
         volts = responses.volts[:GP_PRESSES, channel][valid]
         mean_v = float(volts.mean())
@@ -151,22 +152,9 @@ def fit_gps(responses: Responses, unit_mm: float) -> list[GaussianProcess | None
     return out
 
 
-def fit_gp(responses: Responses, unit_mm: float) -> tuple[Array, Array]:
-    """Return the `noise_v` (C,), NaN where too few presses are valid, and `log_bayes_factor` (C,) of `fit_gps`."""
-    return noise_and_evidence(fit_gps(responses, unit_mm))
-
-
-def noise_and_evidence(gps: list[GaussianProcess | None]) -> tuple[Array, Array]:
-    """Return the `noise_v` (C,) of Gaussian processes, NaN where there is none, and their `log_bayes_factor` (C,)."""
-    noise_v = np.array([np.nan if gp is None else gp.noise_v for gp in gps])
-    return noise_v, np.array([0.0 if gp is None else gp.log_bayes_factor for gp in gps])
-
-
-def explained_by_gps(gps: list[GaussianProcess | None], held_out: Responses, unit_mm: float) -> Array:
-    """Return the share of the variance of held-out responses that smooth functions of the position explain; (C,)."""
-    points = held_out.positions_mm / unit_mm
-    predicted = [np.zeros(len(points)) if gp is None else gp.predict(points) for gp in gps]
-    return held_out.explained_variance(np.column_stack(predicted))
+def estimate_noise(responses: Responses, unit_mm: float) -> Array:
+    """Return the standard deviation (C,), V, of what no smooth function of the position explains, see `fit_gps`."""
+    return np.array([gp.noise_v for gp in fit_gps(responses, unit_mm)])
 
 
 def _squares(points: Array, others: Array) -> Array:

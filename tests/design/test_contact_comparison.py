@@ -3,27 +3,11 @@
 import pytest
 
 from padforge.design import Contact, Morphology, PadSettings, SearchSettings
-from padforge.design.contact_comparison import alternative_contacts, beside_straight, errors_by_contact
+from padforge.design.contact_comparison import beside_straight, errors_by_contact
 from padforge.design.objectives.bayes_error import expected_errors
-from padforge.design.settings import PUBLISHED_CONTACT
 from tests.helpers.less import compare_little
 
 PAD, SIZE = Morphology.random(2, 5, seed=1), PadSettings(grid=2)
-
-
-def test_alternative_contacts_begin_with_the_assumed_one():
-    """And have none of the others that is the same."""
-    profiles, disc = ["profile of 5 mm", "profile of 6.2 mm", "profile of 7.9 mm"], ["published disc, K = 0.6"]
-    presses = ["tool of 4.2 mm", "2.5 mm deep", "pressed flat alone"]
-    for assumed, others in (
-        (Contact(radius=0.9), profiles + disc),
-        (Contact(), presses),
-        (Contact(stretch=0.0), presses[:2]),
-        (Contact(model="profile"), [profiles[0], profiles[2], *disc]),
-        (PUBLISHED_CONTACT, profiles),
-    ):
-        contacts = alternative_contacts(assumed)
-        assert (list(contacts), contacts["as assumed"]) == (["as assumed", *others], assumed)
 
 
 def test_errors_by_contact_of_both_pads(monkeypatch):

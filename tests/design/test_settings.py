@@ -76,6 +76,7 @@ NESTED = [
     ({"contacts": [{"model": "layer", "radius": 0.9}]}, r"contacts\[0\]: got .*, radius is 0.9, which counts where"),
     ({"contacts": [{"fibre_depths_mm": [1, 0]}]}, r"contacts\[0\]\.fibre_depths_mm\[1\]: got 0, .*greater"),
     ({"contacts": 3}, "contacts: got 3, "),
+    ({"contacts": "likely"}, r"contacts: got 'likely', allowed are \"plausible\", \"assumed\" and a list"),
     ({"weights": [1, "x", 1]}, r"weights\[1\]: got 'x', "),
 ]
 

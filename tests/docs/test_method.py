@@ -1,8 +1,8 @@
 """The method page describes the program that there is."""
 
-from padforge.design import contact_comparison as comparison
+from padforge.design.contact_set import judged_contacts
 from padforge.design.objectives import bayes_error
-from padforge.design.settings import Contact
+from padforge.design.settings import Contact, SearchSettings
 from padforge.sense.localizer import moments, press_sampler
 from padforge.sense.localizer.features import N_TIMED
 from tests.docs.pages import ROOT
@@ -17,7 +17,7 @@ def section(title: str) -> str:
 
 def test_errors_under_another_contact_name_those_that_are_compared() -> None:
     text = section("## Errors under another contact")
-    for name in comparison.alternative_contacts(Contact()):
+    for name in judged_contacts(Contact(), SearchSettings()):
         assert f"| {name} |" in text
 
 

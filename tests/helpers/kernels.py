@@ -59,7 +59,7 @@ def use_other_stages() -> None:
 
     readings = np.random.default_rng(0).normal(size=(50, 1))
     sense.total_variation(readings, 2.0)
-    sense.total_variation(readings, 2.0, "squares", causal=True)
+    sense.total_variation(readings, 2.0, "squares")
     sense.running_median(readings, 5)
     with tempfile.TemporaryDirectory() as folder:
         box = Path(folder) / "box.stl"

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from padforge.sense.localizer.features import DOWN, NOW
+from padforge.sense.localizer.moments import DOWN, NOW
 from padforge.sense.localizer.scaler import TrainingPresses
 
 

@@ -32,6 +32,8 @@ def test_compare_evaluates_finished_pads(tmp_path, monkeypatch):
     assert plain["length_mm"] == pytest.approx(2 * 4 * 8 + 3 * 3 * 15)
     assert plain["errors_mm"] == plain["straight_mm"] != bent["errors_mm"]
     assert len(plain["errors_mm"]) == 4, "0 to 3 lost"
+    assert all(other["errors_mm"] == other["straight_mm"] for other in plain["others"].values())
+    assert [name.split(",")[0] for name in bent["others"]] == ["isotropic", "isotropic"]
     assert plain["mould_ml"] > 0
     assert plain["half_width_mm"] == pytest.approx(half_width_mm(Contact()))
     assert plain["contact"]["model"] == "layer"
@@ -59,7 +61,8 @@ def test_compare_evaluates_finished_pads(tmp_path, monkeypatch):
 
 def test_comparison_is_a_table_in_metres_with_straight_fibres_below_a_pad_that_differs():
     plain = {"name": "plain", "fibres": [2, 3], "knots": 0, "length_mm": 1234.0, "crossings": 6, "mould_ml": 12.34}
-    plain |= {"errors_mm": [1.0, 1.5], "straight_mm": [1.0, 1.5]}
+    flat = {"errors_mm": [0.4, 2.0], "straight_mm": [0.8, 1.0]}
+    plain |= {"errors_mm": [1.0, 1.5], "straight_mm": [1.0, 1.5], "others": {"flat": flat}}
     bent = plain | {"name": "bent", "knots": 4, "errors_mm": [0.5, 0.75], "half_width_mm": 5.678}
     lines = comparison.comparison_lines({"rows": [plain, bent]})
     costs = "half width (mm)", "mould (ml)", "0 failed (mm)", "1 failed (mm)"
@@ -68,6 +71,7 @@ def test_comparison_is_a_table_in_metres_with_straight_fibres_below_a_pad_that_d
         ["plain", "2 + 3", "0", "1.23", "6", "-", "12.3", "1.00", "1.50"],
         ["bent", "2 + 3", "4", "1.23", "6", "5.68", "12.3", "0.50", "0.75"],
         ["straight fibres", "1.00", "1.50"],
+        ["flat", "0.40 / 0.80", "2.00 / 1.00"],
     ]
 
 

@@ -49,7 +49,7 @@ def few_candidates() -> Iterator[None]:
         yield
 
 
-def identified(built: Morphology, told: Morphology, rig: sense_settings.RigSettings) -> Identification:
+def identify_simulated(built: Morphology, told: Morphology, rig: sense_settings.RigSettings) -> Identification:
     """Identify a simulated pad by a plan; its contact and the parts of presses, which take longest, do not count."""
     contact = patch.object(twin_identification, "_measure_contact", lambda *_: None)
     with contact, patch.object(twin_identification, "measure_rig_settings", lambda _: {}):
@@ -63,17 +63,21 @@ def identification(once: Once) -> Identification:
 
     @few_candidates()
     def make(folder: Path) -> Identification:
-        return identified(plan, plan, ideal_rig(presses=120, seed=1))
+        return identify_simulated(plan, plan, ideal_rig(presses=120, seed=1))
 
     return once("identification", make)
 
 
+def first_presses(recording: Recording, presses: int) -> Recording:
+    """Return the first presses of a recording, by their positions alone."""
+    end = int(recording.down_command[presses])
+    edges = (getattr(recording, name)[:presses] for name in ("presses_mm", "down_command", "up_command"))
+    return Recording(recording.readings[:end], recording.times_s[:end], *edges)
+
+
 @pytest.fixture(scope="session")
 def brief(recording: Recording) -> Recording:
-    """Its first 40 presses."""
-    end = int(recording.down_command[40])
-    presses = {name: getattr(recording, name)[:40] for name in ("presses_mm", "down_command", "up_command")}
-    return Recording(recording.readings[:end], recording.times_s[:end], **presses)
+    return first_presses(recording, 40)
 
 
 @contextmanager

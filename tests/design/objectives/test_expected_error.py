@@ -8,16 +8,18 @@ from padforge.design.morphology import Morphology
 from padforge.design.objectives import expected_error as module
 from padforge.design.objectives.expected_error import (
     BOUND_WEIGHT,
+    POWER,
     REGRESSION_WEIGHT,
     RIDGE,
     WIDTH,
-    aggregate_failures,
+    averages,
     confusable,
     criterion_errors,
     evaluation_windows,
     expected_error,
     kernel_weights,
     place_window,
+    relative_error,
     straight_full_scale,
     window_presses,
 )
@@ -117,19 +119,23 @@ def test_expected_error_ignores_failed_fibres():
     assert found[0] == pytest.approx(error(random_responses()[[0, 2]], scatter))
 
 
-def test_aggregate_failures_is_a_weighted_geometric_mean():
-    kept = np.array([[1.0, 1.0, 1.0], [0.0, 1.0, 1.0], [1.0, 1.0, 0.0], [1.0, 0.0, 0.0]])
-    given = np.array([0.1, 0.2, 0.4, 2.7])
-    even = (1 / 3, 1 / 3, 1 / 3)
-    usual, gradient = aggregate_failures(given, kept, even)
-    assert usual == pytest.approx((0.1 * 0.3 * 2.7) ** (1 / 3))
-    for level in ([0], [1, 2], [3]):
-        better = given.copy()
-        better[level] *= 0.9
-        assert aggregate_failures(better, kept, even)[0] == pytest.approx(0.9 ** (1 / 3) * usual)
-        assert gradient[level] @ given[level] == pytest.approx(usual / 3)  # of equal relative gains
-    assert aggregate_failures(given[:3], kept[:3], (0.2, 0.8, 0.0))[0] == pytest.approx(0.1**0.2 * 0.3**0.8)
-    assert aggregate_failures(given[:1], kept[:1], even)[0] == pytest.approx(0.1)
+def test_averages_are_means_over_the_sets_of_each_size():
+    kept = np.array([[1.0, 1.0, 1.0], [0.0, 1.0, 1.0], [1.0, 1.0, 0.0]])
+    assert averages(kept, 3) @ [0.1, 0.2, 0.4] == pytest.approx([0.1, 0.3, 0.0])
+
+
+def test_relative_error_is_a_power_mean_of_shares_of_straight_fibres():
+    straight, shares = np.array([[0.1, 0.4], [0.2, 0.2]]), (0.5, 0.25, 0.25)  # of three numbers two occur
+    assert relative_error(0.7 * straight, straight, shares)[0] == pytest.approx(0.7)
+    errors = straight * [[0.6, 0.7], [1.0, 0.5]]
+    value, gradient = relative_error(errors, straight, shares)
+    of_powers = np.array([0.6, 0.7, 1.0, 0.5]) ** POWER @ [1 / 3, 1 / 6, 1 / 3, 1 / 6]
+    assert value == pytest.approx(of_powers ** (1 / POWER))
+    step = 1e-6 * np.random.default_rng(0).standard_normal(errors.shape)
+    ahead, behind = (relative_error(errors + sign * step, straight, shares)[0] for sign in (1, -1))
+    assert (ahead - behind) / 2 == pytest.approx((gradient * step).sum(), rel=1e-5)
+    gains = gradient * errors
+    assert gains[1, 0] > 0.9 * gains.sum(), "the worst weighs most"
 
 
 def test_expected_error_without_signals_is_that_of_the_prior():
@@ -147,11 +153,12 @@ def test_expected_error_gradient_matches_finite_differences(scatter):
     signals = np.concatenate([random_responses(), far], axis=1)
     places = np.concatenate([PLACES, np.full((5, 2), 9.0)])
     kept, shares = np.array([[1.0, 1, 1], [1, 0, 1]]), (0.6, 0.4)
+    of_sets, straight = averages(kept, 2), np.array([[0.31, 0.48]])  # both sets count
 
     def joint(signals):
         errors, by_signals = expected_error(signals, places, STEPS, FREE, kept, scatter, np.ones(3))
-        value, by_errors = aggregate_failures(errors, kept, shares)
-        return value, np.tensordot(by_errors, by_signals, axes=1)
+        value, by_means = relative_error((of_sets @ errors)[None], straight, shares)
+        return value, np.tensordot(by_means[0] @ of_sets, by_signals, axes=1)
 
     way, steps = np.random.default_rng(6).standard_normal(signals.shape), 1e-3 * np.array([-2, -1, 1, 2])
     slope = np.array([1, -8, 8, -1]) / 12e-3 @ [joint(signals + step * way)[0] for step in steps]

@@ -7,10 +7,9 @@ import pytest
 
 from padforge.design import Contact, InputError, Morphology
 from padforge.design.contact import fibre_axes
-from padforge.design.objectives.expected_error import criterion_errors
-from padforge.design.objectives.score import TERMS, ScoredPad, score, sharpness
+from padforge.design.objectives.score import TERMS, score, sharpness
 from padforge.design.published.objective import published_terms
-from padforge.design.settings import PadSettings, RulesSettings, SearchSettings
+from padforge.design.settings import PadSettings
 from padforge.design.signal_gradients import FibreCurves
 
 
@@ -34,17 +33,6 @@ def test_score_joint_entropy_saturates_before_those_of_families():
     assert published_terms(pad)[0].entropy < 9
     one = score(Morphology.straight((1, 0)), max_failures=0)  # one family is all there is
     assert one["published_joint_entropy"] == one["published_entropy"]
-
-
-@pytest.mark.parametrize(("fibres", "weights"), [((1, 0), [1.0]), ((1, 1), [1 / 2, 1 / 2])])
-def test_objective_is_the_geometric_mean_over_the_failures_that_leave_a_fibre(fibres, weights):
-    """Each number of failures weighs the same, also where fewer can fail."""
-    pad = Morphology.straight(fibres)
-    size = PadSettings().for_layout(pad.layout)
-    scored = ScoredPad(pad, Contact(), SearchSettings(max_failures=3), RulesSettings(), size)
-    criterion = criterion_errors(pad, Contact(), scored.search, size)
-    assert len(scored.expected_errors) == len(criterion) == len(weights)
-    assert scored.objective == pytest.approx(np.prod(np.power(criterion, weights)))
 
 
 @pytest.mark.parametrize(

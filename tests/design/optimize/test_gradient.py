@@ -9,6 +9,7 @@ from scipy.interpolate import PchipInterpolator
 
 from padforge.design import Contact, Morphology
 from padforge.design.contact import fibre_axes
+from padforge.design.contact_set import served_contacts
 from padforge.design.morphology import MARGIN
 from padforge.design.objectives.expected_error import criterion_errors
 from padforge.design.objectives.penalties import penalties
@@ -42,7 +43,9 @@ BRIEF = PUBLISHED_SEARCH.model_copy(update={"starts": 1, "steps": 20, "max_failu
 
 
 def begun(search, rules, start=0, state=None, pad=PAD, contact=PUBLISHED_CONTACT):
-    return GradientSearch(SearchProblem(pad, (contact, *search.contacts), search, rules), start, state)
+    return GradientSearch(
+        SearchProblem(pad, tuple(served_contacts(contact, search).values()), search, rules), start, state
+    )
 
 
 def advance(run, steps):

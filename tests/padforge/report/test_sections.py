@@ -18,7 +18,7 @@ from padforge.design.common.validation import Fault, InputError
 from padforge.design.contact import FIBRE_BLUR_MM, contact_press, half_widths_mm, profile_weights
 from padforge.design.layer import Tool
 from padforge.design.morphology import Morphology
-from padforge.design.report import contact_line, contact_sections, design_sections, draw_press, press_sections
+from padforge.design.report import contact_lines, contact_sections, design_sections, draw_press, press_sections
 from padforge.design.settings import Contact, RulesSettings
 from padforge.fabricate import build
 from padforge.report import write_report
@@ -263,14 +263,16 @@ def test_report_omits_pictures_of_other_mould(pad: Path) -> None:
 
 
 def test_report_shows_errors_by_contact(page: Path) -> None:
-    assert contact_line(contacts_document()) == (
+    assert contact_lines(contacts_document()) == [
         "contact: expected error 0.50 mm under the assumed contact, 4.00 to 4.00 mm otherwise;"
-        " of straight fibres 1.00 mm under the assumed contact, 3.00 to 3.00 mm otherwise"
-    )
+        " of straight fibres 1.00 mm under the assumed contact, 3.00 to 3.00 mm otherwise",
+        "  straight fibres are as good or better: published disc, K = 0.6 with 0 and 1 failed",
+    ]
     section = page.read_text().split("Contact model</h2>")[1].split("</section>")[0]
     rows = [re.findall(r"<td.*?>(.*?)</td>", row) for row in re.findall(r"<tr>(.*?)</tr>", section, re.S)]
     assert ["published disc, K = 0.6", "designed", "4.00", "6.00"] in rows
-    assert len([row for row in rows if row]) == 4
+    assert ["", "designed / straight", "133%", "120%"] in rows
+    assert len([row for row in rows if row]) == 6
 
 
 def test_report_shows_depth_and_force(pad: Path) -> None:
@@ -464,13 +466,15 @@ def test_contact_section_and_line_compare_pads_by_contact() -> None:
     text = words(section.body)
     assert "with a scatter of 18% of the response and 2.0% of full scale" in text
     head = "|contact|fibres|0 failed|1 failed|"
-    assert f"{head}as assumed|designed|0.50|0.75|as assumed|straight|1.00|1.50|" in text
+    assert f"{head}as assumed|designed|0.50|0.75|as assumed|straight|1.00|1.50|designed / straight|50%|50%|" in text
     assert "|published disc, K = 0.6|designed|4.00|6.00|published disc, K = 0.6|straight|3.00|5.00|" in text
     third = [{"contact": "half", "pad": pad, "errors_mm": [error]} for pad, error in (("designed", 2), ("straight", 7))]
-    assert contact_line(document | {"rows": document["rows"] + third}) == (
+    line, lost = contact_lines(document | {"rows": document["rows"] + third})
+    assert line == (
         "contact: expected error 0.50 mm under the assumed contact, 2.00 to 4.00 mm otherwise; of"
         " straight fibres 1.00 mm under the assumed contact, 3.00 to 7.00 mm otherwise"
     )
+    assert "half" not in lost
 
 
 def test_press_section_states_what_the_press_does_to_each_family(monkeypatch: pytest.MonkeyPatch) -> None:

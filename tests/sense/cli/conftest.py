@@ -3,7 +3,9 @@
 import shutil
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 from unittest import mock
 
 import pytest
@@ -11,10 +13,13 @@ import pytest
 from padforge.cli import main
 from padforge.design import Morphology
 from padforge.design.common.settings import Spec
+from padforge.sense import Evaluation, calibrate
 from padforge.sense.health import trace_model
+from padforge.sense.localizer.model import LocalizerModel
 from padforge.sense.report.calibration import calibrate_into
 from padforge.sense.rig.operation import record_simulated
-from padforge.sense.settings import LocalizerSettings
+from padforge.sense.settings import LocalizerSettings, RigSettings
+from padforge.sense.simulation.simulated_recording import simulate
 from tests.helpers.once import Once
 from tests.sense.conftest import blank_pictures, few_moments
 
@@ -47,6 +52,42 @@ def make_model(folder: Path, presses: int) -> Path:
     with mock.patch.object(trace_model, "MAX_STEPS", 80), blank_pictures(), few_moments():
         calibrate_into(recording, folder / "model", spec.section(LocalizerSettings))
     return folder
+
+
+def make_deep_presses(folder: Path) -> Path:
+    """Make `rec`, whose presses differ in depth and force, and a localizer of both on it, `model`."""
+    pad, rig = Morphology.straight(2), RigSettings(presses=60, depths_mm=(1.0, 3.0, 5.0))
+    recording = simulate(pad, rig)
+    recording = replace(recording, forces_n=3.0 * recording.depths_mm)
+    recording.save(folder / "rec", {})
+    with few_moments():
+        localizer, _ = calibrate(recording, LocalizerSettings(members=1, hidden=32, layers=1, epochs=12))
+    localizer.save(folder / "model")
+    return folder
+
+
+@pytest.fixture(scope="session")
+def deep_presses(once: Once) -> Path:
+    return once("deep presses and their model", make_deep_presses)
+
+
+@pytest.fixture
+def deep(padforge_sense: Run, deep_presses: Path) -> Run:
+    """As `few`, with presses of several depths and a localizer of depth and force."""
+    shutil.copytree(deep_presses, Path(), dirs_exist_ok=True)
+    return padforge_sense
+
+
+@pytest.fixture
+def calibrate_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Train at the first calibration; later ones get the same localizer, whatever they ask for."""
+    trained: list[tuple[LocalizerModel, Evaluation]] = []
+
+    def calibrate_at_first(*arguments: Any, **options: Any) -> tuple[LocalizerModel, Evaluation]:
+        trained[:] = trained or [calibrate(*arguments, **options)]
+        return trained[0]
+
+    monkeypatch.setattr("padforge.sense.localizer.localizer.calibrate", calibrate_at_first)
 
 
 @pytest.fixture(scope="session")

@@ -18,15 +18,15 @@ from padforge.sense.localizer.model import LocalizerModel
 from padforge.sense.rig import simulated_board
 from padforge.sense.rig.devices import RigFault
 from tests.helpers.page_names import names_in_view
-from tests.sense.live.conftest import first_presses
+from tests.sense.conftest import first_presses
 
 
 @pytest.fixture
-def replay(padforge_sense, model: Path, recording: Recording) -> Callable[..., tuple[int, str, str]]:
+def replay(few) -> Callable[..., tuple[int, str, str]]:
     """Of six presses on a pad that lay with its tracks up."""
-    replace(first_presses(recording, 6), source={"rig": {"mirrored": True}}).save("mirrored", {})
-    command = ("live", "--port", "0", "--model", str(model), "--replay", "mirrored", "--speed", "1e6")
-    return lambda *words: padforge_sense(*command, *words)
+    replace(first_presses(Recording.open("rec"), 6), source={"rig": {"mirrored": True}}).save("mirrored", {})
+    command = ("live", "--port", "0", "--model", "model", "--replay", "mirrored", "--speed", "1e6")
+    return lambda *words: few(*command, *words)
 
 
 @pytest.fixture
@@ -85,17 +85,17 @@ LOST = RigFault("stale", "the board does not send", "reset it")
     ("error", "code", "said"),
     [(KeyboardInterrupt(), 130, "interrupted"), (LOST, 1, "padforge: the board does not send; reset it")],
 )
-def test_live_shows_a_rig_until_it_ends(padforge_sense, model, views, monkeypatch, error, code: int, said: str) -> None:
+def test_live_shows_a_rig_until_it_ends(few, views, monkeypatch, error, code: int, said: str) -> None:
     """As the pad lay when the model was learnt: a holder had said how, so that `[rig]` leaves it open."""
     board, told = Mock(read=Mock(side_effect=error)), Mock()
     board.connect.return_value = {"channels": 4, "rate_hz": 13.3}
-    LocalizerModel.load(model).save("mine")
-    recording = Recording.open(model / "recording")
+    LocalizerModel.load("model").save("mine")
+    recording = Recording.open("rec")
     source = {**recording.source, "rig": {**recording.source["rig"], "mirrored": True}}
     replace(recording, source=source).save("mine/recording", {})
     monkeypatch.setattr(simulated_board, "SimulatedBoard", lambda *pad, **size: board)
     monkeypatch.setattr(outputs, "MessageBuilder", told)
-    ended, out, err = padforge_sense("live", "--port", "0", "--model", "mine", "--json")
+    ended, out, err = few("live", "--port", "0", "--model", "mine", "--json")
     assert (ended, out) == (code, "")
     assert said in err.splitlines()[-1]
     assert err.count("touches are simulated") == 1
@@ -125,16 +125,13 @@ def test_live_lines_number_fibres_from_one() -> None:
     assert lines[4] == "fibre 2 was dead"
 
 
-def test_live_shows_depth_and_force_of_models_that_estimate_them(
-    padforge_sense, deep_localizer, deep_recording, views
-) -> None:
-    deep_localizer.save("deep")
-    first_presses(deep_recording, 8).save("rec", {})
-    words = ("live", "--replay", "rec", "--speed", "1e6", "--port", "0", "--model", "deep")
-    told = [json.loads(line) for line in padforge_sense(*words, "--json")[1].splitlines()]
-    deep = [each["depth_mm"] for each in told if each["final"]]
-    assert 0 < min(deep) < 2 < 4 < max(deep) < 6
+def test_live_shows_depth_and_force_of_models_that_estimate_them(deep, views) -> None:
+    first_presses(Recording.open("rec"), 8).save("short", {})
+    words = ("live", "--replay", "short", "--speed", "1e6", "--port", "0", "--model", "model")
+    told = [json.loads(line) for line in deep(*words, "--json")[1].splitlines()]
+    depths_mm = [each["depth_mm"] for each in told if each["final"]]
+    assert 0 < min(depths_mm) < 3 < max(depths_mm) < 6
     assert all(each["force_r90_n"] > 0 and each["depth_r90_mm"] > 0 for each in told)
     assert {view["mirrored"] for view in views} == {False}
-    first = padforge_sense(*words)[1].splitlines()[0]
+    first = deep(*words)[1].splitlines()[0]
     assert f"{told[0]['depth_mm']:.1f} ± {told[0]['depth_r90_mm']:.1f} mm deep, {told[0]['force_n']:.1f} ± " in first

@@ -50,7 +50,7 @@ record --plan rows --out rec                    | Invalid value for '--plan': go
 record --plan adaptive                          | --plan is adaptive, which needs a real rig
 record --resume                                 | --resume, --dry-run and --model need a real rig
 record --mcap --out rec2                        | rec2.mcap: exists, recordings are never written over; choose
-record --mcap --dry-run --rig ur5 {five}        | --mcap writes what is recorded, and --dry-run keeps nothing
+record --mcap --dry-run --rig ur5 {five}        | --mcap exports what is recorded, and --dry-run keeps nothing
 record --twin twin.json --rig ur5               | --twin is of the simulated pad, allowed with --rig simulated
 record --twin dead.json                         | twin: none of its channels reads a fibre
 record --rig printer {straight}                 | [rig] tcp_mm is unknown, allowed are x, y and z of the probe's tip

@@ -2,8 +2,6 @@
 
 import json
 import os
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -21,7 +19,7 @@ from padforge.sense.localizer.features import interpolate_gaps
 from padforge.sense.localizer.model import Localization, LocalizerModel
 from padforge.sense.localizer.network import predict
 from padforge.sense.localizer.scaler import MAX_INPUT
-from tests.sense.live.conftest import first_presses
+from tests.sense.conftest import first_presses
 
 DIGEST = "a" * 64
 
@@ -32,7 +30,7 @@ def exported(
 ) -> tuple[Path, OnnxReport]:
     """A graph, tested on presses of which the recording cuts off the last one."""
     path = tmp_path_factory.mktemp("onnx") / "localizer.onnx"
-    return path, export_onnx(localizer, DIGEST, path, brief)
+    return path, export_onnx(localizer, DIGEST, path, first_presses(brief, 5))
 
 
 @pytest.fixture(scope="module")
@@ -49,7 +47,7 @@ def graph(exported: tuple[Path, OnnxReport]) -> onnxruntime.InferenceSession:
     return onnxruntime.InferenceSession(exported[0])
 
 
-def inputs_of(recording: Recording, fibre_mask: np.ndarray) -> dict[str, np.ndarray]:
+def graph_inputs(recording: Recording, fibre_mask: np.ndarray) -> dict[str, np.ndarray]:
     commands = {"down_command": recording.down_command, "up_command": recording.up_command}
     return {"readings": interpolate_gaps(recording.readings), **commands, "fibre_mask": fibre_mask}
 
@@ -64,7 +62,7 @@ def test_graph_gives_the_predictions_with_masked_fibres(graph, localizer, record
     for failed in ((), (2,), (0, 3), (0, 1, 2), (0, 1, 2, 3)):
         fibre_mask = presses.fibre_mask & ~np.isin(np.arange(4), failed)
         expected = localizer.predict_features(replace(presses, fibre_mask=fibre_mask))
-        positions_mm, *others = graph.run(names, inputs_of(recording, fibre_mask))
+        positions_mm, *others = graph.run(names, graph_inputs(recording, fibre_mask))
         check_positions(positions_mm, expected)
         for name, values in zip(names[1:], others, strict=True):
             np.testing.assert_allclose(values, getattr(expected, name), rtol=1e-4)
@@ -88,20 +86,19 @@ def test_graph_gives_the_predictions_at_every_reading(graph, localizer, recordin
     assert sorted(set(n_complete)) == list(range(18))
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_graph_gives_the_predictions_of_presses_without_pauses(graph, localizer, recording, seed: int) -> None:
+def test_graph_gives_the_predictions_of_presses_without_pauses(graph, localizer, recording) -> None:
     """Short ones, too, and from the first readings on: windows and rests end where a press or the recording begins."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     edges = np.cumsum(rng.choice([1, 2, 3, 7, 12, 25], 2 * 60))
     down, up = edges[::2], edges[1::2]
-    until = edges[-1] + seed
+    until = edges[-1] + 2
     unknown = np.full((60, 2), np.nan)
     quick = Recording(recording.readings[:until], recording.times_s[:until], unknown, down, up)
     scaled = localizer.scaled_features(quick)
     for failed in ((), (1,)):
         fibre_mask = scaled.fibre_mask & ~np.isin(np.arange(4), failed)
         expected = localizer.predict_features(replace(scaled, fibre_mask=fibre_mask))
-        positions_mm, std_mm, r90_mm = graph.run(["positions_mm", "std_mm", "r90_mm"], inputs_of(quick, fibre_mask))
+        positions_mm, std_mm, r90_mm = graph.run(["positions_mm", "std_mm", "r90_mm"], graph_inputs(quick, fibre_mask))
         check_positions(positions_mm, expected)
         np.testing.assert_allclose(std_mm, expected.std_mm, rtol=1e-4)
         np.testing.assert_allclose(r90_mm, expected.r90_mm, rtol=1e-4)
@@ -115,7 +112,7 @@ def test_graph_clips_what_is_far_beyond_the_training(graph, localizer, recording
     presses = localizer.scaled_features(strong)
     assert (np.abs(presses.inputs) == MAX_INPUT).any()
     expected = localizer.predict_features(presses)
-    positions_mm, r90_mm = graph.run(["positions_mm", "r90_mm"], inputs_of(strong, presses.fibre_mask))
+    positions_mm, r90_mm = graph.run(["positions_mm", "r90_mm"], graph_inputs(strong, presses.fibre_mask))
     check_positions(positions_mm, expected)
     np.testing.assert_allclose(r90_mm, expected.r90_mm, rtol=1e-4)
 
@@ -128,7 +125,7 @@ def test_graph_masks_a_fibre_whose_readings_are_missing(graph, localizer, record
     fibre_mask = np.array(presses.fibre_mask)
     expected_mask = fibre_mask.copy()
     expected_mask[first:, 1] = False
-    inputs = inputs_of(recording, fibre_mask) | {"readings": readings}
+    inputs = graph_inputs(recording, fibre_mask) | {"readings": readings}
     positions_mm, r90_mm = graph.run(["positions_mm", "r90_mm"], inputs)
     expected = localizer.predict_features(replace(presses, fibre_mask=expected_mask))
     check_positions(positions_mm, expected)
@@ -146,12 +143,13 @@ def test_graph_follows_a_finger_that_slides(graph, localizer, recording) -> None
     inputs = scaled.inputs, scaled.fibre_mask, scaled.seen
     *_, slid = predict(localizer.networks, *inputs, *localizer.corrected, sliding=localizer.sliding)
     assert 20 < slid.sum() < 280
-    positions_mm, r90_mm = graph.run(["positions_mm", "r90_mm"], inputs_of(sliding, scaled.fibre_mask))
+    positions_mm, r90_mm = graph.run(["positions_mm", "r90_mm"], graph_inputs(sliding, scaled.fibre_mask))
     expected = localizer.predict_features(scaled)
     check_positions(positions_mm, expected)
     np.testing.assert_allclose(r90_mm, expected.r90_mm, rtol=1e-4)
 
 
+@pytest.mark.slow
 def test_graph_gives_depth_and_force(deep_localizer, deep_recording, deeply_exported) -> None:
     path, report = deeply_exported
     assert report.position_difference_mm < MAX_DIFFERENCE_MM
@@ -162,7 +160,7 @@ def test_graph_gives_depth_and_force(deep_localizer, deep_recording, deeply_expo
     for failed in ((), (0, 1, 2, 3)):
         fibre_mask = presses.fibre_mask & ~np.isin(np.arange(4), failed)
         expected = deep_localizer.predict_features(replace(presses, fibre_mask=fibre_mask))
-        values = graph.run(names, inputs_of(deep_recording, fibre_mask))
+        values = graph.run(names, graph_inputs(deep_recording, fibre_mask))
         columns = [column for each in expected.measures.values() for column in (each.values, each.r90)]
         np.testing.assert_allclose(np.array(values), np.array(columns), rtol=1e-4, atol=1e-4)
 
@@ -176,23 +174,23 @@ def test_graph_describes_itself(exported: tuple[Path, OnnxReport]) -> None:
     assert list(json.loads(metadata["outputs"])) == [each.name for each in model.graph.output]
     assert [each.dim_param for each in model.graph.input[1].type.tensor_type.shape.dim] == ["presses"]
     text = exported[1].text
-    assert " MB, tested on 40 presses and at every moment of one, with up to 3 failed fibres: positions within " in text
+    assert " MB, tested on 5 presses and at every moment of one, with up to 3 failed fibres: positions within " in text
     assert "with up to 1 failed fibre: positions" in replace(exported[1], max_failures=1).text
 
 
 def test_export_refuses_other_localizers_and_a_graph_that_differs(
-    deep_localizer, deep_recording, deeply_exported, tmp_path, monkeypatch
+    localizer, brief, exported, tmp_path, monkeypatch
 ) -> None:
-    """The graph is the one that torch has exported of the same localizer before, in a second."""
-    path, localizer, exported = tmp_path / "l.onnx", deep_localizer, deeply_exported[0].read_bytes()
-    monkeypatch.setattr("torch.onnx.export", lambda module, inputs, file, **options: file.write(exported))
+    """The graph is the one that torch has exported of the same localizer before, which takes long."""
+    path, content = tmp_path / "l.onnx", exported[0].read_bytes()
+    monkeypatch.setattr("torch.onnx.export", lambda module, inputs, file, **options: file.write(content))
     with pytest.raises(InputError, match="method published, expected ensemble"):
         export_onnx(replace(localizer, method="published"), DIGEST, path)
     with pytest.raises(InputError, match="of features array, expected windows"):
         export_onnx(replace(localizer, features="array"), DIGEST, path)
     monkeypatch.setattr(onnx_export, "MAX_DIFFERENCE_MM", 1e-9)
     with pytest.raises(Fault, match="not written, positions by onnxruntime differ"):
-        export_onnx(localizer, DIGEST, path, first_presses(deep_recording, 5))
+        export_onnx(localizer, DIGEST, path, first_presses(brief, 2))
     assert not list(tmp_path.iterdir())
 
 
@@ -209,9 +207,6 @@ def test_script_of_the_tutorial_predicts_positions(localizer, brief, exported, t
     check_positions(names["positions_mm"][:-1], without_last)
 
 
-def test_onnxruntime_sends_no_telemetry(tmp_path: Path) -> None:
-    """Nor in programs that import it behind padforge; if it does, it leaves a file in the folder for temporary ones."""
-    environment = {name: value for name, value in os.environ.items() if name != "ORT_DISABLE_TELEMETRY"}
-    command = [sys.executable, "-c", "import padforge.sense.deploy, onnxruntime"]
-    subprocess.run(command, env=environment | {"TMPDIR": str(tmp_path)}, check=True)
-    assert list(tmp_path.iterdir()) == []
+def test_onnxruntime_sends_no_telemetry() -> None:
+    """Nor in programs that import it behind padforge, which sets what it reads as it is loaded."""
+    assert os.environ["ORT_DISABLE_TELEMETRY"] == "1"

@@ -37,7 +37,6 @@ def published_content() -> dict[str, np.ndarray]:
     [
         (120, 3, 3, None),
         (111, 3, 2, "the last of 3 presses is left out, with 31 of 40 readings"),
-        (80, 3, 2, "the last of 3 presses is left out, with 0 of 40 readings"),
         (100, 2, 2, "the last 20 readings belong to no press"),
     ],
 )
@@ -92,7 +91,6 @@ def test_import_mat_by_columns(tmp_path: Path) -> None:
     [
         ("voltage", np.ones((79, 4)), r"voltage has shape \(79, 4\), expected 40 rows for each of the 3 presses"),
         ("voltage", scipy.sparse.csc_matrix(np.ones((120, 4))), "voltage is a sparse matrix, expected a full matrix"),
-        ("pos", np.ones((2, 5)), "each of the 5 presses of pos, 200 in all; only the last may be cut off"),
     ],
 )
 def test_import_mat_refuses_variables_that_do_not_fit(tmp_path: Path, name: str, value: Any, message: str) -> None:

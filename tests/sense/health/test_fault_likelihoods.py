@@ -1,7 +1,6 @@
 """Log-likelihood ratios against SciPy's densities in plain loops, cumulative sums, and the tail of their peaks."""
 
 import math
-import tracemalloc
 
 import numpy as np
 import pytest
@@ -101,19 +100,6 @@ def test_log_likelihood_ratios_are_those_of_densities(seed: int) -> None:
             onset.append(float(np.clip(shift_llr(sign * innovation, size), -6, 6)) + step)
         np.testing.assert_allclose(llr_continuing[q, c], np.clip(continuing, -6, 6), rtol=1e-9, atol=1e-9)
         np.testing.assert_allclose(llr_onset[q, c], onset, rtol=1e-9, atol=1e-9)
-
-
-def test_log_likelihood_ratios_take_memory_in_parts() -> None:
-    """Compared with the library at once, presses take 15 times as much as their traces; parts change no press."""
-    model, *presses = random_case(0)
-    many = [np.concatenate([each] * 200) for each in presses]
-    tracemalloc.start()
-    llr_continuing, _ = model.log_likelihood_ratios(*many)
-    _, peak = tracemalloc.get_traced_memory()
-    tracemalloc.stop()
-    assert peak < 6 * many[0].nbytes
-    inconsistent = llr_continuing[:, :, HYPOTHESES.index("inconsistent")].reshape(200, PRESSES, FIBRES)
-    assert (inconsistent == inconsistent[0]).all()
 
 
 def test_log_likelihood_ratios_are_0_for_missing_readings() -> None:

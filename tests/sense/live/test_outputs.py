@@ -27,7 +27,7 @@ from padforge.sense.live import outputs
 from padforge.sense.live.outputs import FORMAT, JsonLines, Message, MessageBuilder
 from padforge.sense.live.pipeline import Estimate
 from padforge.sense.localizer.model import LocalizerModel
-from tests.sense.live.conftest import first_presses
+from tests.sense.conftest import first_presses
 
 POSITION = {"press": 4, "x_mm": 1.5, "y_mm": -2.25, "r50_mm": 0.5, "r90_mm": 1.0, "final": True, "failed": []}
 TOUCH = Message(TOUCHES, {}, {"event": "touch", **POSITION})
@@ -38,7 +38,7 @@ TOKEN = "a word of sixteen"
 PROTOCOL = Path(__file__).parents[3] / "docs" / "live-protocol.md"
 
 
-def pipeline_of(localizer: LocalizerModel, recording: Recording) -> Live:
+def make_pipeline(localizer: LocalizerModel, recording: Recording) -> Live:
     return Live(localizer, None, recording.fibres, recording.rate_hz)
 
 
@@ -50,7 +50,7 @@ def ten(recording: Recording) -> Recording:
 
 @pytest.fixture(scope="module")
 def messages(ten: Recording, localizer: LocalizerModel) -> list[Message]:
-    pipeline = pipeline_of(localizer, ten)
+    pipeline = make_pipeline(localizer, ten)
     builder, messages = MessageBuilder(pipeline), []
     for first in range(0, len(ten.readings), 7):
         times_s, readings = ten.times_s[first : first + 7], ten.readings[first : first + 7]
@@ -106,7 +106,7 @@ def test_stamp_is_the_nearest_nanosecond(time_s: float) -> None:
 def test_touch_lies_below_the_surface_in_a_right_handed_frame(brief, localizer, mirrored: bool) -> None:
     """From above, y of the plan runs up and x to the right, or to the left if mirrored; depth runs away from above."""
     estimate = Estimate(0, 1.5, 2.0, "touch", 7, 0.5, True, 3, 4, 1, 1, 1, 2, (), depth_mm=2.5, depth_r90_mm=0.5)
-    builder = MessageBuilder(pipeline_of(localizer, brief), mirrored)
+    builder = MessageBuilder(make_pipeline(localizer, brief), mirrored)
     (touch,) = of_topic(TOUCHES, list(builder.build(brief.times_s[:1], brief.readings[:1], [estimate])))
     pose = touch.msg["pose"]
     z_axis = np.cross([-1 if mirrored else 1, 0, 0], [0, 1, 0])
@@ -118,7 +118,7 @@ def test_touch_lies_below_the_surface_in_a_right_handed_frame(brief, localizer, 
 def test_health_comes_first_and_with_every_fault(messages, brief: Recording, localizer: LocalizerModel) -> None:
     assert messages[0].topic == HEALTH
     assert messages[0].pad["states"] == ["unmonitored"] * brief.fibres
-    pipeline = pipeline_of(localizer, brief)
+    pipeline = make_pipeline(localizer, brief)
     fault, rows = FibreFault(press=3, since=1, fibres=(2,), kind="stuck", score=8.0), brief.readings[:2].copy()
     rows[1, 0] = np.nan
     pipeline.feed(brief.times_s[:2], rows)

@@ -14,7 +14,7 @@ from padforge.sense.live import pad_sensor
 from padforge.sense.live.pad_sensor import PadSensor
 from padforge.sense.localizer.model import LocalizerModel
 from padforge.sense.rig.devices import BoardSamples, RigFault
-from tests.sense.live.conftest import first_presses
+from tests.sense.conftest import first_presses
 
 PRESSES = 3
 LOST = RigFault("lost", "the board is gone")

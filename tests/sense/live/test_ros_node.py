@@ -25,7 +25,7 @@ from padforge.sense.health.fault_detector import FibreFault
 from padforge.sense.live.outputs import JsonLines, Message, MessageBuilder
 from padforge.sense.localizer.model import LocalizerModel
 from tests.docs.pages import BLOCK, ROOT
-from tests.sense.live.conftest import first_presses
+from tests.sense.conftest import first_presses
 
 TOKEN = "a word of sixteen"
 SECONDS = 1_800_000_000

@@ -103,15 +103,11 @@ def test_foxglove_gets_messages_and_a_scene() -> None:
     [
         ("", 101),
         ("Origin: https://app.foxglove.dev", 101),
-        ("Origin: http://localhost:8080", 101),
         ("Origin: file://", 101),
         ("Origin: https://elsewhere.example", 403),
         ("Origin: https://app.foxglove.dev.elsewhere.example", 403),
-        ("Origin: http://localhost.elsewhere.example", 403),
         ("Origin: null", 403),
-        ("Origin: http://[", 403),
         ("Host: elsewhere.example:{port}", 403),
-        ("Host: 127.0.0.1:1", 403),
     ],
 )
 def test_foxglove_refuses_foreign_pages(foxglove_port: int, headers: str, status: int) -> None:

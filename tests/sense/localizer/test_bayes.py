@@ -12,12 +12,11 @@ from padforge.sense.localizer.bayes import (
     COARSENING,
     N_SUMMARY,
     PRIOR_WEIGHT,
-    STAGES,
     BayesianLocalizer,
     fit_stages,
-    stage_of,
 )
-from padforge.sense.localizer.features import N_FEATURES, N_TIMED, NOW
+from padforge.sense.localizer.features import N_FEATURES
+from padforge.sense.localizer.moments import N_TIMED, NOW, STAGES, stage_of
 
 SIDE, FIBRES, WINDOWS, PRESSES, NOISE = 61, 4, 3, 2500, 0.05
 Response = Callable[[np.ndarray], np.ndarray]
@@ -35,7 +34,7 @@ def waves(places: np.ndarray) -> np.ndarray:
     return np.stack(parts, axis=1).reshape(len(places), FIBRES, WINDOWS)
 
 
-def fitted(answer: Response, noise: float = NOISE, seed: int = 0) -> "Fitted":
+def fit_bayes(answer: Response, noise: float = NOISE, seed: int = 0) -> "Fitted":
     """A Bayesian localizer of a pad of this response, with new presses: inputs and positions."""
     rng = np.random.default_rng(seed)
     grid = np.linspace(-1, 1, SIDE)
@@ -53,12 +52,12 @@ Fitted = tuple[BayesianLocalizer, np.ndarray, np.ndarray]
 
 @pytest.fixture(scope="module")
 def fitted_waves() -> Fitted:
-    return fitted(waves)
+    return fit_bayes(waves)
 
 
 @pytest.fixture(scope="module")
 def fitted_line() -> Fitted:
-    return fitted(linear)
+    return fit_bayes(linear)
 
 
 @pytest.mark.parametrize("lost", [(), (0,), (1, 3), (0, 1, 2)])
@@ -99,7 +98,7 @@ def test_predict_spreads_over_positions_of_equal_response() -> None:
     def even(places: np.ndarray) -> np.ndarray:
         return linear(np.stack([np.square(places[:, 0]), places[:, 1]], axis=1))
 
-    bayes, _, _ = fitted(even)
+    bayes, _, _ = fit_bayes(even)
     press = even(np.array([[0.6, 0.1]]))
     found, summary = bayes.predict(press, np.ones((1, FIBRES), dtype=bool))
     on_grid = np.exp(2 * (summary[0, 6:8] - 1))  # standard deviations
@@ -160,17 +159,6 @@ def test_predict_ignores_masked_fibres_and_agrees_with_torch(fitted_waves: Fitte
         place, about = one.predict(values, fibre_mask if xp is np else torch.from_numpy(fibre_mask), xp)
         assert np.abs(np.asarray(place)).max() <= 1 + 1e-6
         assert np.isfinite(np.asarray(about)).all()
-
-
-@pytest.mark.parametrize("places", [np.zeros((9, 2)), np.linspace([-1, 0], [1, 0], 9)], ids=["one place", "a line"])
-def test_fit_takes_presses_on_a_point_or_line(places: np.ndarray) -> None:
-    grid = np.linspace(-1, 1, SIDE)
-    table = linear(np.stack(np.meshgrid(grid, grid, indexing="ij"), axis=-1).reshape(-1, 2))
-    table = table.reshape(SIDE, SIDE, FIBRES, WINDOWS)
-    bayes = BayesianLocalizer.fit(table, linear(places), np.ones((9, FIBRES), dtype=bool), places)
-    found, summary = bayes.predict(linear(places), np.ones((9, FIBRES), dtype=bool))
-    np.testing.assert_allclose(found, places, atol=0.02)
-    assert np.isfinite(summary).all()
 
 
 def test_transformed_can_be_repeated(fitted_waves: Fitted) -> None:

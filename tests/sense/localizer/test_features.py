@@ -7,16 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from padforge.sense.localizer.features import (
-    DOWN,
-    N_HISTORY,
-    N_TIMED,
-    NOW,
-    UP,
-    PressFeatures,
-    compute_features,
-    interpolate_gaps,
-)
+from padforge.sense.localizer.features import N_HISTORY, PressFeatures, compute_features, interpolate_gaps
+from padforge.sense.localizer.moments import DOWN, N_TIMED, NOW, UP
 from padforge.sense.localizer.scaler import MAX_INPUT, FeatureScaler
 
 PRESSES, FIBRES, WINDOWS = 5, 3, 4
@@ -153,7 +145,7 @@ def test_fibre_mask_needs_three_quarters_of_readings(
     assert np.isfinite(found.windows).all()
 
 
-def made(presses: int = 300) -> tuple[PressFeatures, np.ndarray]:
+def make_presses(presses: int = 300) -> tuple[PressFeatures, np.ndarray]:
     """Presses without a history, each fibre and window of a size of its own, the last fibre dead in some of them."""
     rng = np.random.default_rng(0)
     sizes = rng.uniform(0.1, 2.0, (FIBRES, WINDOWS))
@@ -166,7 +158,7 @@ def made(presses: int = 300) -> tuple[PressFeatures, np.ndarray]:
 
 
 def test_scaler_standardizes_features_and_positions() -> None:
-    inputs, places = made()
+    inputs, places = make_presses()
     scaling, _ = FeatureScaler.fit(inputs, places)
     for fibre in range(FIBRES):
         own = inputs.windows[inputs.fibre_mask[:, fibre], fibre]
@@ -188,7 +180,7 @@ def test_scaler_standardizes_features_and_positions() -> None:
 
 @pytest.mark.parametrize("kind", ["silent", "never there", "rounding"])
 def test_scaler_keeps_silent_fibres_finite(kind: str) -> None:
-    inputs, places = made(10)
+    inputs, places = make_presses(10)
     windows, fibre_mask = inputs.windows.copy(), inputs.fibre_mask.copy()
     windows[:, 1] = 3.3 + (1e-15 * windows[:, 1] if kind == "rounding" else 0)
     fibre_mask[:, 1] = kind != "never there"

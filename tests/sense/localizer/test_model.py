@@ -1,21 +1,12 @@
 """The trained localizer: failed fibres are ignored, radii follow; its files keep every bit, or are refused."""
 
 import json
-import os
-from collections.abc import Callable
 from dataclasses import replace
-from functools import reduce
-from itertools import count
-from operator import getitem
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
 
-from padforge.design.common.files import read_json
 from padforge.design.common.validation import InputError
 from padforge.sense import Recording
 from padforge.sense.localizer.model import (
@@ -25,8 +16,6 @@ from padforge.sense.localizer.model import (
     MeasureEstimate,
     write_localization,
 )
-from padforge.sense.localizer.model_files import ModelFiles, files_of
-from tests.helpers.kills import killed
 
 
 def test_predict_ignores_failed_fibres(localizer: LocalizerModel, recording: Recording) -> None:
@@ -67,7 +56,7 @@ def test_predict_widens_radii_with_fewer_fibres(localizer: LocalizerModel, recor
     assert localizer.predict_features(presses[:0]).positions_mm.shape == (0, 2)
 
 
-@pytest.mark.parametrize("until", [1, 2, 4, 9, 19, 20, 21, 23, 28, 39])
+@pytest.mark.parametrize("until", [1, 9, 20, 28])
 def test_predict_at_a_moment_is_that_of_a_recording_cut_off_there(
     localizer: LocalizerModel, recording: Recording, until: int
 ) -> None:
@@ -177,66 +166,16 @@ def test_write_localization_writes_one_line_a_press(tmp_path: Path) -> None:
         write_localization(plain, tmp_path)
 
 
-Change = Callable[[Any], dict[str, Any]]
-
-
-def changed_networks(localizer: LocalizerModel, change: Callable[[Any], dict[str, Any]]) -> dict[str, Any]:
-    """Its networks, of which that of one phase is changed."""
-    return {"networks": {**localizer.networks, "settled": change(localizer.networks["settled"])}}
-
-
 @pytest.mark.parametrize(
-    ("path", "value", "named"),
-    [
-        ("features", "published", "expected both published or neither"),
-        ("features", "array", r"scaler\.history_coef"),
-        ("method", "published", "force_n of method published"),
-        ("interval_factors.0", [1.0, 1.0], "interval_factors"),
-        ("interval_factors", [[]] * 18, r"interval_factors has shape .18, 0."),
-        ("interval_factors.0.0.0", -1.0, "interval_factors"),
-        ("scaler.history_coef.0.0", [1.0], r"scaler\.history_coef"),
-        ("scaler.scale_v.0.0", 0.0, "scale_v"),
-        ("scaler.mean_v.0.0", np.nan, "mean_v"),
-        *(("scaler.mean_v", value, r"scaler\.mean_v has shape") for value in (1.0, [1.0, 2.0])),
-        *(("rate_hz", value, "rate_hz") for value in (0, "13", np.nan)),
-        ("scaler.origin_mm", [0.0], "origin_mm"),
-        *(("test", value, "test") for value in ([-1], [True], [3, 3])),
-        ("more", 1, "more"),
-        ("scaler.measures", [{"name": "force_n", "origin": 1.0, "scale": 1.0}], "force_n of method ensemble"),
-        ("scaler.measures", [], "interval_factors has shape .18, 4, 5."),
-    ],
+    ("key", "value"), [("rate_hz", "13"), ("interval_factors", [[[-1.0]]]), ("test", [-1]), ("more", 1)]
 )
-def test_load_refuses_documents_out_of_range(
-    deep_localizer: LocalizerModel, tmp_path: Path, path: str, value: object, named: str
+def test_load_names_a_wrong_value_of_the_document(
+    localizer: LocalizerModel, tmp_path: Path, key: str, value: object
 ) -> None:
-    deep_localizer.save(tmp_path)
-    document = json.loads((tmp_path / "localizer.json").read_text())
-    *way, last = [int(part) if part.isdigit() else part for part in path.split(".")]
-    reduce(getitem, way, document)[last] = value
-    (tmp_path / "localizer.json").write_text(json.dumps(document))
-    with pytest.raises(InputError, match=rf"localizer\.json: .*{named}") as caught:
-        LocalizerModel.load(tmp_path)
-    assert len(str(caught.value)) < 400
-
-
-@pytest.mark.parametrize(
-    "change",
-    [
-        lambda of: changed_networks(of, lambda weights: weights | {"first.w": weights["first.w"] + np.float32(1e30)}),
-        lambda of: changed_networks(of, lambda weights: weights | {"hidden.b": weights["hidden.b"].astype(np.float64)}),
-        lambda of: changed_networks(of, lambda weights: {"last.w": weights["last.w"]}),
-        lambda of: changed_networks(of, lambda weights: {}),
-        lambda of: {"networks": of.networks | {"later": of.networks["released"]}},
-        lambda of: {"residual_network": {name: weight * np.nan for name, weight in of.residual_network.items()}},
-        lambda of: {"bayes": of.bayes[:-1]},
-        lambda of: {"bayes": (*of.bayes[:-1], replace(of.bayes[-1], grid=of.bayes[-1].grid[1:]))},
-        lambda of: {"bayes": (*of.bayes[:-1], replace(of.bayes[-1], linearization=-of.bayes[-1].linearization))},
-    ],
-)
-def test_load_refuses_arrays_of_other_documents(localizer: LocalizerModel, tmp_path: Path, change: Change) -> None:
-    assert localizer.bayes
-    replace(localizer, **change(localizer)).save(tmp_path)
-    with pytest.raises(InputError, match=r"localizer\.safetensors: no weights of the localizer"):
+    localizer.save(tmp_path)
+    path = tmp_path / "localizer.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | {key: value}))
+    with pytest.raises(InputError, match=rf"localizer\.json: {key}"):
         LocalizerModel.load(tmp_path)
 
 
@@ -267,75 +206,22 @@ def test_load_refuses_files_of_before(localizer: LocalizerModel, tmp_path: Path)
         LocalizerModel.load(tmp_path)
 
 
-@pytest.mark.parametrize("name", ["localizer.json", "localizer.safetensors"])
-@settings(max_examples=15, suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(at=st.floats(0, 1, exclude_max=True), flip=st.integers(0, 255), cut=st.integers(0, 300))
-def test_load_refuses_damaged_bytes(
-    localizer: LocalizerModel, brief: Recording, tmp_path: Path, name: str, at: float, flip: int, cut: int
-) -> None:
-    """A byte is changed, and some behind it are lost."""
+@pytest.mark.parametrize(
+    ("name", "message"), [("localizer.json", "not a JSON file|JSON"), ("localizer.safetensors", "not the weights")]
+)
+def test_load_refuses_torn_files(localizer: LocalizerModel, tmp_path: Path, name: str, message: str) -> None:
     localizer.save(tmp_path)
-    content = bytearray((tmp_path / name).read_bytes())
-    where = int(at * len(content))
-    content[where] ^= flip
-    del content[where + 1 : where + 1 + cut]
-    sound = (tmp_path / name).read_bytes() == content
-    (tmp_path / name).write_bytes(content)
-    try:
-        read = LocalizerModel.load(tmp_path)
-    except InputError:
-        return
-    assert sound or name == "localizer.json"
-    assert np.isfinite(read.predict_features(read.scaled_features(brief)).positions_mm).all()
+    (tmp_path / name).write_bytes((tmp_path / name).read_bytes()[:-9])
+    with pytest.raises(InputError, match=message):
+        LocalizerModel.load(tmp_path)
 
 
 def test_save_that_fails_changes_nothing(localizer: LocalizerModel, tmp_path: Path) -> None:
     localizer.save(tmp_path)
     before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
     other = replace(localizer, table=localizer.table + 1)
-    for value in (np.nan, object()):
-        with pytest.raises(InputError, match="cannot be written as JSON"):
-            replace(other, provenance={"note": value}).save(tmp_path)
-    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
     (tmp_path / "localizer.json").unlink()
     (tmp_path / "localizer.json").mkdir()
     with pytest.raises(InputError, match="is a folder, expected a file or nothing"):
         other.save(tmp_path)
     assert (tmp_path / "localizer.safetensors").read_bytes() == before["localizer.safetensors"]
-    with pytest.raises(InputError, match=r"folder is .*, expected a path"):
-        LocalizerModel.load("")
-    with pytest.raises(InputError, match="name is"):
-        files_of(tmp_path, "..")
-
-
-def written(folder: Path, value: float) -> ModelFiles:
-    files = files_of(folder, "model")
-    files.write({"format": "model/1", "value": value}, {"weights": np.full(3, value)}, "the model")
-    return files
-
-
-def read(files: ModelFiles) -> tuple[float, float]:
-    """Values of document and weights."""
-    document = read_json(files.document, "model/1")
-    with files.arrays(document["weights_sha256"], "the model") as arrays:
-        return document["value"], float(arrays["weights"][0])
-
-
-@pytest.mark.skipif(os.name != "posix", reason="kills and locks as POSIX has them")
-def test_kill_while_writing_leaves_the_old_or_the_new_model_or_none(tmp_path: Path) -> None:
-    results, number = [], 0
-    for number in count():
-        folder = tmp_path / str(number)
-        files = written(folder, 1.0)
-        ended = not killed(lambda folder=folder: written(folder, 2.0), number, folder)
-        if files.document.exists():
-            results.append(read(files))
-        else:
-            with pytest.raises(InputError, match=r"model\.json: cannot be read"):
-                read(files)
-        assert read(written(folder, 3.0)) == (3.0, 3.0)
-        if ended:
-            break
-    assert {*results} == {(1.0, 1.0), (2.0, 2.0)}
-    assert (results[0], results[-1]) == ((1.0, 1.0), (2.0, 2.0))
-    assert len(results) <= number  # between the two there is none

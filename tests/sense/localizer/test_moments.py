@@ -5,9 +5,19 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from padforge.sense.localizer.features import DOWN, N_TIMED, UP, complete_windows
-from padforge.sense.localizer.moments import CORRECTED, N_DOWN, PHASES, complete_at, count_complete
-from padforge.sense.localizer.network import RESIDUAL, answering
+from padforge.sense.localizer.moments import (
+    CORRECTED,
+    DOWN,
+    N_DOWN,
+    N_TIMED,
+    PHASES,
+    RESIDUAL,
+    UP,
+    answering,
+    complete_at,
+    complete_windows,
+    count_complete,
+)
 
 
 def completed(down: int, up: int, until: int) -> list[bool]:

@@ -7,7 +7,7 @@ from padforge.sense.localizer.evaluation import PRIOR_PRESSES, conformal, surene
 from padforge.sense.localizer.model import Localization
 
 
-def located(ratios: np.ndarray) -> Localization:
+def make_localization(ratios: np.ndarray) -> Localization:
     """Presses at (0, 0) that are off by shares of a radius of 2 mm."""
     size = len(ratios)
     return Localization(
@@ -21,7 +21,7 @@ def test_radii_of_few_presses_differ_less_from_draw_to_draw(presses: int) -> Non
     rng, many = np.random.default_rng(presses), np.random.default_rng(0).gamma(2.3, 0.67 / 2.3, 20_000)
     shares: dict[float | None, list[float]] = {None: [], 0.67: []}
     for _ in range(100):
-        found = [located(rng.gamma(2.3, 0.67 / 2.3, presses))]
+        found = [make_localization(rng.gamma(2.3, 0.67 / 2.3, presses))]
         for prior in shares:
             shares[prior].append(float((many <= conformal(found, np.zeros((presses, 2)), None, prior)[2]).mean()))
     assert np.mean(shares[0.67]) == pytest.approx(0.9, abs=0.01)
@@ -30,7 +30,7 @@ def test_radii_of_few_presses_differ_less_from_draw_to_draw(presses: int) -> Non
 
 def test_prior_counts_as_so_many_presses() -> None:
     """As many presses as the prior counts for, all ten times as far off as it says."""
-    far = located(np.full(PRIOR_PRESSES, 10.0))
+    far = make_localization(np.full(PRIOR_PRESSES, 10.0))
     spread, r50, r90 = conformal([far], np.zeros((PRIOR_PRESSES, 2)), None, 1.0)
     assert r90 == pytest.approx(10.0)
     assert 2.0 < r50 < 10.0

@@ -13,9 +13,8 @@ from padforge.design.common.validation import InputError
 from padforge.sense import Recording, evaluate
 from padforge.sense.localizer import training
 from padforge.sense.localizer.evaluation import distances
-from padforge.sense.localizer.features import N_TIMED
 from padforge.sense.localizer.model import Localization, LocalizerModel
-from padforge.sense.localizer.moments import PHASES
+from padforge.sense.localizer.moments import N_TIMED, PHASES
 from padforge.sense.localizer.recalibration import (
     CrossValidation,
     Recalibration,
@@ -123,7 +122,8 @@ def test_recalibrate_follows_a_remade_pad(localizer: LocalizerModel, recording: 
 def test_recalibrate_keeps_an_unchanged_pad(
     localizer: LocalizerModel, recording: Recording, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("padforge.sense.localizer.recalibration.SUBSETS", 2)
+    monkeypatch.setattr("padforge.sense.localizer.recalibration.SUBSETS", 1)
+    monkeypatch.setattr("padforge.sense.localizer.recalibration.FOLDS", 2)
     now, result = recalibrate(localizer, known_only(recording, NEW))
     assert "corrected" not in result.changes
     # adapting is kept unless new presses speak against it by a standard error

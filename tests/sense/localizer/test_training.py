@@ -10,8 +10,8 @@ from padforge.benchmarks import harness
 from padforge.benchmarks import localizer as bench
 from padforge.design.common.progress import ignore_progress
 from padforge.sense.localizer import network, torch_network, training
-from padforge.sense.localizer.features import N_FEATURES, N_TIMED
-from padforge.sense.localizer.moments import CORRECTED, N_DOWN, PHASES
+from padforge.sense.localizer.features import N_FEATURES
+from padforge.sense.localizer.moments import CORRECTED, N_DOWN, N_TIMED, PHASES
 from padforge.sense.localizer.press_sampler import PressSampler, sample_fibre_dropout
 from padforge.sense.localizer.torch_network import EnsembleMlp
 from padforge.sense.settings import LocalizerSettings as Options

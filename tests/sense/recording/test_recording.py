@@ -11,7 +11,6 @@ import pytest
 
 from padforge.design.common.validation import InputError
 from padforge.sense import Recorder, Recording
-from padforge.sense.recording.run_directory import JOURNAL, READINGS, read_journal
 
 
 def test_save_and_open_round_trip_and_torn_readings(recording: Recording, folder: Path) -> None:
@@ -116,28 +115,6 @@ def test_open_refuses_other_folders(folder: Path, tmp_path: Path) -> None:
         Recording.open(folder)
 
 
-@pytest.mark.parametrize("exists_before", [False, True])
-def test_save_refuses_a_path_that_appeared_meanwhile(
-    recording: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, exists_before: bool
-) -> None:
-    path = tmp_path / "run"
-    if exists_before:
-        path.mkdir()
-    late = replace(recording, times_s=recording.times_s + 1)
-    sync = Recorder.sync
-
-    def overtaken(recorder: Recorder) -> None:
-        sync(recorder)
-        monkeypatch.setattr(Recorder, "sync", sync)
-        recording.save(path, {})
-
-    monkeypatch.setattr(Recorder, "sync", overtaken)
-    with pytest.raises(InputError, match="never written over"):
-        late.save(path, {})
-    assert Recording.open(path) == recording
-    assert [entry.name for entry in tmp_path.iterdir()] == ["run"]
-
-
 def test_measures_are_saved_but_not_in_the_digest(recording: Recording, tmp_path: Path) -> None:
     count = len(recording.down_command)
     unknown = replace(recording, depths_mm=np.empty(0))
@@ -173,7 +150,7 @@ def test_open_while_recording(tmp_path: Path) -> None:
 
 
 def test_open_needs_little_more_memory_than_the_readings(tmp_path: Path) -> None:
-    """Also where the file has several chunks: neither its content nor a second copy of the readings is kept."""
+    """Neither the content of the file nor a second copy of the readings is kept."""
     readings, down = np.random.default_rng(0).normal(size=(30_000, 60)), np.arange(1, 30_000, 40)
     recording = Recording(readings, np.arange(30_000.0), np.zeros((len(down), 2)), down, down + 20)
     recording.save(tmp_path / "recording", {})
@@ -183,34 +160,3 @@ def test_open_needs_little_more_memory_than_the_readings(tmp_path: Path) -> None
     tracemalloc.stop()
     assert opened == recording
     assert peak < 1.6 * (readings.nbytes + 8 * len(readings)) + 2**23
-
-
-def test_read_journal_needs_little_more_memory_than_its_presses(tmp_path: Path) -> None:
-    down = np.arange(1, 8_000, 4)
-    recording = Recording(np.zeros((8_000, 1)), np.arange(8_000.0), np.full((len(down), 2), 1 / 3), down, down + 2)
-    recording.save(tmp_path / "recording", {})
-    journal = tmp_path / "recording" / JOURNAL
-    tracemalloc.start()
-    presses = read_journal(journal)
-    _, peak = tracemalloc.get_traced_memory()
-    tracemalloc.stop()
-    assert len(presses) == len(down)
-    assert peak < 5 * journal.stat().st_size
-
-
-def test_save_needs_little_memory(tmp_path: Path) -> None:
-    """Readings and the journal are written in parts, as the same bytes as at once."""
-    readings, down = np.random.default_rng(0).normal(size=(20_000, 40)), np.arange(1, 20_000, 4)
-    recording = Recording(readings, np.arange(20_000.0), np.zeros((len(down), 2)), down, down + 2)
-    tracemalloc.start()
-    recording.save(tmp_path / "recording", {})
-    _, peak = tracemalloc.get_traced_memory()
-    tracemalloc.stop()
-    assert peak < 0.45 * readings.nbytes
-    with Recorder(tmp_path / "at_once", 40, {}, {}) as recorder:
-        recorder.append(recording.times_s, recording.readings)
-        for first in down.tolist():
-            recorder.begin((0, 0), first)
-            recorder.finish(first + 2)
-    for name in (JOURNAL, READINGS):
-        assert (tmp_path / "recording" / name).read_bytes() == (tmp_path / "at_once" / name).read_bytes()

@@ -20,8 +20,6 @@ from padforge.sense.localizer.calibration import calibrate
 from padforge.sense.recording.run_directory import read_journal
 from padforge.sense.rig import by_hand
 from padforge.sense.rig.by_hand import (
-    MAP_COLUMNS,
-    MAP_ROWS,
     MIN_PRESSES,
     ROUND,
     SETTLE_S,
@@ -47,8 +45,7 @@ from tests.sense.rig.fakes import Time
 IDENTITY = {"name": "board", "channels": 4, "rate_hz": 1000.0}
 VIEW: dict[str, Any] = {
     **{"phase": "press", "progress": 0.5, "prompt": "press x 5, y 5 mm", "done": 2, "total": 7},
-    **{"message": "counted: x 0, y 0 mm", "target": (16.875, 16.875), "rejected": None},
-    "presses": [{"x_mm": 0.0, "y_mm": 0.0}, {"x_mm": -16.875, "y_mm": 16.875}],
+    "message": "counted: x 0, y 0 mm",
 }
 
 
@@ -84,31 +81,16 @@ def test_plan_targets_rounds_none_into_a_keep_out() -> None:
     assert (positions == np.rint(positions)).mean() > 0.9
 
 
-def test_view_lines_map_positions() -> None:
+def test_view_lines_say_what_to_do_and_pad_view_where() -> None:
     pad = Morphology.straight(2)
     view = pad_view(pad, "hand")
     np.testing.assert_allclose([path[0] for path in view["paths"]], pad.to_mm(pad.knots[:, 0]), atol=0.051)
-    lines = view_lines(view | VIEW)
+    assert view["half_mm"] == [side / 2 for side in pad.layout.size_mm]
+    lines = view_lines(VIEW)
     assert lines[0] == "PRESS X 5, Y 5 MM"
     assert lines[1].count("#") == lines[1].count(".") == 15
-    rows = lines[3 : 3 + MAP_ROWS]
-    assert (rows[0][MAP_COLUMNS], rows[0][1]) == ("O", ".")  # up is up, right is right
-    assert "".join(rows).count("O") == 1
-    assert rows[MAP_ROWS // 2][1 + MAP_COLUMNS // 2] == "."
-    assert "2 of 7 presses" in lines[-2]
-    assert "q: end" in lines[-1]
-    # With the tracks up, what is right on the plan is left on the map; positions stay as planned.
-    lying = view_lines(pad_view(pad, "hand", mirrored=True) | VIEW)
-    assert [row[::-1] for row in lying[3 : 3 + MAP_ROWS]] == rows
-    assert lying[0] == lines[0]
-
-
-def test_view_lines_keep_the_aspect_of_a_rectangle() -> None:
-    view = pad_view(Morphology.straight((1, 5), 8.0), "hand")  # 48 mm wide and 16 mm high
-    lines = view_lines(view | VIEW | {"target": (24.0, 8.0), "rejected": (-24.0, -8.0)})
-    top, bottom = (row for row, line in enumerate(lines) if line.startswith("+"))
-    assert (len(lines[top]), bottom - top - 1) == (MAP_COLUMNS + 2, MAP_ROWS // 3)
-    assert (lines[top + 1][MAP_COLUMNS], lines[bottom - 1][1]) == ("O", "x")
+    assert lines[2].startswith("2 of 7 presses")
+    assert "q: end" in lines[3]
 
 
 @pytest.fixture
@@ -232,8 +214,8 @@ def distances_mm(recording: Recording, strokes: np.ndarray) -> list[float]:
 
 @pytest.fixture(scope="module")
 def clumsy(tmp_path_factory: pytest.TempPathFactory) -> tuple[Hands, Recording]:
-    """A recording in which one press of five goes wrong."""
-    hand = Hands(tmp_path_factory.mktemp("hand"), mishaps=0.2, presses=60)
+    """A recording in which three presses of ten go wrong."""
+    hand = Hands(tmp_path_factory.mktemp("hand"), mishaps=0.3, presses=30)
     return hand, hand.record()
 
 
@@ -244,15 +226,15 @@ def test_session_accepts_every_target_once_and_rejects_mishaps(clumsy: tuple[Han
     rejected, accepted = (
         Counter(stroke.kind for stroke in strokes[part]) for part in (~recording.has_position, recording.has_position)
     )
-    assert min(rejected["short"], rejected["echo"]) >= 2
+    assert min(rejected["short"], rejected["echo"]) >= 1
     assert rejected["press"] <= 1
     assert accepted["short"] + accepted["echo"] + accepted["light"] == 0
     error_mm = distances_mm(recording, strokes)
     assert max(error_mm) < 4 * SCATTER_MM
-    assert np.sqrt(np.mean(np.square(error_mm))) == pytest.approx(SCATTER_MM * np.sqrt(2), rel=0.25)
+    assert np.sqrt(np.mean(np.square(error_mm))) == pytest.approx(SCATTER_MM * np.sqrt(2), rel=0.35)
     held_s = (recording.up_command - recording.down_command)[recording.has_position] / HAND_RIG.rate_hz
     assert held_s.min() > 0.45
-    assert hand.views[-1]["done"] == hand.views[-1]["total"] == 60
+    assert hand.views[-1]["done"] == hand.views[-1]["total"] == 30
     assert names_in_view("hand.html") <= (pad_view(HAND_PAD, "hand") | hand.views[-1]).keys()
 
 
@@ -311,10 +293,10 @@ def test_session_quits_and_never_overwrites(hands) -> None:
         hand.record()
 
 
-@pytest.mark.parametrize(("phase", "killed"), [("hold", False), ("wait", False), ("hold", True)])
+@pytest.mark.parametrize(("phase", "killed"), [("wait", False), ("hold", True)])
 def test_session_resumes(hands, monkeypatch, phase: str, killed: bool) -> None:
     """A press that was under way is none; after a kill nothing tells the journal of it."""
-    hand = hands(presses=6)
+    hand = hands(presses=5)
     with monkeypatch.context() as patched:
         if killed:
             patched.setattr(by_hand.Recorder, "abort", lambda self, reason: None)
@@ -325,7 +307,7 @@ def test_session_resumes(hands, monkeypatch, phase: str, killed: bool) -> None:
     recording = hand.record(resume=True)
     np.testing.assert_array_equal(accepted_mm(recording), hand.targets)
     np.testing.assert_array_equal(recording.readings[: len(before.readings)], before.readings)
-    assert hand.views[-1]["done"] == 6
+    assert hand.views[-1]["done"] == 5
 
 
 def test_session_raises_a_full_disk(hands, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -464,8 +446,9 @@ def test_validator_follows_the_drift_of_the_baseline(validator: PressValidator) 
 
 
 @pytest.mark.slow
-def test_calibrate_learns_from_a_recording_by_hand(clumsy: tuple[Hands, Recording]) -> None:
-    hand, recording = clumsy
+def test_calibrate_learns_from_a_recording_by_hand(hands) -> None:
+    hand = hands(mishaps=0.2, presses=60)
+    recording = hand.record()
     _, evaluation = calibrate(recording, QUICK.model_copy(update={"members": 1, "epochs": 10}))
     scale_mm = np.linalg.norm(hand.targets - hand.targets.mean(axis=0), axis=1).mean()
     assert evaluation.errors[0]["mean_mm"] < 0.55 * scale_mm

@@ -31,23 +31,13 @@ def test_load_device_by_name(monkeypatch: pytest.MonkeyPatch) -> None:
         load_device("padforge.arms", "crane")
 
 
-def test_root_holds_the_package() -> None:
-    assert (devices.ROOT / "padforge" / "__init__.py").is_file()
-
-
-@pytest.mark.parametrize("python_path", [None, ":", "/nowhere::"])
-def test_start_imports_nothing_from_the_current_folder(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, python_path: str | None
-) -> None:
+def test_start_imports_nothing_from_the_current_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     hostile = "open('pwned', 'w').close()\n"
     (tmp_path / "sense").mkdir()
     for name in ("queue.py", "sense/__init__.py", "selectors.py"):
         (tmp_path / name).write_text(hostile, encoding="utf-8")
     monkeypatch.chdir(tmp_path)
-    if python_path is None:
-        monkeypatch.delenv("PYTHONPATH", raising=False)
-    else:
-        monkeypatch.setenv("PYTHONPATH", python_path)
+    monkeypatch.setenv("PYTHONPATH", "/nowhere::")
     process = start("padforge.sense.rig.arms.rtde_worker", "127.0.0.1", stderr=subprocess.PIPE)
     assert os.getsid(process.pid) == process.pid, "an interrupt from the keyboard would reach it"
     _, stderr = process.communicate(timeout=20)  # the end of its stdin ends it
@@ -59,18 +49,14 @@ def test_start_imports_nothing_from_the_current_folder(
     ("error", "match"),
     [
         (serial.SerialException(13, "Permission denied"), "no permission.*dialout"),
-        (serial.SerialException(errno.EPERM, "Operation not permitted"), "no permission.*dialout"),
-        (serial.SerialException(errno.EBUSY, "Device or resource busy"), "another program uses it"),
         (serial.SerialException(errno.EAGAIN, "Resource temporarily unavailable"), "another program uses it"),
         (serial.SerialException(errno.ENOENT, "No such file or directory"), "no such port"),
-        (serial.SerialException("could not open port 'COM7': PermissionError(13, 'Access is denied.')"), "another"),
-        (serial.SerialException("could not open port 'COM7': FileNotFoundError(2, '...')"), "no such port"),
         (serial.SerialException("a device attached to the system is not functioning"), "not functioning.*right port"),
     ],
 )
 def test_port_fault_gives_advice(error: Exception, match: str) -> None:
     with pytest.raises(RigFault, match=match):
-        raise devices.port_fault("COM7", error)
+        raise devices.port_fault("/dev/ttyACM0", error)
 
 
 BUILT_IN = SimpleNamespace(device="/dev/ttyS0", vid=None, pid=None, serial_number=None)

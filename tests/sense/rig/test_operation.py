@@ -11,6 +11,7 @@ from padforge.sense.recording.run_directory import Recorder
 from padforge.sense.rig.operation import ADAPT_EVERY, AdaptivePlanner, acquisition
 from padforge.sense.rig.press_loop import PressLoop
 from padforge.sense.settings import LocalizerSettings
+from tests.sense.conftest import few_moments
 from tests.sense.rig.fakes import FIBRES, PAD, RIG, FakeArm, FakeBoard, Time
 
 
@@ -43,7 +44,8 @@ def test_adaptive_planner_presses_where_the_localizer_is_poor(tmp_path):
 
     training_recording = record("training", PressPlan(left_mm, training.depths_mm))
     small = LocalizerSettings(members=1, hidden=32, layers=1, epochs=10, max_failures=0)
-    localizer, _ = calibrate(training_recording, small)
+    with few_moments():
+        localizer, _ = calibrate(training_recording, small)
     planner = AdaptivePlanner(
         localizer, tmp_path / "run", np.random.default_rng(5), lambda positions_mm: np.ones(len(positions_mm), bool)
     )

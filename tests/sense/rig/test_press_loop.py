@@ -117,7 +117,7 @@ def test_dry_run_lifts_the_tool_and_never_touches_the_pad(tmp_path):
         ({}, PressPlan(np.array([[0.0, 0.0], [150.0, 0.0]]), np.full(2, 4.0)), {}, "x 150 mm"),
         ({}, PressPlan(np.zeros((1, 2)), np.array([6.5])), {}, "depth 6.5 mm"),
         ({"clearance_mm": 70.5}, PLAN, {}, r"z 120\.5 mm; allowed 40 to 120 mm"),
-        *(({name: None}, PLAN, {}, name) for name in ("contact_mm", "box_mm", "pad_mm")),
+        ({"contact_mm": None}, PLAN, {}, "contact_mm"),
         ({}, PLAN, {"force_n": None}, 'max_force_n is 60, but this arm measures no force; allowed "unwatched"'),
         ({}, PLAN, {"pose": (0.0, -400.0, 100.0, np.pi * np.cos(0.5), np.pi * np.sin(0.5), 0.0)}, "held 123 degrees"),
         ({}, PLAN, {"pose": (150.0, -400.0, 100.0, 0.0, np.pi, 0.0)}, r"stands at 150\.0, -400\.0, 100\.0 mm, outside"),
@@ -139,9 +139,10 @@ def test_run_checks_a_changed_plan_before_its_next_press(tmp_path):
     assert len(arm.moves) == 3  # of the press before
 
 
-@pytest.mark.parametrize("time_s", [0.05, 0.5, 0.71, 1.0, 1.3, 2.2])
-@pytest.mark.parametrize("fault", ["protective_stop", "emergency_stop", "lost"])
-def test_run_loses_no_finished_press_by_a_fault_of_the_arm(tmp_path, time_s, fault):
+@pytest.mark.parametrize(
+    ("fault", "time_s"), [("protective_stop", 0.05), ("emergency_stop", 0.5), ("lost", 0.71), ("lost", 1.3)]
+)
+def test_run_loses_no_finished_press_by_a_fault_of_the_arm(tmp_path, fault, time_s):
     arm, board, options = rig()
     arm.hook = lambda arm: setattr(arm, fault, arm.time() > 100 + time_s)
     assert fault_of(tmp_path / "run", arm, board, options, ".", FOUR) == fault
@@ -366,7 +367,7 @@ def test_run_records_depth_and_force(tmp_path):
     assert np.isnan(Recording.open(tmp_path / "without").forces_n).all()
 
 
-@settings(max_examples=40)
+@settings(max_examples=20)
 @given(st.integers(1, 12), st.integers(1, 200), st.sets(st.integers(0, 199), max_size=60), st.data())
 def test_averager_takes_means_however_samples_arrive(ratio, count, lost, data):
     index = np.array([i for i in range(count) if i not in lost], dtype=np.int64)

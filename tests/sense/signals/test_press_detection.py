@@ -55,12 +55,10 @@ def test_detect_presses_of_the_published_recording(published: Path) -> None:
 @pytest.mark.parametrize(
     ("grid", "rig"),
     [
-        *[(4, RigSettings(presses=150, noise_mv=noise_mv)) for noise_mv in (1.6, 5)],
-        *[(4, RigSettings(presses=150, hysteresis=share, creep=0.8 * share)) for share in (0.5, 0)],
-        (4, RigSettings(presses=150, drift_mv=150)),
+        (4, RigSettings(presses=150, noise_mv=5, drift_mv=150)),
+        (4, RigSettings(presses=150, hysteresis=0.5, creep=0.4)),
         (4, RigSettings(presses=150, depth_mm=2.5)),
-        *[(4, RigSettings(presses=150, rate_hz=rate, readings_per_press=n)) for rate, n in ((13.3, 12), (5, 20))],
-        (4, RigSettings(presses=60, rate_hz=100, readings_per_press=200)),
+        (4, RigSettings(presses=150, rate_hz=5, readings_per_press=20)),
         (4, RigSettings(presses=20, rate_hz=1000, readings_per_press=2000)),
         (1, RigSettings(presses=150)),
         # fibres across 128 pitches would hardly respond
@@ -85,17 +83,14 @@ def evenly(presses: int, held_s: float, pause_s: float) -> Spans:
 @pytest.mark.parametrize(
     ("spans", "rate_hz", "ramp_s"),
     [
-        ([(3.0, 4.5)], 5.0, 0.15),
         ([(3.0, 4.5)], RATE_HZ, 0.15),
         (evenly(100, 0.15, 1.5), RATE_HZ, 0.15),
-        (evenly(100, 0.4, 0.4), RATE_HZ, 0.15),
         (evenly(100, 0.4, 0.4), 100.0, 0.15),
         (evenly(100, 1.0, 0.3), RATE_HZ, 0.15),
-        (evenly(10, 30.0, 5.0), RATE_HZ, 0.15),
         (evenly(3, 120.0, 60.0), RATE_HZ, 0.15),
         (evenly(60, 1.5, 2.0), RATE_HZ, 0.4),
     ],
-    ids=["one 5 Hz", "one", "taps", "quick", "quick 100 Hz", "close", "held", "held long", "slow"],
+    ids=["one", "taps", "quick 100 Hz", "close", "held long", "slow"],
 )
 def test_detect_presses_of_any_protocol(spans: Spans, rate_hz: float, ramp_s: float) -> None:
     """A press without an end lasts to the end of the recording."""
@@ -122,7 +117,7 @@ def test_detect_presses_of_any_protocol(spans: Spans, rate_hz: float, ramp_s: fl
         assert presses.released[-1] == estimate_commands(presses, times[:cut])[1][-1] == cut
 
 
-@settings(max_examples=25)
+@settings(max_examples=10)
 @given(
     fibres=st.sampled_from([1, 2, 6, 100]),
     std=st.sampled_from([0.0, 0.1 * COUNT_V, 0.3 * COUNT_V, COUNT_V, 0.1]),
@@ -158,8 +153,7 @@ def disturb(readings: np.ndarray) -> dict[str, np.ndarray]:
 
 
 @pytest.mark.parametrize("kind", disturb(np.zeros((2, 2))))
-def test_detect_presses_in_disturbed_readings(kind: str) -> None:
-    recording = simulate(Morphology.straight(4), RigSettings(presses=300, seed=3))
+def test_detect_presses_in_disturbed_readings(recording: Recording, kind: str) -> None:
     recall, false, *_ = evaluate(detect_presses(disturb(recording.readings)[kind], recording.times_s), recording)
     assert recall >= 0.98
     assert false <= 0.02
@@ -174,7 +168,7 @@ def test_detect_presses_recovers_from_a_start_under_a_press(recording: Recording
     assert false <= 0.05
 
 
-@settings(max_examples=25)
+@settings(max_examples=10)
 @given(cuts=st.lists(st.integers(0, 2000), max_size=20))
 def test_update_does_not_depend_on_the_size_of_blocks(recording: Recording, cuts: list[int]) -> None:
     readings, times = recording.readings[:2000], recording.times_s[:2000]
@@ -210,7 +204,7 @@ def test_detector_refuses_what_is_no_stream() -> None:
     detector.update([0.11], np.zeros((1, 2)))
 
 
-@settings(max_examples=25)
+@settings(max_examples=10)
 @given(
     scale=st.sampled_from([-4.0, -1.0, 0.25, 2.0]),
     shift=st.sampled_from([-1.0, 0.0, 0.5]),
@@ -227,7 +221,7 @@ def test_detect_presses_is_invariant_to_polarity_scale_offset_and_clock(
     assert np.abs(other.released - plain.released).max() <= 1
 
 
-@settings(max_examples=50)
+@settings(max_examples=25)
 @given(
     gaps=st.lists(st.integers(1, 6), min_size=2, max_size=30),
     after=st.integers(0, 20),
@@ -283,12 +277,8 @@ def scene(seed: int, rate_hz: float, presses: int, fibres: int = 5) -> tuple[np.
 
 
 SCENES = {
-    (0, 14.0, 60): (52, 77260, 78864),
     (2, 5.0, 60): (40, 21532, 22152),
     (3, 100.0, 40): (36, 218694, 224817),
-    (4, 300.0, 25): (23, 374517, 393217),
-    (7, 14.0, 120): (98, 294192, 297817),
-    (8, 14.0, 120): (87, 249420, 253232),
     (12, 14.0, 200): (121, 527170, 533804),
 }
 """Number of presses detected, and sums of the readings at which they begin and end."""

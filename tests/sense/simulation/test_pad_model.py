@@ -17,9 +17,9 @@ from padforge.sense.simulation.pad_model import (
     Motion,
     Strain,
     Viscoelasticity,
+    adc_volts,
     divider_voltage,
     probe_motion,
-    quantize,
     simulate_readings,
     superpose_strain,
 )
@@ -102,9 +102,9 @@ def test_divider_and_adc() -> None:
     np.testing.assert_allclose(divider_voltage(rest, np.zeros(26)), rest)
     np.testing.assert_allclose(divider_voltage(rest, SUPPLY_V / (SUPPLY_V - rest)), rest / 2)
     volts = np.linspace(-1, 5, 1001)
-    counts = quantize(volts) / SUPPLY_V * ADC_STEPS
+    counts = adc_volts(volts) / SUPPLY_V * ADC_STEPS
     np.testing.assert_allclose(counts, np.round(counts), atol=1e-9)
-    assert np.abs(quantize(volts) - np.clip(volts, 0, SUPPLY_V)).max() <= SUPPLY_V / ADC_STEPS / 2 * (1 + 1e-9)
+    assert np.abs(adc_volts(volts) - np.clip(volts, 0, SUPPLY_V)).max() <= SUPPLY_V / ADC_STEPS / 2 * (1 + 1e-9)
 
 
 def test_drift_is_an_ornstein_uhlenbeck_process() -> None:

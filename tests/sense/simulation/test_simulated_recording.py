@@ -180,8 +180,8 @@ def test_simulate_refuses_wrong_arguments() -> None:
         simulate(PAD, RigSettings(plan="adaptive"))
 
 
-@pytest.mark.parametrize("values", [(1.8, 12.0, 15.0), (3.0, 25.0, 6.0)])
-def test_measure_rig_settings_recovers_those_of_a_simulation(values: tuple[float, ...]) -> None:
+def test_measure_rig_settings_recovers_those_of_a_simulation() -> None:
+    values = (3.0, 25.0, 6.0)
     names = ("noise_mv", "drift_mv", "hysteresis_s")
     rig: dict[str, Any] = dict(zip(names, values, strict=True))
     measured = measure_rig_settings(simulate(PAD, RigSettings(presses=1500, memory=0.0, **rig)))

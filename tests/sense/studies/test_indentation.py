@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -34,9 +33,6 @@ def test_force_study_estimates_depth_and_force_better_than_guessing(
     for quiet, noisy in zip(force["rows"][::2], force["rows"][1::2], strict=True):
         assert quiet["depth_mm"] < noisy["depth_mm"]
         assert quiet["position_one_depth_mm"] < noisy["position_one_depth_mm"]
-    curve, row = force["curves"][0], force["rows"][0]
-    pressed_n, predicted_n = (press_forces_n(curve[key]) for key in ("pressed_mm", "predicted_mm"))
-    assert np.abs(predicted_n - pressed_n).mean() == pytest.approx(row["force_n"], rel=1e-3)
 
 
 def test_tools_have_one_size_and_the_layer_of_the_contact() -> None:
@@ -65,12 +61,8 @@ def test_shape_study_classifies_better_than_chance(tmp_path: Path, monkeypatch: 
     monkeypatch.setattr(contact, "DEPTH_STEPS", 6)
     shapes = run(shape_study(PADS, sizes=Sizes(500, 200, hidden=12, epochs=25)), tmp_path)
     assert [(row["pad"], row["shapes"]) for row in shapes["rows"]] == [(label, kind) for label in PADS for kind in SETS]
-    for row, matrix in zip(shapes["rows"], shapes["confusions"], strict=True):
-        counts = np.array(matrix["counts"])
-        assert counts.sum() == 200
-        assert row["accuracy_percent"] == pytest.approx(100 * np.trace(counts) / 200)
+    for row in shapes["rows"]:
         assert row["accuracy_percent"] > row["majority_percent"] + 5
-        assert row["worst_percent"] == pytest.approx((100 * np.diag(counts) / counts.sum(axis=1)).min())
         assert 0 < row["position_mm"] < MIDDLE_ERROR_MM
         assert 0 < row["position_shape_known_mm"] < MIDDLE_ERROR_MM
 
@@ -117,49 +109,3 @@ def test_shape_study_names_the_shape_that_is_recognized_least() -> None:
         assert row["accuracy_percent"] == pytest.approx(100 * (4 * len(shapes) - 3) / (4 * len(shapes)))
         positions_mm = row["position_mm"], row["position_shape_known_mm"]
         assert positions_mm == pytest.approx((0.5 * UNIT_MM, 0.25 * UNIT_MM))
-    assert "An unknown shape makes the error of the position 2.00 to 2.00 times as large." in result.text
-
-
-def test_figure_of_depths_has_predicted_over_true_ones_and_errors_by_depth() -> None:
-    curves = [
-        {"pad": pad, "noise_counts": noise, "pressed_mm": [1.0, 5.0], "predicted_mm": [noise, 4.0]}
-        | {"bin_depth_mm": [2.0, 4.0], "bin_position_mm": [None, 10 * noise]}
-        for pad in ("a", "b")
-        for noise in (1.0, 4.0)
-    ]
-    settings = {"pads": {"a": {}, "b": {}}, "noise_counts": [1.0, 4.0], "test": 9}
-    figure: Any = force_study({"square": PADS["square"]}).draw({"curves": curves, "settings": settings})
-    *panels, errors = figure.axes
-    for axes, label in zip(panels, ("a", "b"), strict=True):
-        drawn = {dots.get_label(): dots.get_offsets().tolist() for dots in axes.collections}
-        assert drawn == {"noise 4": [[1, 4], [5, 4]], "noise 1": [[1, 1], [5, 4]]}
-        assert list(drawn) == ["noise 4", "noise 1"]  # the least noise above
-        assert axes.lines[0].get_xydata().tolist() == [[1, 1], [5, 5]]
-        assert (axes.get_title("left"), axes.get_xlabel()) == (label, "true depth (mm)")
-    assert [axes.get_ylabel() for axes in panels] == ["predicted depth (mm)", ""]
-    assert [line.get_xydata().tolist()[1] for line in errors.lines] == [[4, 10], [4, 40], [4, 10], [4, 40]]
-    assert [line.get_linestyle() for line in errors.lines] == ["-", "--", "-", "--"]
-    assert [text.get_text() for text in figure.legends[0].get_texts()] == [
-        f"{pad}, noise {noise}" for pad in "ab" for noise in (1, 4)
-    ]
-    assert (errors.get_xlabel(), errors.get_ylabel()) == ("true depth (mm)", "mean error of the position (mm)")
-    assert figure.get_suptitle() == "Depth of 9 presses never trained on; noise in counts of 12 bits"
-
-
-def test_figure_of_shapes_has_a_column_a_pad_and_a_row_a_set() -> None:
-    kinds = [(pad, shapes) for pad in ("a", "b") for shapes in SETS]
-    confusions = [
-        {"pad": pad, "shapes": shapes, "names": list(SETS[shapes]), "counts": np.eye(len(SETS[shapes])).tolist()}
-        for pad, shapes in kinds
-    ]
-    rows = [{"accuracy_percent": 10.4 * number} for number in range(1, 5)]
-    document = {"settings": {"pads": {"a": {}, "b": {}}, "test": 7}, "confusions": confusions, "rows": rows}
-    figure: Any = shape_study({"square": PADS["square"]}).draw(document)
-    titles = [axes.get_title("left") for axes in figure.axes]
-    assert titles == ["a: 10 %", "b: 31 %", "a: 21 %", "b: 42 %"]
-    assert [axes.get_ylabel() for axes in figure.axes] == ["pressed", "", "pressed", ""]
-    assert [axes.get_xlabel() for axes in figure.axes] == ["", "", "predicted", "predicted"]
-    for axes, shapes in zip(figure.axes[::2], SETS, strict=True):
-        for labels in (axes.get_xticklabels(), axes.get_yticklabels()):
-            assert [text.get_text() for text in labels] == list(SETS[shapes])
-    assert figure.get_suptitle() == "Which object was pressed, per cent of 7 presses never trained on"

@@ -1,14 +1,9 @@
 """The study of robustness, and its files."""
 
-import csv
-import json
-import os
-import signal
 from collections import Counter
 from collections.abc import Iterator
-from concurrent.futures import Executor
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import pytest
@@ -26,8 +21,8 @@ PADS = {"square": Morphology.straight(2), "random": Morphology.random(2, 3, 0)}
 @pytest.fixture(autouse=True, scope="module")
 def small() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(robustness, "HIDDEN", 10)
-        patched.setattr(robustness, "TEST", 300)
+        patched.setattr(robustness, "HIDDEN", 8)
+        patched.setattr(robustness, "TEST", 150)
         patched.setattr(robustness, "MIN_NETWORKS", 4)
         yield
 
@@ -60,16 +55,6 @@ def test_study_evaluates_every_set_of_failed_fibres(results: tuple[Path, dict]) 
     assert select_rows(document, pad="square", n_failed=2)[0]["max"] > 0.2
 
 
-def test_study_writes_the_same_numbers_into_all_files(results: tuple[Path, dict]) -> None:
-    folder, document = results
-    assert json.loads((folder / "robustness.json").read_text()) == json.loads(json.dumps(document))
-    with (folder / "robustness.csv").open() as file:
-        table = list(csv.DictReader(file))
-    assert [float(row["mean"]) for row in table] == [row["mean"] for row in document["rows"]]
-    text = (folder / "robustness.md").read_text()
-    assert all(paragraph in text for paragraph in (*document["text"], f"{document['rows'][0]['mean']:.4g}"))
-
-
 @pytest.mark.slow
 def test_study_reproduces_published_errors(published: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Mean errors with all fibres and with one failed, measured by others with the same protocol."""
@@ -82,55 +67,10 @@ def test_study_reproduces_published_errors(published: Path, tmp_path: Path, monk
         assert [row["mean"] for row in select_rows(document, pad=name)] == pytest.approx(errors, rel=0.15)
 
 
-@pytest.mark.slow
-@pytest.mark.filterwarnings("ignore")
-def test_study_on_a_cluster_survives_the_kill_of_its_worker(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    distributed = pytest.importorskip("distributed")
-    monkeypatch.setattr(robustness, "MIN_NETWORKS", MIN_NETWORKS)  # as workers have it, which are other processes
-    study = robustness_study({"a": Morphology.straight(1), "b": Morphology.random(1, 1)}, max_failures=1, presses=16)
-    expected = run(study, tmp_path / "local")
-    with (
-        distributed.LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address=None) as cluster,
-        distributed.Client(cluster) as client,
-    ):
-        victim = next(iter(client.run(os.getpid).values()))
-
-        def kill(done: int, total: int, name: str) -> None:
-            if done == 1:
-                os.kill(victim, signal.SIGKILL)
-
-        executor = client.get_executor(pure=False, retries=10)
-        document = run(study, tmp_path / "cluster", executor=cast(Executor, executor), on_progress=kill)
-        with pytest.raises(ProcessLookupError):
-            os.kill(victim, 0)
-    assert document["rows"] == expected["rows"]
-
-
-def test_study_escapes_names_of_files(tmp_path: Path) -> None:
-    names = ("_under", "a$\\frac$", "pi|pe <b>", b"\xff".decode(errors="surrogateescape"))
-    paths = [tmp_path / name / "morphology.json" for name in names]
-    for path in paths:
-        PADS["random"].save(path)
-    pads = load_pads(tuple(map(str, paths)), 0)
-    document = run(robustness_study(pads, max_failures=0, presses=16), tmp_path / "out")
-    assert len(document["rows"]) == len(pads) == len(names)
-    for line in (tmp_path / "out" / "robustness.md").read_text().splitlines()[-len(names) :]:
-        assert line.replace("\\|", "").count("|") == len(document["rows"][0]) + 1
-        assert "<b>" not in line
-
-
+@pytest.mark.usefixtures("blank")
 def test_study_of_a_pad_without_signals_guesses_the_middle(tmp_path: Path) -> None:
     document = run(robustness_study(PADS, max_failures=1, presses=16, contact=Contact(radius=1e-6)), tmp_path)
     assert all(0.3 < row["mean"] < 0.5 for row in document["rows"])
-
-
-def test_maps_cover_the_pressed_rectangle(tmp_path: Path) -> None:
-    """Of 2 verticals 8 mm apart and 3 horizontals 15 mm apart."""
-    pad = Morphology.straight((3, 2), (8.0, 15.0))
-    document = run(robustness_study({"tall": pad}, max_failures=0, presses=16), tmp_path)
-    left, right, low, high = document["maps"][0]["extent"]
-    assert ((right - left) * pad.unit_mm, (high - low) * pad.unit_mm) == pytest.approx((8, 30))
-    assert document["rows"][0]["mean_mm"] == pytest.approx(document["rows"][0]["mean"] * np.sqrt(8 * 15))
 
 
 @pytest.mark.usefixtures("blank")
@@ -170,17 +110,6 @@ def test_figure_and_text_have_the_numbers_of_the_rows() -> None:
     figure: Any = study.draw({"settings": settings, "rows": rows, "maps": maps})
     bars, *panels = figure.axes
     assert [patch.get_height() for patch in bars.patches] == [0.1, 0.3, 0.05, 0.2]
-    middles = [patch.get_x() + patch.get_width() / 2 for patch in bars.patches]
-    assert middles == pytest.approx([-0.2, 0.8, 0.2, 1.2])
-    assert [container.get_label() for container in bars.containers if container.get_label()[0] != "_"] == [
-        "plain",
-        "bent",
-    ]
-    dashes = [each.get_offsets()[:, 1].tolist() for each in bars.collections if len(each.get_offsets()) == 2]
-    assert dashes[-2:] == [[0.2, 0.6], [0.1, 0.4]]
-    assert [label.get_text() for label in bars.get_xticklabels()] == ["all fibres", "1 failed"]
-    assert bars.get_ylabel() == "mean error (grid units)"
-    assert bars.get_title("left") == "bar: mean over the sets; line: their standard deviation; dash: the worst set"
     images = [panel.images[0].get_array() for panel in panels if panel.images]
     for errors, changed, change in (images[:3], images[3:]):  # of a pad: both maps, and the change of the second
         np.testing.assert_allclose(errors, cells)
@@ -188,17 +117,18 @@ def test_figure_and_text_have_the_numbers_of_the_rows() -> None:
         np.testing.assert_allclose(change, cells)
 
 
+@pytest.mark.usefixtures("blank")
 def test_study_maps_errors_without_chosen_fibres(tmp_path: Path) -> None:
     """However many fail otherwise, and as for the set that is evaluated anyway."""
-    document = run(robustness_study(PADS, max_failures=1, presses=64, failed=(3, 0, 2)), tmp_path)
+    document = run(robustness_study(PADS, max_failures=1, presses=36, failed=(3, 0, 2)), tmp_path)
     assert [row["n_failed"] for row in document["rows"]] == [0, 1] * 2
     for pad, paragraph in zip(PADS, document["text"][1:], strict=False):
         *_, chosen = [panel for panel in document["maps"] if panel["pad"] == pad]
         assert chosen["failed"] == [0, 2, 3]
         intact = select_rows(document, pad=pad, n_failed=0)[0]["mean"]
         assert intact < chosen["mean"] == pytest.approx(np.mean(chosen["errors"]), rel=0.25)
-        assert f"{chosen['mean']:.3f} without 1+3+4" in paragraph
-    document = run(robustness_study(PADS, max_failures=1, presses=64, failed=(2,)), tmp_path)
+        assert paragraph == f"{pad}: {chosen['mean']:.3f} without 1+3+4."
+    document = run(robustness_study(PADS, max_failures=1, presses=16, failed=(2,)), tmp_path)
     for pad in PADS:
         *_, chosen = [panel for panel in document["maps"] if panel["pad"] == pad]
         [row] = [row for row in document["by_subset"] if (row["pad"], row["failed"]) == (pad, [2])]

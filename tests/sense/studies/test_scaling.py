@@ -1,7 +1,6 @@
 """The study of larger surfaces, in small."""
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -9,7 +8,7 @@ import pytest
 from padforge.design import InputError, Morphology, signals
 from padforge.design.settings import PUBLISHED_CONTACT
 from padforge.sense.studies import scaling
-from padforge.sense.studies.scaling import METHODS, family_shares, scaling_study, spread_presses, tile_inputs
+from padforge.sense.studies.scaling import family_shares, scaling_study, spread_presses, tile_inputs
 from padforge.sense.studies.study import run
 
 
@@ -76,35 +75,3 @@ def test_scaling_study_summarizes_errors_by_method_and_grid() -> None:
     row = result.rows[1]
     assert [row[name] for name in ("mean", "median", "p95")] == pytest.approx([0.32, 0.16, 0.08 * 8.3])
     assert (row["percent_of_side"], row["epochs"], row["seconds"]) == (pytest.approx(100 * 0.32 / 8), 7, 2.13)
-    assert (
-        "0.200 at 4 x 4 to 0.320 at 8 x 8, 5.00 % to 4.00 % of the side; below half a grid unit on grids 4, 8"
-        in (result.text[1])
-    )
-
-
-def test_figure_has_errors_shares_and_times_by_grid() -> None:
-    rows = [
-        {"pad": pad, "grid": grid, "method": method, "mean": 0.1 * grid + number}
-        | {"percent_of_side": 50.0 / grid + number, "seconds": grid**2 + number}
-        for pad in ("a", "b")
-        for number, method in enumerate(METHODS)
-        for grid in (4, 8)
-    ]
-    maps = [{"pad": pad, "grid": grid, "errors": [[0.01 * grid, 0.5]]} for grid in (8, 4) for pad in ("a", "b")]
-    document = {"settings": {"grids": [4, 8], "pads": {"a": {}, "b": {}}}, "rows": rows, "maps": maps}
-    figure: Any = scaling_study({"square": Morphology.straight(2)}, grids=(4,)).draw(document)
-    plots = [axes for axes in figure.axes if axes.get_xlabel() == "grid"]
-    names = ["mean error (grid units)", "mean error (% of the side)", "time (s)"]
-    assert [axes.get_ylabel() for axes in plots] == names
-    for axes, key in zip(plots, ("mean", "percent_of_side", "seconds"), strict=True):
-        assert (axes.get_xscale(), axes.get_yscale()) == ("log", "log")
-        values = [row[key] for row in rows]
-        assert [line.get_ydata().tolist() for line in axes.lines[:6]] == np.reshape(values, (6, 2)).tolist()
-        assert [line.get_linestyle() for line in axes.lines[:6]] == [":", "--", "-"] * 2
-    assert plots[0].lines[6].get_ydata() == [0.5, 0.5]  # half a grid unit
-    [upper, lower] = figure.subfigs
-    labels = [f"{pad}, {method}" for pad in "ab" for method in METHODS]
-    assert [text.get_text() for text in upper.legends[0].get_texts()] == labels
-    panels = [axes for axes in lower.axes if axes.images and axes.get_title()]
-    drawn = [(axes.get_ylabel(), axes.get_title(), float(axes.images[0].get_array()[0, 0])) for axes in panels]
-    assert drawn == [("a", "4 x 4", 0.04), ("", "8 x 8", 0.08), ("b", "4 x 4", 0.04), ("", "8 x 8", 0.08)]

@@ -1,10 +1,12 @@
 """The frame of all studies: pads by name, tasks in any order, all results or none."""
 
+import csv
 import json
-import re
 import subprocess
 import sys
+import threading
 from collections.abc import Callable
+from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
@@ -19,36 +21,36 @@ from padforge.design.settings import PUBLISHED_CONTACT, Layout
 from padforge.sense.localizer import evaluation
 from padforge.sense.localizer.moments import MOMENTS
 from padforge.sense.settings import LocalizerSettings, RigSettings
+from padforge.sense.simulation.pad_model import ADC_STEPS
 from padforge.sense.simulation.simulated_recording import simulate
 from padforge.sense.studies import drift, indentation, robustness, scaling, sensitivity
 from padforge.sense.studies.multicontact import multicontact_study
 from padforge.sense.studies.strokes import strokes_study
 from padforge.sense.studies.study import (
-    ADC_COUNTS,
     Sizes,
     Study,
     StudyResult,
+    Task,
     classification_scores,
+    compute_states,
     load_pads,
-    quantize,
+    read_counts,
     run,
     study_lines,
 )
 from tests.helpers.door import refused
 
-PADS = {"square": Morphology.straight(2), "random": Morphology.random(2, 2, 0)}
+PADS = {"square": Morphology.straight(2)}
 TINY = LocalizerSettings(members=1, hidden=8, layers=1, epochs=1, batch=16, max_failures=0)
 SMALLEST: dict[str, Callable[[], Study]] = {
     "robustness": lambda: robustness.robustness_study(PADS, max_failures=1, presses=16),
-    "drift": lambda: drift.drift_study(
-        {"random": PADS["random"]}, {"real": simulate(PADS["square"], RigSettings(presses=40, seed=3))}
-    ),
+    "drift": lambda: drift.drift_study({}, {"real": simulate(PADS["square"], RigSettings(presses=40, seed=3))}),
     "force": lambda: indentation.force_study(PADS, sizes=Sizes(60, 40, hidden=4, epochs=3)),
     "shape": lambda: indentation.shape_study(PADS, sizes=Sizes(100, 60, hidden=4, epochs=3)),
     "multicontact": lambda: multicontact_study(PADS, sizes=Sizes(100, 60, hidden=5, members=2, epochs=3)),
     "strokes": lambda: strokes_study(PADS, presses=40, strokes=3, options=TINY),
-    "scaling": lambda: scaling.scaling_study({"square": PADS["square"]}, grids=(2, 4), side=16),
-    "sensitivity": lambda: sensitivity.sensitivity_study({"square": PADS["square"]}),
+    "scaling": lambda: scaling.scaling_study(PADS, grids=(2, 4), side=16),
+    "sensitivity": lambda: sensitivity.sensitivity_study(PADS),
 }
 
 SMALLER: dict[object, dict[str, object]] = {
@@ -66,28 +68,35 @@ SMALLER: dict[object, dict[str, object]] = {
 
 
 @pytest.mark.parametrize("name", SMALLEST)
-def test_run_gives_every_study_the_same_result_in_any_order_of_tasks(
-    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+@pytest.mark.usefixtures("blank")
+def test_every_study_writes_table_figure_and_text(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for module, sizes in SMALLER.items():
         for size, value in sizes.items():
             monkeypatch.setattr(module, size, value)
-    complete = run(SMALLEST[name](), tmp_path / "complete", jobs=1)
-    again = run(replace(SMALLEST[name](), draw=lambda document: Figure()), tmp_path / "again", jobs=3)
-    for row in (*complete["rows"], *again["rows"]):
-        for seconds in ("seconds", "seconds_per_10000"):
-            row.pop(seconds, None)
-    for document in (complete, again):
-        document["text"] = [re.sub(r"took \d+ s", "", line) for line in document["text"]]
-    assert again == complete
-    stem = complete["format"].removeprefix("padforge-study-").removesuffix("/2")
-    names = [f"{stem}.{end}" for end in ("csv", "json", "md", "png")]
-    assert sorted(path.name for path in (tmp_path / "complete").iterdir()) == names
-    assert (tmp_path / "complete" / f"{stem}.png").read_bytes().startswith(b"\x89PNG")
-    json.dumps(complete, allow_nan=False)
-    assert len({tuple(row) for row in complete["rows"]}) == 1
-    lines = study_lines(complete)
-    assert len(lines) == 1 + len(complete["rows"]) + 1 + len(complete["text"])
+    document = run(SMALLEST[name](), tmp_path, jobs=1)
+    assert document["format"] == f"padforge-study-{name}/2"
+    assert sorted(path.name for path in tmp_path.iterdir()) == [f"{name}.{end}" for end in ("csv", "json", "md", "png")]
+    assert json.loads((tmp_path / f"{name}.json").read_text()) == json.loads(json.dumps(document, allow_nan=False))
+    with (tmp_path / f"{name}.csv").open() as file:
+        table = list(csv.DictReader(file))
+    assert [list(row) for row in table] == [list(row) for row in document["rows"]]
+    assert len(study_lines(document)) == 1 + len(table) + 1 + len(document["text"])
+    text = (tmp_path / f"{name}.md").read_text()
+    assert all(paragraph in text for paragraph in document["text"])
+
+
+@pytest.mark.parametrize("executor", [None, ThreadPoolExecutor(2)], ids=["threads", "executor"])
+def test_results_do_not_depend_on_the_order_of_tasks(executor: Executor | None) -> None:
+    """The second task ends first."""
+    gate = threading.Event()
+    tasks = [
+        Task("first", lambda: {"value": np.array(1.0 if gate.wait(10) else 0.0)}),
+        Task("second", lambda: gate.set() or {"value": np.array(2.0)}),
+    ]
+    reports: list[tuple[int, int, str]] = []
+    states = compute_states(tasks, lambda *report: reports.append(report), jobs=2, executor=executor)
+    assert [float(state["value"]) for state in states] == [1.0, 2.0]
+    assert reports == [(0, 2, ""), (1, 2, "second"), (2, 2, "first")]
 
 
 def test_run_leaves_nothing_if_the_figure_or_the_document_fails(tmp_path: Path) -> None:
@@ -114,18 +123,10 @@ def test_run_leaves_nothing_if_the_figure_or_the_document_fails(tmp_path: Path) 
         ),
         (["robustness", "square", "--failed", "6,9"], "fibre 9: no such fibre, allowed are 1 to 8"),
         (["scaling", "square", "--grids", "4,x"], "--grids is '4,x', expected numbers from 2 to 256"),
-        *(([name, "no"], "no: no such file") for name in ("sensitivity", "force", "shape", "multicontact")),
     ],
 )
 def test_invalid_study_command_fails_in_one_line(arguments: list[str], message: str, tmp_path: Path) -> None:
     assert message in refused("study", *arguments, "--out", "out", cwd=tmp_path)
-
-
-@pytest.mark.parametrize("name", ["force", "shape"])
-def test_study_presses_with_the_contact_of_the_settings(name: str, tmp_path: Path) -> None:
-    (tmp_path / "pad.toml").write_text("[contact]\nradius = 0.6\n")
-    message = refused("study", name, "square@1", "--out", "out", cwd=tmp_path)
-    assert "[contact] model is shape, allowed is layer" in message
 
 
 @pytest.mark.parametrize("name", ["multicontact", "scaling"])
@@ -208,14 +209,14 @@ def test_load_pads_searches_with_the_given_knots_by_either_method(monkeypatch: p
         load_pads(("optimised-0",), seed=0)
 
 
-def test_quantize_gives_whole_counts_up_to_full_scale_of_the_training() -> None:
+def test_read_counts_gives_whole_counts_up_to_full_scale_of_the_training() -> None:
     signals = np.array([[0.0, 0.5, 0.0], [0.25, 1.0, 0.0], [0.5, 0.5, 0.0], [0.75, 2.0, 0.0]])
-    counts = quantize(signals, 3, 0.0, np.random.default_rng(0))
-    full = [ADC_COUNTS, ADC_COUNTS, 0]
-    np.testing.assert_array_equal(counts, [[0, 2048, 0], [2048, ADC_COUNTS, 0], [ADC_COUNTS, 2048, 0], full])
-    signed = quantize(np.array([[-0.5, -2.0], [1.0, 0.0]]), 2, 0.0, np.random.default_rng(0))
-    np.testing.assert_array_equal(signed, [[-2048, -ADC_COUNTS], [ADC_COUNTS, 0]])
-    noisy = quantize(np.repeat([0.5, 1.0], [4000, 1])[:, None], 4001, 4.0, np.random.default_rng(0))
+    counts = read_counts(signals, 3, 0.0, np.random.default_rng(0))
+    full = [ADC_STEPS, ADC_STEPS, 0]
+    np.testing.assert_array_equal(counts, [[0, 2048, 0], [2048, ADC_STEPS, 0], [ADC_STEPS, 2048, 0], full])
+    signed = read_counts(np.array([[-0.5, -2.0], [1.0, 0.0]]), 2, 0.0, np.random.default_rng(0))
+    np.testing.assert_array_equal(signed, [[-2048, -ADC_STEPS], [ADC_STEPS, 0]])
+    noisy = read_counts(np.repeat([0.5, 1.0], [4000, 1])[:, None], 4001, 4.0, np.random.default_rng(0))
     assert noisy[:-1].std() == pytest.approx(4, rel=0.1)
 
 

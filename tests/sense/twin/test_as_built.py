@@ -34,7 +34,9 @@ def pad() -> AsBuiltPad:
 
 def test_jacobian_agrees_with_differences(pad):
     jacobians = pad.predict_with_jacobian(POSITIONS_MM)[1]
-    for index, step in enumerate(1e-6 * np.eye(len(pad.values))):
+    steps = 1e-6 * np.eye(len(pad.values))
+    for index in [*range(N_SHARED), *range(N_SHARED, len(pad.values), 11)]:
+        step = steps[index]
         ahead, behind = (replace(pad, values=pad.values + sign * step).predict(POSITIONS_MM) for sign in (1, -1))
         slope = (ahead - behind) / 2e-6
         for channel in range(3):

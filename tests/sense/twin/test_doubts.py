@@ -11,7 +11,7 @@ from padforge.sense.twin.as_built import OFFSET, PadPlan, channel_indices
 from padforge.sense.twin.doubts import find_doubts
 from padforge.sense.twin.identification import Identification
 from padforge.sense.twin.wiring import Wiring, images
-from tests.sense.conftest import few_candidates, identified
+from tests.sense.conftest import few_candidates, identify_simulated
 
 
 @pytest.fixture
@@ -99,7 +99,7 @@ def test_no_second_wiring_is_told_of_that_plans_each_fibre_where_it_was(result: 
 def test_another_pad_is_doubted_and_the_recorded_one_is_not() -> None:
     rig = RigSettings(presses=160, seed=1)
     built = Morphology.random(2, knots=3, seed=1)
-    right, wrong = (identified(built, told, rig) for told in (built, Morphology.random(2, knots=4, seed=11)))
+    right, wrong = (identify_simulated(built, told, rig) for told in (built, Morphology.random(2, knots=4, seed=11)))
     assert find_doubts(right) == []
     assert right.fit.pad.fibres == (0, 1, 2, 3)
     assert any("is it the recording of this pad?" in doubt for doubt in find_doubts(wrong))
@@ -109,7 +109,7 @@ def test_another_pad_is_doubted_and_the_recorded_one_is_not() -> None:
 @few_candidates()
 def test_a_pad_of_straight_fibres_is_not_doubted() -> None:
     pad = Morphology.straight(3)
-    result = identified(pad, pad, RigSettings(presses=160, seed=7))
+    result = identify_simulated(pad, pad, RigSettings(presses=160, seed=7))
     assert find_doubts(result) == []
     assert result.alternatives  # as good, and planned where the stated one is
 
@@ -118,5 +118,5 @@ def test_a_pad_of_straight_fibres_is_not_doubted() -> None:
 @few_candidates()
 def test_a_fibre_moved_by_a_pitch_is_doubted() -> None:
     told = Morphology.random(2, knots=3, seed=1)
-    result = identified(moved(told, 2, 1.0), told, RigSettings(presses=160, seed=60))
+    result = identify_simulated(moved(told, 2, 1.0), told, RigSettings(presses=160, seed=60))
     assert any("channel 3 does not fit" in doubt for doubt in find_doubts(result))

@@ -52,7 +52,7 @@ def test_images_of_a_wiring_respond_alike_on_straight_fibres(fibres, pitch_mm, c
 
 
 @pytest.mark.parametrize("mirrored", [False, True])
-@pytest.mark.parametrize("turn_deg", [-180, -90, 0, 90])
+@pytest.mark.parametrize("turn_deg", [-180, 90])
 def test_planned_paths_lie_under_the_arm_where_the_transform_takes_them_to_the_plan(mirrored, turn_deg) -> None:
     plan, fibres = PadPlan.from_morphology(PLAN, 5), (2, 0)
     expected = (plan.paths[[2, 0]] - np.array(plan.layout.extent) / 2) * plan.layout.unit_mm

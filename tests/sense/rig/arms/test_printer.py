@@ -262,38 +262,3 @@ def test_lines_follow_marlin_and_answers_are_parsed():
     assert not printer_link.is_halt("Error:checksum mismatch, Last Line: 41")
     assert printer_link.parse_axis_limits(M503[1:], "M203") is None
     assert printer_link.parse_axis_limits(["M203 X0.00 Y1.00 Z1.00"], "M203") is None
-
-
-AT_HOME = (50.0, 50.0, 50.0)
-
-
-def answer(marlin: firmware.Firmware, data: bytes, now: float = 0.0) -> list[str]:
-    marlin.receive(data, now)
-    return marlin.run(now).decode().splitlines()
-
-
-def test_firmware_executes_lines_once_in_order_and_reports_busy():
-    marlin = firmware.Firmware(AT_HOME)
-    assert answer(marlin, printer_link.number_line(0, "M110 N0")) == ["ok"]
-    assert answer(marlin, printer_link.number_line(1, "G90")) == ["ok"]
-    again = ["Error:Line Number is not Last Line Number+1, Last Line: 1", "Resend: 2", "ok"]
-    assert answer(marlin, printer_link.number_line(1, "G90")) == again
-    assert answer(marlin, printer_link.number_line(3, "G90")) == again
-    assert answer(marlin, printer_link.number_line(2, "G90").replace(b"9", b"8")) == [
-        "Error:checksum mismatch, Last Line: 1",
-        *again[1:],
-    ]
-    assert answer(marlin, b"N2 G90\n")[0].startswith("Error:No Checksum")
-    assert answer(marlin, b"2 G90*35\n") == ['echo:Unknown command: "2 G90*35"', "ok"]
-    assert answer(marlin, printer_link.number_line(2, "G90")) == ["ok"]
-    marlin.restart(1.0)
-    assert answer(marlin, b"", 1.0)[0] == "start"
-    assert printer_link.parse_position(answer(marlin, b"M114\n", 1.0)[0]) == (0, 0, 0)  # until it is homed
-    assert answer(marlin, printer_link.number_line(3, "G90"), 1.0)[1] == "Resend: 1"
-    marlin = firmware.Firmware(AT_HOME)
-    marlin.busy(5.0)
-    assert answer(marlin, b"M114\n", 0.0) == []
-    assert answer(marlin, b"", 1.9) == []
-    assert answer(marlin, b"", 2.1) == ["echo:busy: processing"]
-    assert answer(marlin, b"", 4.2) == ["echo:busy: processing"]
-    assert answer(marlin, b"", 5.1)[-1] == "ok"

@@ -17,39 +17,17 @@ VALUES = (1.0, *np.linspace(-0.5, 0.5, 6), 0.3, 0.0, 0.4, 0.0, 0.0, 0.0, 6.0, 8.
 """Of a state: stamp, pose, speed, force, mode, runtime, safety and progress."""
 
 
-def damage_bytes(data: bytes, places: list[tuple[int, int]]) -> bytes:
-    """`data` with some bytes replaced."""
-    changed = bytearray(data)
-    for at, byte in places:
-        changed[at % len(changed)] = byte
-    return bytes(changed)
-
-
-DAMAGE = st.lists(st.tuples(st.integers(0, 10_000), st.integers(0, 255)), max_size=6)
-
-
-@given(st.lists(st.tuples(st.integers(0, 255), st.binary(max_size=40)), max_size=8), st.integers(1, 20), DAMAGE)
-def test_splitter_returns_frames_in_any_portions(sent, size, damage) -> None:
-    def cut(data: bytes, size: int) -> list[tuple[int, bytes] | None]:
-        splitter, items = rtde.FrameSplitter(), []
-        try:
-            for at in range(0, len(data), size):
-                for frame in splitter.split(data[at : at + size]):
-                    items.append(frame)
-        except ValueError:
-            items.append(None)
-        return items
-
-    stream = b"".join(rtde.pack_frame(*frame) for frame in sent)
-    assert cut(stream, size) == sent
-    if stream:
-        damaged = damage_bytes(stream, damage)
-        assert cut(damaged, size) == cut(damaged, len(damaged))
+@settings(max_examples=20)
+@given(st.lists(st.tuples(st.integers(0, 255), st.binary(max_size=40)), max_size=8), st.integers(1, 20))
+def test_splitter_returns_frames_in_any_portions(sent: list[tuple[int, bytes]], size: int) -> None:
+    splitter, stream = rtde.FrameSplitter(), b"".join(rtde.pack_frame(*frame) for frame in sent)
+    portions = [stream[at : at + size] for at in range(0, len(stream), size)]
+    assert [frame for portion in portions for frame in splitter.split(portion)] == sent
     with pytest.raises(ValueError, match="2 bytes"):
         list(rtde.FrameSplitter().split(b"\x00\x02U"))
 
 
-@settings(max_examples=40)
+@settings(max_examples=15)
 @given(st.lists(st.floats(0, 0.5), min_size=50, max_size=50))
 def test_host_clock_ignores_late_arrivals(delays: list[float]) -> None:
     clock, delays = HostClock(), [0.0, *delays]
@@ -105,18 +83,3 @@ def test_reader_converts_state() -> None:
 def test_reader_refuses_other_controller_and_impossible_state(sent: list[bytes], match: str) -> None:
     with pytest.raises(ValueError, match=match):
         reader(sent).read(1.0)
-
-
-@settings(max_examples=100)
-@given(st.integers(0, 8), DAMAGE)
-def test_reader_raises_os_or_value_error_for_damage(which: int, damage: list[tuple[int, int]]) -> None:
-    """The two that whoever uses the reader is prepared for."""
-    sent = stream(*[state(*VALUES)] * 5)
-    sent[which] = damage_bytes(sent[which], damage)
-    try:
-        link = reader(sent)
-        for _ in range(6):
-            reading = link.read(1.0)
-            assert np.isfinite(reading.pose).all()
-    except (OSError, ValueError):
-        return

@@ -65,7 +65,7 @@ def run(link: Link) -> tuple[np.ndarray, SampleClock]:
     return np.array(errors), clock
 
 
-@settings(max_examples=12)
+@settings(max_examples=6)
 @given(
     rate=st.sampled_from([(1000.0, 16), (100.0, 2), (40.0, 1)]),
     skew=st.floats(-200e-6, 200e-6),
@@ -79,9 +79,9 @@ def test_times_are_accurate_from_first_block(rate: tuple[float, int], skew: floa
 
 
 def test_times_stay_accurate_in_bounded_memory() -> None:
-    errors, clock = run(Link(40.0, 8, 1500.0, 200e-6, seed=1))
+    errors, clock = run(Link(40.0, 8, 600.0, 200e-6, seed=1))
     assert np.abs(errors).max() < 2e-3
-    assert np.abs(errors[500:]).max() < 1e-3
+    assert np.abs(errors[250:]).max() < 1e-3
     assert len(pickle.dumps(clock)) < 3000  # a minute of arrivals
 
 
@@ -116,7 +116,7 @@ def test_times_of_microsecond_clock() -> None:
     assert np.diff(times) == pytest.approx(np.diff(measured_s[-10:]), rel=1e-2)
 
 
-@settings(max_examples=40)
+@settings(max_examples=15)
 @given(st.integers(0, 2**32 - 1), st.integers(2, 12), st.sampled_from([1e-4, 1e-3, 1e-1]))
 def test_times_follow_highest_line_below_arrivals(seed: int, count: int, size: float) -> None:
     """By linear programming: as high as can be at the mean of x, above no point, no steeper than a quartz is off."""

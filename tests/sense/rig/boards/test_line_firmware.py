@@ -49,7 +49,9 @@ def assemble(header: LineHeader, samples: list[LineSample]) -> BoardSamples:
     return LineAssembler(header, range(header.channels)).assemble([(1.0, samples)])
 
 
-@pytest.mark.parametrize("board", ["ESP32", "ARDUINO_SAM_DUE", pytest.param("TEENSY", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "board", ["ESP32", *(pytest.param(name, marks=pytest.mark.slow) for name in ("ARDUINO_SAM_DUE", "TEENSY"))]
+)
 def test_firmware_sends_header_at_start_and_on_request(board: str, program: Path, tmp_path: Path) -> None:
     runs = program if board == "ESP32" else compile_sketch("line", FIRMWARE, tmp_path, board)
     items, _ = read(runs, "run 5000", "host x", "host ?", "run 5000")

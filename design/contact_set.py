@@ -1,0 +1,66 @@
+"""The contacts that a pad may really meet: those that a search serves, and those that a finished pad is judged by."""
+
+from padforge.design.contact import half_width_mm, widened
+from padforge.design.settings import MEASURED_PROFILE, MEASURED_STD_MM, PUBLISHED_CONTACT, Contact, SearchSettings
+
+NARROWER, WIDER = 0.75, 1.25
+"""Widths of the isotropic profiles that a pad designed for a layer must serve, as shares of the measured one."""
+UNCERTAINTY = 0.1
+"""Share by which the width of a measured profile may be wrong: of profiles identified from two recordings of a pad."""
+PROFILE_STD_MM = (5.0, MEASURED_STD_MM, 7.9)  # of the sensitivity profiles, about Gaussian, that are tried
+
+
+def served_contacts(assumed: Contact, search: SearchSettings) -> dict[str, Contact]:
+    """Return the contacts that a search serves, by name, the assumed one first."""
+    others: dict[str, Contact] = {}
+    if search.contacts == "plausible":
+        others = _plausible_contacts(assumed)
+    elif search.contacts != "assumed":
+        others = {f"contact {number} of [search]": contact for number, contact in enumerate(search.contacts, 1)}
+    return {"as assumed": assumed} | {name: other for name, other in others.items() if other != assumed}
+
+
+def _plausible_contacts(assumed: Contact) -> dict[str, Contact]:
+    """Return contacts that the assumed one may turn out to be.
+
+    The share in which a press stretches fibres is the least certain part of a layer: on the built pad an isotropic
+    profile explains as much as the directions of a layer do. So a pad serves the layer and, of two widths, the measured
+    isotropic profile, which is as much wider under another press as the layer is. Pressed flat alone, fibres answer in
+    between. A profile was measured, and only its width is uncertain. A shape is a convention, to be served as it is.
+    """
+    if assumed.model == "layer":
+        scale = half_width_mm(assumed) / half_width_mm(Contact())
+        return {
+            f"isotropic, {half_width_mm(profile):.1f} mm": profile
+            for profile in (widened(Contact(model="profile"), scale * share) for share in (NARROWER, WIDER))
+        }
+    if assumed.model == "profile":
+        shares = {"narrower": 1 - UNCERTAINTY, "wider": 1 + UNCERTAINTY}
+        return {f"{UNCERTAINTY:.0%} {name}": widened(assumed, share) for name, share in shares.items()}
+    return {}
+
+
+def judged_contacts(assumed: Contact, search: SearchSettings) -> dict[str, Contact]:
+    """Return the contacts that a pad is judged by, by name: those that a search serves, and others; none twice.
+
+    Beside a layer the others are presses by a tool half as large or half as deep, and fibres that answer to being
+    pressed flat alone; beside another contact narrower and wider profiles, and the published disc.
+    """
+    if assumed.model == "layer":
+        tool_mm, depth_mm = assumed.tool_radius_mm / 2, assumed.depth_mm / 2
+        changes: dict[str, dict[str, float]] = {
+            f"tool of {tool_mm:g} mm": {"tool_radius_mm": tool_mm},
+            f"{depth_mm:g} mm deep": {"depth_mm": depth_mm},
+            "pressed flat alone": {"squeeze": 1.0, "stretch": 0.0},
+        }
+        others = {name: Contact(**assumed.model_dump() | change) for name, change in changes.items()}
+    else:
+        others = {
+            f"profile of {std:g} mm": Contact(
+                sensitivity_profile=tuple((std / MEASURED_STD_MM * d, weight) for d, weight in MEASURED_PROFILE)
+            )
+            for std in PROFILE_STD_MM
+        }
+        others["published disc, K = 0.6"] = PUBLISHED_CONTACT
+    served = served_contacts(assumed, search)
+    return served | {name: other for name, other in others.items() if other not in served.values()}
