@@ -6,7 +6,7 @@ from padforge.design.settings import MEASURED_PROFILE, MEASURED_STD_MM, PUBLISHE
 NARROWER, WIDER = 0.75, 1.25
 """Widths of the isotropic profiles that a pad designed for a layer must serve, as shares of the measured one."""
 UNCERTAINTY = 0.1
-"""Share by which the width of a measured profile may be wrong: of profiles identified from two recordings of a pad."""
+"""Share by which the width of a measured profile may be wrong: parts of one recording give profiles as far apart."""
 PROFILE_STD_MM = (5.0, MEASURED_STD_MM, 7.9)  # of the sensitivity profiles, about Gaussian, that are tried
 
 

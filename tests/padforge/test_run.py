@@ -14,9 +14,11 @@ import pytest
 import trimesh
 from safetensors.numpy import load_file
 
+from padforge.design import Contact, SearchSettings
 from padforge.design.common.files import sha256
 from padforge.design.common.parallel import Checkpoints
 from padforge.design.common.settings import Spec
+from padforge.design.contact_set import judged_contacts
 from padforge.design.report import press_sections
 from padforge.run import Run
 from padforge.sense.report.calibration import calibrate_into
@@ -74,7 +76,7 @@ def test_run_compares_contacts(finished: tuple[Path, str]) -> None:
     folder, printed = finished
     rows = json.loads((folder / "out/pad/contacts.json").read_text())["rows"]
     assert {row["pad"] for row in rows} == {"designed", "straight"}
-    assert len(rows) == 8
+    assert len(rows) == 2 * len(judged_contacts(Contact(), SearchSettings()))
     assert all(0 < min(row["errors_mm"]) < 20 for row in rows)
     assert printed.count("\ncontact: expected error ") == 1
 

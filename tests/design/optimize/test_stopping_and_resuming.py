@@ -23,7 +23,7 @@ from padforge.design.common.parallel import Checkpoints
 from padforge.design.optimize import search as stopping
 
 PAD = PadSettings(grid=1)
-SMALL = SearchSettings(knots=3, starts=2, steps=30, population=10, generations=5, max_failures=1)
+SMALL = SearchSettings(knots=3, starts=2, steps=30, population=10, generations=5, max_failures=1, contacts="assumed")
 FREE = RulesSettings(enforce=False)
 POSIX = pytest.mark.skipif(os.name != "posix", reason="signals as POSIX has them")
 

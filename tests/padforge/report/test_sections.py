@@ -226,7 +226,6 @@ DAMAGED = {
     "recording/start.json": ['{"format": "padforge-recording/2", "fibres": 4}'],
     "mould.stl": ["solid nothing"],
     "mould.png": ["no picture"],
-    "design.svg": ["<svg"],
     "studies/drift.json": [
         '{"format": "padforge-study-drift/2", "title": "a", "text": [], "rows": [{"a": 1}, {"b": 1}]}'
     ],

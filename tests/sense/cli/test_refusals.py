@@ -72,7 +72,7 @@ calibrate rec --time-budget nan                 | Invalid value for '--time-budg
 {live} --model model --rig ur5                  | no board is found
 {live} --model model --host 0.0.0.0             | host is '0.0.0.0', which other machines reach
 {live} --model model --replay rec --tcp 0 --rerun here | --rerun is 'here', expected an address like rerun+http://HOST:PORT
-{live} --model model --tcp 0 --token short      | token has 5 characters, allowed are 16 to 256
+{live} --model model --tcp 0 --token short      | token has 5 characters, allowed are 16 or more
 """
 SHORT = {name: f"--morphology {name}.json" for name in ("straight", "five")}
 SHORT |= {"live": "live --port 0", "unread": "--morphology straight.json --spec none.toml"}
