@@ -66,7 +66,7 @@ def expected_errors(pad: Morphology, contact: Contact, search: SearchSettings, s
         search: says how many fibres may fail, and how responses scatter.
         size: says what is pressed.
     """
-    fibres, windows = len(pad.knots), list(dict.fromkeys(evaluation_windows(size.sensed)))
+    fibres, windows = len(pad.knots), evaluation_windows(size.sensed)
     levels = range(min(len(failure_shares(search.max_failures)), fibres))
     masks = [failure_masks(fibres, k, max(MAX_SETS // len(windows), MIN_SETS)) > 0 for k in levels]
     scale = straight_full_scale(pad.layout, contact, size.sensed_mm)

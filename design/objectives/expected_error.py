@@ -55,9 +55,9 @@ MAX_FAR, MAX_WINDOWS = 2048, 16
 MAX_PARTNERS, MAX_PARTNER_DISTANCE = 36, 1.0
 """Presses of the coarse grid that are added to the regression, and their distance in response, widths of the kernel:
 along a strip, where some fibres answer all presses of a row alike, a network tells them apart by the others."""
-GRIDS, MAX_SETS, MIN_SETS = 4, 32, 8
-"""Grids, and sets of failed fibres of a size, by which a finished pad is evaluated; with more windows, fewer sets do
-for each, down to the last."""
+MAX_SETS, MIN_SETS = 32, 8
+"""Sets of failed fibres of a size by which a finished pad is evaluated; with more windows, fewer sets do for each, down
+to the last."""
 WIDTH, RIDGE = 0.8, 1e-2
 """Width of the kernel, full scales, and the ridge."""
 BOUND_WEIGHT, REGRESSION_WEIGHT = 0.85, 0.47
@@ -93,7 +93,7 @@ def criterion_errors(pad: Morphology, contact: Contact, search: SearchSettings, 
     rng, fibres = np.random.default_rng(0), len(pad.knots)
     levels = range(min(len(failure_shares(search.max_failures)), fibres))
     windows = evaluation_windows(size.sensed)
-    masks = [failure_masks(fibres, k, max(MAX_SETS * GRIDS // len(windows), MIN_SETS)) for k in levels]
+    masks = [failure_masks(fibres, k, max(MAX_SETS // len(windows), MIN_SETS)) for k in levels]
     scale, weights = straight_full_scale(pad.layout, contact, size.sensed_mm), kernel_weights(pad.layout)
     scatter = scatter_of_full_scale(search.response_scatter, contact, scale)
     errors: list[list[float]] = []  # by window, means over the sets of each size
@@ -150,14 +150,14 @@ def kernel_weights(layout: Layout) -> Array:
 
 
 def evaluation_windows(rectangle: Rectangle) -> list[Rectangle]:
-    """Return the windows by which a pad is evaluated, GRIDS or more: tiles of what is pressed, a sample if many."""
+    """Return the windows by which a pad is evaluated: tiles of what is pressed, a sample if many."""
     low, high = np.array(rectangle)
     counts = np.ceil((high - low) / WINDOW - 1e-9).astype(int).clip(1)
     size = (high - low) / counts
     tiles = np.stack(np.unravel_index(np.arange(counts.prod()), counts), axis=1)
     if len(tiles) > MAX_WINDOWS:
         tiles = np.random.default_rng(0).permutation(tiles)[:MAX_WINDOWS]
-    corners = low + size * np.tile(tiles, (math.ceil(GRIDS / len(tiles)), 1))
+    corners = low + size * tiles
     return [(tuple(corner.tolist()), tuple((corner + size).tolist())) for corner in corners]
 
 

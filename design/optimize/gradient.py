@@ -49,6 +49,8 @@ it asks for in the end is a small change.
 """
 RULE_MARGIN = 1.05
 """On the limits of the rules."""
+FORGETTING = 0.03
+"""Weight of a step in the running means of errors."""
 HISTORY_STEPS = 10
 """Steps between entries of the history, each the geometric mean of the objectives since the last one."""
 MAX_GRADIENT = 1e150
@@ -225,6 +227,8 @@ class GradientSearch:
         self._log_sum = 0.0  # of the objectives since the last entry of the history
         self._history: list[tuple[int, float]] = []
         self._broken = np.zeros(problem.pad.layout.fibres, bool)  # fibres that broke rules at the last check
+        # running means of the errors by contact and number of failed fibres, from straight fibres' on
+        self._means = problem.straight_errors.copy()
         if state is not None:
             self._restore(state)
             return
@@ -259,6 +263,7 @@ class GradientSearch:
             "across": self.fibres.across.copy(),
             "fixed": np.array([self.fibres.floor, self.fibres.border]),
             "scales": np.array(self.scales),
+            "means": self._means.copy(),
             "progress": np.array([self.step, self.objective, self._log_sum]),
             "done": np.array(self.done),
             "history": np.array(self._history).reshape(-1, 2),
@@ -271,7 +276,7 @@ class GradientSearch:
 
     def _restore(self, state: State) -> None:
         variables = [state["spans"].copy(), state["across"].copy()]
-        self.scales = state["scales"].tolist()
+        self.scales, self._means = state["scales"].tolist(), state["means"].copy()
         self.fibres = Parametrization(self.problem.pad.layout, *variables, *state["fixed"].tolist())
         step, self.objective, self._log_sum = state["progress"].tolist()
         self.step, self.done = int(step), bool(state["done"])
@@ -362,44 +367,40 @@ class GradientSearch:
         return np.stack([found.by_along, found.by_across])
 
     def _objective(self, curves: FibreCurves, noise_factor: float) -> tuple[float, Array]:
-        """Return the relative error on random presses and failures, and the weighted terms, means over the contacts.
+        """Return the relative error on random presses and failures, and the weighted terms; and a gradient.
 
-        With it comes its gradient (3, F, n) by the curves.
+        A step looks at one contact, drawn by its part in the mean, and remembers what earlier steps have seen of the
+        others: so the gradient (3, F, n) by the curves is that of the mean on average, for the time of one contact.
         """
-        search, pad, contacts = self.problem.search, self.problem.pad, self.problem.contacts
-        length = curves.lengths()
+        search, pad, shares = self.problem.search, self.problem.pad, failure_shares(self.problem.search.max_failures)
         # 1. a random window, all of the pad unless it is large; another one if it lies in a keep-out; random failures
         presses = None
         while presses is None or not presses.free.any():
             window = objective.place_window(pad.sensed, self.rng.random(2))
             presses = objective.window_presses(pad, window, objective.SEARCH_SIDE, self.rng)
-        shares = failure_shares(search.max_failures)
         masks = sample_failures(pad.layout.fibres, shares, self.rng)
-        stated_scatter, straight = search.response_scatter.scaled(noise_factor), self.problem.straight_errors
-        # 2. expected errors under each contact, and how straight fibres compare
-        errors, differentiate = [], []
-        for contact, scale in zip(contacts, self.scales, strict=True):
-            scatter = objective.scatter_of_full_scale(stated_scatter, contact, scale)
-            found = self._errors(curves, length, presses, masks, contact, scale, scatter)
-            errors.append(found[0])
-            differentiate.append(found[1])
+        # 2. errors under one contact, and how straight fibres compare
+        value, by_means = objective.relative_error(self._means, straight := self.problem.straight_errors, shares)
+        parts = (by_means * self._means).sum(axis=1) / value  # in the mean, of each contact; they add up to 1
+        which = int(self.rng.choice(len(parts), p=parts))
+        contact, scale = self.problem.contacts[which], self.scales[which]
+        stated = search.response_scatter.scaled(noise_factor)
+        scatter = objective.scatter_of_full_scale(stated, contact, scale)
+        errors, differentiate = self._errors(curves, presses, masks, contact, scale, scatter)
         averages = objective.averages(masks, straight.shape[1])
-        total, by_means = objective.relative_error(np.array(errors) @ averages.T, straight, shares)
-        gradient = np.sum([d(by) for d, by in zip(differentiate, by_means @ averages, strict=True)], axis=0)
+        self._means[which] += FORGETTING * (averages @ errors - self._means[which])
+        total, by_means = objective.relative_error(self._means, straight, shares)
+        gradient = differentiate(by_means[which] @ averages) / parts[which]
         # 3. the terms that `[search]` weighs
         for weight, term in weighted_terms(search):
-            if term.loss is None:
-                continue
-            for contact in contacts:
-                value, by_curves = term.loss(curves, contact, pad)
-                total += weight * value / len(contacts)
-                gradient = gradient + weight / len(contacts) * by_curves
+            if term.loss is not None:
+                value, by_curves = term.loss(curves, self.problem.contacts[0], pad)
+                total, gradient = total + weight * value, gradient + weight * by_curves
         return total, gradient
 
     def _errors(
         self,
         curves: FibreCurves,
-        lengths: tuple[Array, Array],
         presses: objective.PressWindow,
         masks: Array,
         contact: Contact,
@@ -407,7 +408,7 @@ class GradientSearch:
         scatter: Scatter,
     ) -> tuple[Array, Differentiate]:
         """Return the expected errors (L,) under a contact, and what differentiates: from (L,) to (3, F, n)."""
-        (length, by_length), weights = lengths, objective.kernel_weights(self.problem.pad.layout)
+        (length, by_length), weights = curves.lengths(), objective.kernel_weights(self.problem.pad.layout)
         per_signal, positions = 1 / (scale * length[:, None]), presses.positions
         if len(presses.far):  # those whose responses resemble some of the window
             near, far = (

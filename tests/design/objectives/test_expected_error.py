@@ -73,7 +73,6 @@ def test_evaluation_windows_tile_the_pressed_area(size):
         assert np.ptp(window, axis=0).max() <= module.WINDOW + 1e-9
     area = sum(np.prod(window[1] - window[0]) for window in windows)
     assert area / np.prod(high - low) == pytest.approx(round(area / np.prod(high - low)))
-    assert len(windows) >= module.GRIDS
 
 
 def test_window_presses_sample_the_remaining_pad_coarsely():
@@ -206,8 +205,7 @@ def test_evaluation_of_a_huge_pad_samples_windows_and_presses():
 
 
 @pytest.mark.parametrize("counts", [(2, 5), pytest.param((8, 8), marks=pytest.mark.slow)])
-def test_expected_errors_grow_with_failures_and_scatter(counts, monkeypatch):
-    monkeypatch.setattr(module, "GRIDS", 1)
+def test_expected_errors_grow_with_failures_and_scatter(counts):
     size = PadSettings(horizontals=counts[0], verticals=counts[1], pitch_mm=6.0)
     pad = Morphology.straight(size.layout)
     quiet, loud = (criterion_errors(pad, Contact(), SearchSettings(scatter=share), size) for share in (0.18, 0.4))

@@ -9,6 +9,5 @@ from padforge.design.published.objective import information
 
 @pytest.fixture(autouse=True)
 def little_scored(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Expected errors are those of one grid of presses, and information is bounded by the cells of a coarse grid."""
-    monkeypatch.setattr("padforge.design.objectives.expected_error.GRIDS", 1)
+    """Information is bounded by the cells of a coarse grid."""
     monkeypatch.setattr("padforge.design.published.objective.information", partial(information, side=5))
