@@ -32,7 +32,7 @@ FILES = {
     *(f"{body}.{suffix}" for body in ("mould", "lid", "conductive", "holder") for suffix in ("stl", "3mf")),
     "mould.step",
     *("tracks.svg", "tracks.dxf", "mould.png", "tracks.png", "laying.md", "orientation.svg", "fabrication.json"),
-    *("laying.gcode", "laying.script", "toolpath.svg"),
+    *("laying.gcode", "toolpath.svg"),
 }
 SETTINGS = with_settings({"lid": True, "pins": True, "conductive": True, "holder": True})
 
@@ -195,13 +195,13 @@ def test_shrinkage_enlarges_the_mould_and_keeps_the_pad(tmp_path):
 
 def test_toolpath_findings_only_with_a_program(tmp_path):
     settings = replace(DEFAULTS, dispenser=DispenserSettings(origin_mm=(10.0, 110.0)))
-    by_hand, by_machine = build(PAD, tmp_path, [], settings), build(PAD, tmp_path, ["urscript"], settings)
+    by_hand, by_machine = build(PAD, tmp_path, [], settings), build(PAD, tmp_path, ["gcode"], settings)
     found = {finding.name: finding.status for finding in by_machine.findings}
     assert (found.pop("dispenser_box"), found.pop("dispenser_tip")) == ("fail", "pass")
     assert [*found] == [finding.name for finding in by_hand.findings]
     assert "dispenser" not in by_hand.settings
     assert by_machine.settings["dispenser"]["origin_mm"] == [10.0, 110.0]
-    assert by_machine.files == ["laying.script", "toolpath.svg"]
+    assert by_machine.files == ["laying.gcode", "toolpath.svg"]
 
 
 def other_solid(monkeypatch, body: str) -> None:
@@ -228,7 +228,7 @@ def in_pieces(monkeypatch, body: str) -> None:
 @pytest.mark.parametrize(
     ("planted", "formats", "line"),
     [
-        (None, ["obj"], "'obj', allowed are stl, 3mf, step, svg, dxf, png, gcode, urscript"),
+        (None, ["obj"], "'obj', allowed are stl, 3mf, step, svg, dxf, png, gcode"),
         (None, ["svg"], "2 crossings"),
         (partial(in_pieces, body="mould_body"), ["stl"], r"^mould: .*the mesh has 2 bodies.*nothing was written"),
         (partial(in_pieces, body="lid_body"), ["stl"], r"^lid: .*the mesh has 2 bodies.*nothing was written"),

@@ -33,7 +33,6 @@ def test_defaults_survive_a_settings_file(tmp_path):
 
 BOX = {"box_mm": [0.0, 9.0, 5.0, 5.0, 0.0, 9.0]}
 NEEDED = "; or a material of your own with cure_h, density_g_per_ml, parts, pot_life_min, shrinkage set"
-FAR = {"arm_pose": [400.0, -250.0, 100.0, 0.0, 0.0, 1.5]}
 
 
 @pytest.mark.parametrize(
@@ -42,7 +41,6 @@ FAR = {"arm_pose": [400.0, -250.0, 100.0, 0.0, 0.0, 1.5]}
         ("mould", {"ridge_width": 1.0}, ("[mould] ridge_width", "no such key", "ridge_width_mm")),
         ("mould", {"wall_mm": 0.1}, ("[mould] wall_mm", "0.1", "greater than or equal to 0.8")),
         ("dispenser", BOX, ("[dispenser] box_mm", "5.0", "from low to high")),
-        ("dispenser", FAR, ("[dispenser] arm_pose", "400.0", "10")),
         ("silicone", {"name": "a | b"}, ("[silicone] name: got ",)),
         ("silicone", {"name": "Ecoflex 00-31"}, (f"'Ecoflex 00-31', allowed are {', '.join(SILICONES)}", NEEDED)),
         ("fibre", {"name": "yarn"}, (f"'yarn', allowed are {', '.join(FIBRES)}; or", "own with diameter_mm set")),

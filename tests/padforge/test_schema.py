@@ -91,7 +91,7 @@ def test_documented_settings_validate(validator: jsonschema.Draft7Validator) -> 
         ("rig", "tcp_mm", [0, 0, 120], True),
         ("rig", "channels", [0, 600], False),
         ("silicone", "cure_h", 1.5, True),
-        ("dispenser", "arm_pose", [0, 0, 0, 0, 0], False),
+        ("dispenser", "origin_mm", [0, 0, 0], False),
         ("localizer", "method", "published", True),
         ("localizer", "method", "forest", False),
     ],

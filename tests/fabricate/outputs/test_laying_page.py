@@ -231,8 +231,8 @@ def test_page_omits_absent_parts():
     table = rows(page, "fibres")
     assert [row[0] for row in table] == ["1 and 3", "1 and 4", "2 and 3", "2 and 4"]
     assert table[0][1:3] == ["-5.6 mm", "-5.6 mm"]  # fibres 1 and 3 meet at the lower left of the tray
-    page = laying_page(plain | {"files": ["mould.stl", "laying.gcode", "laying.script", "toolpath.svg"]})
-    assert "in `laying.gcode` and `laying.script` and drawn in `toolpath.svg`" in page.partition("## Lay\n")[2]
+    page = laying_page(plain | {"files": ["mould.stl", "laying.gcode", "toolpath.svg"]})
+    assert "in `laying.gcode` and drawn in `toolpath.svg`" in page.partition("## Lay\n")[2]
     page = laying_page(fabrication_document(Plan(Morphology.straight(4), with_settings({"holder": True}))))
     assert "tracks up; fibres 1 and 5 start at the cut corner" in page
 
