@@ -84,19 +84,14 @@ def test_run_benches_refuses_an_unwritable_folder_before_measuring(tmp_path):
     [
         ({}, {"seconds": 1.3}, ["slower"]),
         ({}, {"seconds": 1.24}, []),
-        ({}, {"seconds": 0.5}, []),
         ({}, {"seconds": 1.3, "pace": 1.3e-3}, []),  # the machine is slower
         ({}, {"seconds": 1.0, "pace": 0.7e-3}, ["slower"]),  # the machine is faster
         ({}, {"error": 1.0}, ["less accurate"]),
-        ({}, {"error": 0.11}, []),
         ({}, {"error": float("nan")}, ["less accurate"]),
         ({}, {"visited": 0.5}, ["visits more"]),
-        ({}, {"seconds": 2.0, "error": 1.0}, ["less accurate", "slower"]),
-        ({}, {"seconds": 3.0, "way": "new"}, []),
         ({"way": "plain"}, {"seconds": 3.0, "way": "plain"}, []),
         ({"seconds": 1e-4}, {"seconds": 3e-4}, []),  # no other trial of this way is slower
         ({"error": 1e-17}, {"error": 9e-16}, []),  # rounding
-        ({"error": 0.0}, {"error": 1e-14}, ["less accurate"]),
     ],
 )
 def test_find_worsenings_reports_worse_trials(before, now, what):

@@ -51,12 +51,6 @@ def test_build_prints_a_summary_with_the_findings_to_look_at(tmp_path):
     assert (checked.exit_code, "warn" in checked.output) == (0, True)
 
 
-def test_check_of_a_morphology(morphology):
-    result = invoke("check", morphology)
-    assert result.exit_code == 0
-    assert all(line.startswith("ok") for line in result.stdout.splitlines())
-
-
 @pytest.mark.parametrize(
     ("file", "table", "line"),
     [
@@ -109,15 +103,6 @@ def test_check_draws_a_picture_of_the_findings(morphology, tmp_path, monkeypatch
     assert invoke("check", morphology, "--picture", picture, "--spec", tmp_path / "pad.toml").exit_code == 1
     with Image.open(picture) as image:
         assert image.format == "PNG"
-
-
-def test_check_lists_three_positions_and_counts_the_others(tmp_path):
-    Morphology.straight((3, 2)).save(tmp_path / "pad.json")
-    (tmp_path / "pad.toml").write_text("[printer]\nnozzle_mm = 0.6\n", encoding="utf-8")
-    result = invoke("check", tmp_path / "pad.json", "--spec", tmp_path / "pad.toml")
-    [line] = [line for line in result.stdout.splitlines() if "ridges are 0.4 mm wide" in line]
-    assert line.count("(") == 3
-    assert line.endswith(" and 2 more places")
 
 
 def finding_of(status, *positions, name="wall"):

@@ -70,8 +70,8 @@ def height_at(solid: trimesh.Trimesh, x: float, y: float) -> float:
 @pytest.mark.parametrize(
     "pad",
     [
-        *((1, 1, 0), (2, 10, 2), (1, 30, 1032)),
-        *(pytest.param(each, marks=pytest.mark.slow) for each in ((4, 30, 1032), (9, 4, 4), "5para_dis", "20para")),
+        *((2, 10, 2), (1, 30, 1032)),
+        *(pytest.param(each, marks=pytest.mark.slow) for each in ((4, 30, 1032), "20para")),
     ],
 )
 def test_random_and_published_moulds_are_closed(request, pad):
@@ -98,10 +98,6 @@ def test_bodies_without_room_are_refused(make, pad, mould, line):
 @pytest.mark.parametrize(
     "settings",
     [
-        pytest.param(
-            with_settings({"border_mm": 3.0, "wall_mm": 0.8, "ridge_width_mm": 1.5, "exit_mm": 0.0}),
-            marks=pytest.mark.slow,
-        ),
         with_settings({"tolerance_mm": 0.05, "floor_mm": 0.4, "wall_draft_deg": 0.0}, pad={"deep_family": "vertical"}),
         pytest.param(  # the oracle's pins are round
             with_settings({**EVERYTHING, "pins": False}, printer={"layer_mm": 0.4}), marks=pytest.mark.slow
@@ -118,9 +114,8 @@ def test_mesh_agrees_with_the_cad_kernel(settings):
         assert_both_ways_agree(conductive_body(conductive_plan(plan)))
 
 
-@pytest.mark.parametrize("mould", [{}, {"exit_mm": 0.0, "border_mm": 1.5}, {"floor_mm": 1.2, "wall_mm": 0.8}])
-def test_holder_fits_the_pad_with_its_leads(mould):
-    plan = Plan(Morphology.random(3, 2, seed=4), with_settings(mould))
+def test_holder_fits_the_pad_with_its_leads():
+    plan = Plan(Morphology.random(2, 2, seed=4), with_settings({"border_mm": 1.5, "floor_mm": 1.2}))
     read, frame = as_read(holder_body(plan)), bed_frame(plan)
     assert_one_closed_body(read)
     floor, wall, out = plan.settings.mould.floor_mm, frame["walls_mm"], plan.tray.bounds[2]
@@ -140,7 +135,7 @@ def test_holder_fits_the_pad_with_its_leads(mould):
         height_at(read, x, y) for x, y in ((inside, inside), (-inside, inside), (-inside, -inside))
     ] == pytest.approx([wall] * 3)
     with pytest.raises(ValueError, match="zero-size array"):
-        height_at(read, inside, -inside)  # where fibres 1 and 4 start, as the pad lies
+        height_at(read, inside, -inside)  # where fibres 1 and 3 start, as the pad lies
 
 
 def test_ridges_run_to_the_end_of_their_slots():
@@ -194,7 +189,7 @@ def test_lid_has_holes_for_pins_vents_and_spout():
 
 @pytest.mark.parametrize(
     ("tapered", "knots", "layer_mm"),
-    [(5.0, 1, 0.3), (17.0, 2, 0.3), *(pytest.param(draft, 4, 0.1, marks=pytest.mark.slow) for draft in (5.0, 17.0))],
+    [(17.0, 1, 0.3), pytest.param(5.0, 4, 0.1, marks=pytest.mark.slow)],
 )
 def test_tapered_moulds_with_wells_are_closed(tapered, knots, layer_mm):
     tapers = with_settings({"ridge_draft_deg": tapered, "pins": True}, printer={"layer_mm": layer_mm})
@@ -227,10 +222,9 @@ def test_mesh_arrays_separates_coincident_vertices():
         assert (block.bounds[:, :2] <= low + 1).all()
 
 
-@pytest.mark.parametrize(("knots", "seed"), [(5, 4), pytest.param(20, 5, marks=pytest.mark.slow)])
-def test_crossing_gap_is_a_lower_bound(knots, seed):
+def test_crossing_gap_is_a_lower_bound():
     """Fibres as cylinders on the floors of their tracks, which are the tops of the ridges, measured on the mesh."""
-    plan = Plan(Morphology.random(2, knots, seed))
+    plan = Plan(Morphology.random(2, 3, seed=4))
     read, fibre = as_read(mould_body(plan)), plan.settings.fibre.material.diameter_mm
     floors = []
     for line in plan.lines:

@@ -85,7 +85,7 @@ def test_lid_bores_are_clear_of_pillars():
         assert not prism.area.intersects(plan.pillars)
 
 
-@pytest.mark.parametrize("fibres", [(0, 3), (2, 0), (1, 0), (0, 1), (1, 1)])
+@pytest.mark.parametrize("fibres", [(0, 3), (1, 0)])
 @pytest.mark.parametrize("leads", ["edges", "one side"])
 def test_mould_of_few_fibres_is_sound(fibres, leads):
     pad = Morphology.straight(fibres, (9.0, 12.0))
@@ -93,7 +93,7 @@ def test_mould_of_few_fibres_is_sound(fibres, leads):
     assert all(found[name].status == "pass" for name in ("watertight", "bodies", "volume", "genus", "crossing_gap"))
 
 
-@effort(max_examples=20)
+@effort(max_examples=8)
 @given(
     st.tuples(st.integers(0, 8), st.integers(0, 8)).filter(any),
     st.tuples(st.floats(4, 25), st.floats(4, 25)),
@@ -178,12 +178,6 @@ def test_page_and_drawings_show_holes_bending_exits_and_lengths(tmp_path):
     assert edge is not None
     assert edge[1].count("M") == 2
     assert [len(re.findall(rf">{number}</text>", drawing)) for number in range(1, 6)] == [2] * 5
-
-
-def test_laying_page_of_a_pad_without_crossings(tmp_path):
-    result = build(Morphology.straight((0, 2), 10.0), tmp_path, [], DEFAULTS)
-    assert result.crossings["gap_mm"] is None
-    assert "No two fibres cross." in (tmp_path / "laying.md").read_text(encoding="utf-8")
 
 
 def test_leads_to_one_side_leave_two_printed_lines_between_their_slots():

@@ -57,7 +57,7 @@ class TestGoodBodies:
         adds = [ridge(outline, height + further) for outline in lines]
         assert not failures(check_body(tray(*adds, ridge(across, height), draft_deg=draft_deg, wall=wall)))
 
-    @pytest.mark.parametrize("angle_deg", [30, 60, 120])
+    @pytest.mark.parametrize("angle_deg", [30, 120])
     def test_crossing_ridges_of_one_height_pass(self, angle_deg):
         crossing = shapely.union(spanning(0.5), shapely.affinity.rotate(spanning(0.5), angle_deg, (0, 0.5)))
         assert not failures(check_body(tray(ridge(crossing & shapely.box(-10.5, -10.5, 10.5, 10.5)))))
@@ -83,7 +83,7 @@ class TestGoodBodies:
 
 
 class TestWidth:
-    @pytest.mark.parametrize(("width", "status"), [(0.2, "fail"), (0.36, "fail"), (0.39, "pass")])
+    @pytest.mark.parametrize(("width", "status"), [(0.36, "fail"), (0.39, "pass")])
     def test_ridge_width_of_a_narrow_ridge(self, width, status):
         thin = ridge(line((2, -6), (7, -5), width=width), 0.8)
         findings = check_body(tray(*CROSS, thin))
@@ -97,8 +97,6 @@ class TestWidth:
     @pytest.mark.parametrize(
         ("printer", "status"),
         [
-            ({"nozzle_mm": 0.6}, "fail"),
-            ({"nozzle_mm": 0.05, "resin": True}, "pass"),
             ({"nozzle_mm": 0.25, "resin": True}, "fail"),
             ({"nozzle_mm": 0.25}, "pass"),
         ],
@@ -106,9 +104,7 @@ class TestWidth:
     def test_ridge_width_by_printer(self, printer, status):
         assert check_body(tray(*CROSS), printer=PrinterSettings.model_validate(printer))["ridge_width"].status == status
 
-    @pytest.mark.parametrize(
-        ("gap", "status"), [(0.05, "fail"), (0.09, "fail"), (0.12, "warn"), (0.35, "warn"), (0.4, "pass")]
-    )
+    @pytest.mark.parametrize(("gap", "status"), [(0.09, "fail"), (0.12, "warn"), (0.4, "pass")])
     def test_silicone_wall_between_ridges(self, gap, status):
         findings = check_body(
             tray(*CROSS, ridge(spanning(3.4 + gap), 1.2), ridge(spanning(-7)), ridge(spanning(-6.6 + gap)))
@@ -138,7 +134,7 @@ class TestWidth:
         findings = check_body(tray(*CROSS, ridge(spanning(3.7), 1.2)) - slot)
         assert failures(findings) == {"silicone_wall": "warn", "tight": "fail"}
 
-    @pytest.mark.parametrize(("height", "status"), [(0.4, "pass"), (0.55, "pass"), (0.65, "warn")])
+    @pytest.mark.parametrize(("height", "status"), [(0.55, "pass"), (0.65, "warn")])
     def test_silicone_wall_between_similar_heights(self, height, status):
         findings = check_body(tray(*CROSS, ridge(spanning(3.7), height)))
         assert findings["silicone_wall"].status == status
@@ -152,29 +148,28 @@ class TestWidth:
         assert all(SIZE / 2 < x < SIZE / 2 + wall for x, _ in findings["wall_thickness"].positions_mm)
         assert bool(findings["wall_thickness"].positions_mm) == (status != "pass")
 
-    @pytest.mark.parametrize("layer", [0.1, 0.4])
-    def test_wall_thickness_of_a_leaning_wall(self, layer):
+    def test_wall_thickness_of_a_leaning_wall(self):
         """A wall 0.5 mm thick at the rim, and thicker by half a millimetre a millimetre below it."""
         side, top, over = 20.0, FLOOR + DEPTH, 1.0
         flare = 1 + (DEPTH + over) / side
         hollow = Manifold.extrude(CrossSection.square((side, side), True), DEPTH + over, scale_top=(flare, flare))
         outer = side + DEPTH + 2 * 0.5
         box = Manifold.cube((outer, outer, top), True).translate((0, 0, top / 2))
-        findings = check_body(box - hollow.translate((0, 0, FLOOR)), printer=PrinterSettings(layer_mm=layer))[
+        findings = check_body(box - hollow.translate((0, 0, FLOOR)), printer=PrinterSettings(layer_mm=0.4))[
             "wall_thickness"
         ]
-        assert findings.measured == pytest.approx(0.5 + layer / 2 * 0.5, abs=0.015)
+        assert findings.measured == pytest.approx(0.5 + 0.4 / 2 * 0.5, abs=0.015)
 
     @pytest.mark.parametrize(
         ("floor", "layer", "status"),
-        [(0.2, 0.1, "fail"), (0.37, 0.1, "fail"), (0.39, 0.1, "pass"), (0.55, 0.3, "fail"), (0.59, 0.3, "pass")],
+        [(0.37, 0.1, "fail"), (0.55, 0.3, "fail"), (0.59, 0.3, "pass")],
     )
     def test_floor_thickness_by_layer(self, floor, layer, status):
         findings = check_body(tray(floor=floor), printer=PrinterSettings(layer_mm=layer))["floor_thickness"]
         assert (findings.status, findings.limit) == (status, pytest.approx(max(0.4, 2 * layer)))
         assert findings.measured == pytest.approx(floor)
 
-    @pytest.mark.parametrize(("lean_deg", "status"), [(0, "fail"), (8, "fail"), (12, "pass")])
+    @pytest.mark.parametrize(("lean_deg", "status"), [(8, "fail"), (12, "pass")])
     def test_floor_thickness_over_a_gable(self, lean_deg, status):
         """A groove from below, with a roof that leans to either side and leaves 0.3 mm of floor over its ridge."""
         fall = 3 * math.tan(math.radians(lean_deg))
@@ -218,7 +213,7 @@ class TestLean:
             solid = Manifold.batch_boolean([_manifold(top), _manifold(low)], OpType.Add)
             assert check_body(solid, printer=PrinterSettings(layer_mm=0.1))["overhang"].status == status
 
-    @pytest.mark.parametrize("lean_deg", [0.05, 0.2, 3, 10])
+    @pytest.mark.parametrize("lean_deg", [0.05, 3])
     def test_undercut_of_a_leaning_wall(self, lean_deg):
         undercut = check_body(tray(*CROSS, draft_deg=-lean_deg))["undercut"]
         assert (undercut.status, undercut.limit) == ("pass" if lean_deg < 0.1 else "fail", 0)
@@ -228,7 +223,7 @@ class TestLean:
         assert undercut.positions_mm
         assert all(max(abs(x), abs(y)) == pytest.approx(SIZE / 2, abs=1) for x, y in undercut.positions_mm)
 
-    @pytest.mark.parametrize(("lean_deg", "status"), [(30, "pass"), (45.8, "pass"), (46.3, "fail")])
+    @pytest.mark.parametrize(("lean_deg", "status"), [(45.8, "pass"), (46.3, "fail")])
     def test_overhang_of_a_funnel(self, lean_deg, status):
         top = 4 + 4 * math.tan(math.radians(lean_deg))
         cup = Manifold.cylinder(4, 4, top, 64) - Manifold.cylinder(5, 2, 2, 64).translate((0, 0, -0.5))
@@ -244,7 +239,7 @@ def _manifold(mesh: trimesh.Trimesh) -> Manifold:
     return Manifold(Mesh(np.float32(mesh.vertices), np.uint32(mesh.faces)))
 
 
-@pytest.mark.parametrize(("layers", "status"), [(0.4, "pass"), (0.6, "fail"), (1.5, "fail"), (4.0, "fail")])
+@pytest.mark.parametrize(("layers", "status"), [(0.4, "pass"), (0.6, "fail")])
 def test_ridges_of_half_a_layer_or_more_are_as_wide_as_the_nozzle(layers: float, status: str) -> None:
     """Lower ones are not printed."""
     printer = PrinterSettings(layer_mm=0.2)
