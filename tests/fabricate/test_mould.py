@@ -8,7 +8,6 @@ from shapely import affinity
 
 from padforge.design.common.validation import InputError
 from padforge.design.morphology import Morphology
-from padforge.fabricate.cad.model import body_solid
 from padforge.fabricate.checks.plan_checks import check_plan
 from padforge.fabricate.mesh import build_mesh, mesh_arrays
 from padforge.fabricate.mould import (
@@ -27,8 +26,6 @@ from padforge.fabricate.plan import Plan
 from padforge.fabricate.settings import WELL_MM
 from tests.fabricate.planted import with_settings
 
-EVERYTHING = {"pins": True, "lid": True, "spout": True, "conductive": True, "border_mm": 1.0, "ridge_draft_deg": 4.0}
-
 
 def as_read(body: Body) -> trimesh.Trimesh:
     """The mesh as whoever reads its STL finds it: single precision, equal vertices joined."""
@@ -40,14 +37,6 @@ def assert_one_closed_body(read: trimesh.Trimesh, genus: int = 0) -> None:
     assert read.is_winding_consistent
     assert read.body_count == 1
     assert read.euler_number == 2 - 2 * genus
-
-
-def assert_both_ways_agree(body: Body) -> None:
-    """The CAD kernel's own Boolean operations on the same prisms are the oracle for the mesh."""
-    oracle = body_solid(body)
-    assert oracle.volume == pytest.approx(build_mesh(body).volume(), rel=1e-5)  # circles are polygons in the mesh
-    box = np.array([[*oracle.bounding_box().min], [*oracle.bounding_box().max]])
-    assert box == pytest.approx(as_read(body).bounds, abs=1e-4)
 
 
 def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -93,25 +82,6 @@ def test_random_and_published_moulds_are_closed(request, pad):
 def test_bodies_without_room_are_refused(make, pad, mould, line):
     with pytest.raises(InputError, match=line):
         make(Plan(Morphology.straight(*pad), with_settings(mould)))
-
-
-@pytest.mark.parametrize(
-    "settings",
-    [
-        with_settings({"tolerance_mm": 0.05, "floor_mm": 0.4, "wall_draft_deg": 0.0}, pad={"deep_family": "vertical"}),
-        pytest.param(  # the oracle's pins are round
-            with_settings({**EVERYTHING, "pins": False}, printer={"layer_mm": 0.4}), marks=pytest.mark.slow
-        ),
-    ],
-)
-def test_mesh_agrees_with_the_cad_kernel(settings):
-    tapered = settings.mould.ridge_draft_deg > 0  # terraces of curves would take the oracle minutes
-    plan = Plan(Morphology.straight(1) if tapered else Morphology.random(1, 3, seed=5), settings)
-    body = mould_body(plan)
-    assert_both_ways_agree(body)
-    assert_one_closed_body(as_read(body))
-    if settings.mould.conductive:
-        assert_both_ways_agree(conductive_body(conductive_plan(plan)))
 
 
 def test_holder_fits_the_pad_with_its_leads():
@@ -235,14 +205,6 @@ def test_crossing_gap_is_a_lower_bound():
     assert isinstance(stated, float)
     for c in plan.crossings:
         assert abs(floors[c.first] - floors[c.second]) - fibre > stated - 1e-4
-
-
-def test_vents_of_a_small_lid_are_at_its_quarters():
-    plan = Plan(Morphology.straight(1, 5.0), with_settings({"lid": True}))
-    quarter = (plan.cavity.bounds[2] - plan.cavity.bounds[0]) / 4
-    vents = {(hole.area.centroid.x, hole.area.centroid.y) for hole in lid_body(plan).cuts}
-    corners = [(x, y) for x in (-quarter, quarter) for y in (-quarter, quarter)]
-    assert np.array(sorted(vents)) == pytest.approx(np.array(corners))
 
 
 def test_pins_are_on_three_corners_so_that_a_lid_fits_one_way() -> None:

@@ -13,7 +13,7 @@ from padforge.design.common.settings import Spec
 from padforge.design.common.validation import InputError
 from padforge.design.morphology import Morphology
 from padforge.design.paths.curves import Crossing
-from padforge.design.settings import FIBRE_MM, Layout, read_contact
+from padforge.design.settings import FIBRE_MM, read_contact
 from padforge.fabricate.mould import mould_body
 from padforge.fabricate.plan import COVER_MM, INTO_WALL_MM, Plan, assign_layers, draw_number, fibre_layers
 from padforge.sense.rig.config import RobotFrame
@@ -105,13 +105,6 @@ def test_every_family_is_laid_at_the_depth_that_it_is_designed_for(fibres, deep)
     contact = read_contact(Spec({"pad": {"deep_family": deep}}))
     assert depths_mm == pytest.approx(np.repeat(contact.fibre_depths_mm, fibres).tolist())
     assert plan.silicone_mm == 6.0
-
-
-def test_deep_family_that_crosses_itself_alone_thickens_a_thin_pad():
-    pad = level_pad(1.8, 1.2)
-    strip = Morphology.from_layout(pad.knots[:2] * [1 / 3, 1], Layout(2, 0, 10.0, 10.0))  # one pitch wide
-    plan = Plan(strip, with_settings({"silicone_mm": 2.5}))
-    assert (plan.heights_mm, plan.silicone_mm) == ((1.2, 2.0), 2.0 + COVER_MM)
 
 
 def test_require_levels_refuses_crossings_of_a_family():

@@ -115,23 +115,6 @@ def test_tracks_svg_numbers_are_beside_starts_outside_silicone():
     assert orientation_sentence((4, 4), "edges") in (root.findtext(f"{SVG}desc") or "")
 
 
-@pytest.mark.parametrize("pad", [Morphology.straight(1, pitch_mm=4.0), Morphology.straight(4)])
-def test_tracks_svg_and_dxf_have_room_for_orientation(pad, tmp_path):
-    plan = Plan(pad)
-    beside, *texts = svg_groups(plan)["scale"].findall(f"{SVG}text")[1:]
-    assert " ".join(text.text or "" for text in texts) == orientation_sentence((4, 4), "edges")
-    notes = read_dxf(tracks_dxf(plan), tmp_path).modelspace().query('TEXT[layer=="scale"]')
-    assert [note.dxf.text for note in notes][2:] == [text.text for text in texts]
-    left, top, width, height = map(float, ElementTree.fromstring(tracks_svg(plan)).get("viewBox", "").split())
-    for text in (beside, *texts):
-        size = min(2.5, 0.6 * pad.pitch_mm)
-        assert float(text.get("x", "")) + 0.58 * size * len(text.text or "") < left + width  # DejaVu Sans is wide
-    lines = [float(text.get("y", "")) for text in texts]
-    assert max(lines) + 1 < top + height
-    assert min(lines) - 1 > -plan.silicone.bounds[1]
-    assert (np.diff(lines) > 0.6 * min(2.5, 0.6 * pad.pitch_mm)).all()
-
-
 def read_dxf(text: str, folder: Path) -> Drawing:
     path = folder / "tracks.dxf"
     path.write_text(text, encoding="utf-8")

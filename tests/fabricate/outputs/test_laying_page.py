@@ -161,29 +161,6 @@ def rows(page: str, head: str) -> list[list[str]]:
     return [[cell.strip() for cell in line.strip("|").split("|")] for line in body[:end]]
 
 
-def test_page_omits_absent_parts():
-    plain = fabrication_document(Plan(Morphology.straight(2)))
-    page = laying_page(plain)
-    for absent in ("holder", "machine", "the lid", "of resin", "pour through its spout"):
-        assert absent not in page
-    section = page.partition("## Orientation\n")[2].partition("\n## ")[0]
-    assert orientation_sentence((2, 2), "edges") in section
-    assert "Horizontal fibres are 1 to 2, vertical ones 3 to 4." in section
-    assert f"]({ORIENTATION_FILE})" in section
-    wire = page.partition("## Wire")[2].partition("##")[0]
-    assert {fibre["resistance_ohm"] for fibre in plain["fibres"]} == {None}
-    assert "unknown: measure 100 mm of it and set `[fibre] ohm_per_mm`" in wire
-    assert "|" not in wire
-    assert rows(page, "PrusaSlicer")[0][:3] == [*2 * ["Layer height: 0.1 mm"], "Layer Height: 0.1 mm"]
-    table = rows(page, "fibres")
-    assert [row[0] for row in table] == ["1 and 3", "1 and 4", "2 and 3", "2 and 4"]
-    assert table[0][1:3] == ["-5.6 mm", "-5.6 mm"]  # fibres 1 and 3 meet at the lower left of the tray
-    page = laying_page(plain | {"files": ["mould.stl", "laying.gcode", "toolpath.svg"]})
-    assert "in `laying.gcode` and drawn in `toolpath.svg`" in page.partition("## Lay\n")[2]
-    page = laying_page(fabrication_document(Plan(Morphology.straight(4), with_settings({"holder": True}))))
-    assert "tracks up; fibres 1 and 5 start at the cut corner" in page
-
-
 def test_page_lists_failed_checks_and_follows_settings():
     findings = (
         {"name": "bed", "status": "pass", "message": "fits", "positions_mm": []},
@@ -420,5 +397,9 @@ def test_page_says_what_the_settings_ask_for():
         "The pad is worn on a cylinder whose axis runs along y, the face with the tracks outwards: fibres stretch"
         " by 3 %."
     )
+    unknown = document["fibre"] | {"ohm_per_mm": None}
+    [line] = section(page(fibre=unknown), "Wire")
+    assert "unknown: measure 100 mm of it and set `[fibre] ohm_per_mm`" in line
+    assert f"]({ORIENTATION_FILE})" in section(document, "Orientation")[-1]
     plain = document["fibre"] | {"max_strain": None, "min_bend_radius_mm": None}
     assert section(page(fibre=plain), "Lay")[1].endswith("with 20 mm out at both ends.")

@@ -1,4 +1,3 @@
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -251,9 +250,8 @@ def test_legend_of_the_mould_names_every_colour_with_its_height(tmp_path, figure
     assert not any("numbers" in label for label in legend_of(figures[1]))
 
 
-@pytest.mark.parametrize("leads", ["edges", "one side"])
-def test_tracks_are_labelled_by_depth_with_a_number_at_every_start(tmp_path, figures, leads):
-    plan = Plan(level_pad(1.8, 1.2), with_settings(pad={"leads": leads}))
+def test_tracks_are_labelled_by_depth_with_a_number_at_every_end(tmp_path, figures):
+    plan = Plan(level_pad(1.8, 1.2), with_settings(pad={"leads": "one side"}))
     draw_tracks(plan, tmp_path / "tracks.png")
     [axes] = figures[0].axes
     crossings = len(plan.crossings)
@@ -264,44 +262,15 @@ def test_tracks_are_labelled_by_depth_with_a_number_at_every_start(tmp_path, fig
     assert list(entries) == [*labels, "2 crossings of one family"]
     assert [entries[label].get_color() for label in labels] == [layer.colour for layer in layers]
     numbers = [text for text in axes.texts if text.get_text().isdigit()]
-    ends = 1 + (leads == "one side")
-    assert sorted(text.get_text() for text in numbers) == sorted(list("1234") * ends)
+    assert sorted(text.get_text() for text in numbers) == sorted(list("1234") * 2)
     for text in numbers:
         fibre = int(text.get_text()) - 1
         line = np.array(plan.lines[fibre].coords)
-        assert np.hypot(*(line[[0, -1]][:ends] - text.xy).T).min() < 3.5  # within the wall
+        assert np.hypot(*(line[[0, -1]] - text.xy).T).min() < 3.5  # within the wall
         assert text.get_color() == (HORIZONTAL, VERTICAL)[plan.family(fibre)]
-        below = leads == "one side" or plan.family(fibre) == 1
-        assert (text.get_ha(), text.get_va()) == (("center", "top") if below else ("right", "center"))
+        assert (text.get_ha(), text.get_va()) == ("center", "top")
     bar = axes.lines[-1].get_xdata()
     assert bar[1] - bar[0] == pytest.approx(10)
     assert [text.get_text() for text in axes.texts if "mm" in text.get_text()] == ["10 mm"]
     note = " ".join(text.get_text() for text in figures[0].texts)
-    assert note == orientation_sentence((2, 2), leads)
-
-
-def test_title_of_a_mesh_has_its_sides(tmp_path, figures):
-    draw_findings(
-        [[0, 0, 1], [30, 0, 1], [30, 10, 6.5]], [[0, 1, 2]], [make_finding("warn", (4, 5))], tmp_path / "a.png"
-    )
-    assert figures[0].axes[0].get_title(loc="left") == "Mesh from above, 30 x 10 x 5.5 mm"
-    assert list(legend_of(figures[0])) == ["warn: wall (1)"]
-
-
-@pytest.mark.parametrize("count", [0, 4])
-def test_legend_has_room_below_the_axes(tmp_path, figures, count):
-    """In rows of three: neither it nor the note reaches the label of the axes or the edge of the picture."""
-    names = [make_finding("warn", (1.0, 1.0), name=f"check_{number}") for number in range(count)]
-    draw_findings([[0, 0, 1], [30, 0, 1], [30, 10, 6.5]], [[0, 1, 2]], names, tmp_path / "mesh.png")
-    draw_tracks(PLAN, tmp_path / "tracks.png")
-    for figure in figures:
-        figure.draw_without_rendering()
-        label = figure.axes[0].xaxis.label.get_window_extent()
-        boxes = [each.get_window_extent() for each in (*figure.legends, *figure.texts)]
-        assert len(figure.legends) == (count > 0 or figure is figures[1])
-        for box in boxes:
-            assert 0 <= box.y0 < box.y1 < label.y0
-            assert all(box.y1 < bar.get_window_extent().y0 + 2 for bar in figure.axes[1:])  # of colours
-        notes = [text.get_window_extent() for text in figure.texts]
-        assert all(lower.y1 <= upper.y0 + 2 for upper, lower in pairwise(notes))
-        assert all(note.y1 <= legend.get_window_extent().y0 + 2 for note in notes for legend in figure.legends)
+    assert note == orientation_sentence((2, 2), "one side")
