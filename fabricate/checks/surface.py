@@ -13,7 +13,6 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from shapely.geometry.base import BaseGeometry
 
-from padforge.design.common.validation import InputError, check_array
 from padforge.design.morphology import Array
 from padforge.fabricate.mesh import Numbers
 from padforge.fabricate.plan import SNAP_MM, areas, overlap, without
@@ -38,25 +37,13 @@ class TriangleMesh:
 
     @classmethod
     def weld(cls, vertices: ArrayLike, triangles: ArrayLike) -> "TriangleMesh":
-        """Build a mesh: merge equal vertices, and drop triangles with two equal corners.
+        """Build a mesh from vertices (n, 3), mm, and triangles (m, 3) of vertex indices.
 
-        Args:
-            vertices: (n, 3), mm.
-            triangles: (m, 3) vertex indices.
-
-        Raises:
-            InputError: vertices that are not finite, or indices out of range.
+        Equal vertices are merged, and triangles with two equal corners dropped.
         """
-        points = check_array("vertices", vertices) + 0.0  # turns -0 into 0
-        indices = check_array("triangles", triangles)
-        for name, rows, array in (("vertices", "n", points), ("triangles", "m", indices)):
-            if array.ndim != 2 or array.shape[1] != 3:
-                raise InputError(f"{name} have shape {array.shape}, expected ({rows}, 3)")
-        if not ((indices >= 0) & (indices < len(points)) & (indices == np.trunc(indices))).all():
-            extremes = f"{indices.min():g} to {indices.max():g}"
-            raise InputError(f"triangles hold {extremes}, allowed are numbers of {len(points)} vertices")
+        points = np.asarray(vertices, np.float64) + 0.0  # turns -0 into 0
         unique, index = np.unique(points[:, ::-1], axis=0, return_inverse=True)
-        corners = index.ravel()[indices.astype(np.int64)]
+        corners = index.ravel()[np.asarray(triangles, np.int64)]
         return cls(unique[:, ::-1], corners[(corners != np.roll(corners, 1, axis=1)).all(axis=1)])
 
     @cached_property

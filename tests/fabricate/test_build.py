@@ -25,7 +25,7 @@ from padforge.fabricate.mesh import BODY_COLOURS
 from padforge.fabricate.mould import Body, Prism
 from padforge.fabricate.settings import DEFAULTS, DispenserSettings
 from tests.fabricate.planted import level_pad, with_settings
-from tests.helpers.less import small_pictures
+from tests.helpers.less import blank_pictures, small_pictures
 
 PAD = Morphology.random(1, 2, seed=7)
 FILES = {
@@ -35,6 +35,11 @@ FILES = {
     *("laying.gcode", "toolpath.svg"),
 }
 SETTINGS = with_settings({"lid": True, "pins": True, "conductive": True, "holder": True})
+
+
+@pytest.fixture(autouse=True)
+def _blank(monkeypatch):
+    blank_pictures(monkeypatch)
 
 
 @pytest.fixture(scope="module")
@@ -56,6 +61,7 @@ def test_build_writes_all_files_with_their_digests_and_no_others(built):
 @pytest.mark.slow
 def test_build_is_reproducible_to_the_byte(built, tmp_path, monkeypatch):
     out, _ = built
+    monkeypatch.undo()
     small_pictures(monkeypatch)
     build(PAD, tmp_path / "again", tuple(FORMATS), SETTINGS)
     for name in FILES:

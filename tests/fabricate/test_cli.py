@@ -9,7 +9,7 @@ from padforge.design.common.validation import InputError
 from padforge.design.morphology import Morphology
 from padforge.fabricate.cli import fabricate, mould_lines
 from tests.fabricate.planted import level_pad
-from tests.helpers.less import small_pictures
+from tests.helpers.less import blank_pictures
 
 FILES = {"mould.stl", "tracks.svg", "fabrication.json", "laying.md", "orientation.svg"}
 
@@ -18,6 +18,7 @@ FILES = {"mould.stl", "tracks.svg", "fabrication.json", "laying.md", "orientatio
 def elsewhere(tmp_path_factory, monkeypatch):
     """Run in an empty folder, since a pad.toml in the current one is taken for the settings."""
     monkeypatch.chdir(tmp_path_factory.mktemp("elsewhere"))
+    blank_pictures(monkeypatch)
 
 
 @pytest.fixture
@@ -96,8 +97,7 @@ def test_the_spec_shapes_the_mould(morphology, tmp_path):
     assert set(document["provenance"]["inputs"]) == {"morphology.json", "pad.toml"}
 
 
-def test_check_draws_a_picture_of_the_findings(morphology, tmp_path, monkeypatch):
-    small_pictures(monkeypatch)
+def test_check_draws_a_picture_of_the_findings(morphology, tmp_path):
     (tmp_path / "pad.toml").write_text("[printer]\nnozzle_mm = 0.6\n", encoding="utf-8")
     picture = tmp_path / "findings.png"
     assert invoke("check", morphology, "--picture", picture, "--spec", tmp_path / "pad.toml").exit_code == 1

@@ -91,21 +91,16 @@ class TestFibres:
         assert (finding.status, finding.limit) == (status, limit)
 
     @pytest.mark.parametrize(("rise", "status", "leads"), [(0.5, "pass", "one side"), (0.6, "fail", "edges")])
-    def test_lead_kinks_above_half_a_radian(self, rise, status, leads):
+    def test_fibre_bend_at_a_lead_fails_above_half_a_radian(self, rise, status, leads):
         """A straight climb from the left end of the horizontal on; leads begin straight."""
         at = np.array([0, 0.4, 0.8, 1.4, 2])
         climb = np.stack([at, 1 + rise * np.array([0, 0.4, 0.8, 0, 0])], axis=1)
         pad = Morphology(np.stack([climb, np.stack([np.ones(5), at], axis=1)]), 11.25)
-        kinks, bends = (find(pad, name, with_settings(pad={"leads": leads})) for name in ("lead_kinks", "fibre_bend"))
-        angle = np.arctan(rise)
-        assert (kinks.status, bends.status) == (status, status)
-        assert kinks.measured == pytest.approx(np.degrees(angle))
-        assert kinks.limit == pytest.approx(np.degrees(0.5))
-        assert kinks.message.endswith("; fibre 1")
-        assert bends.measured == pytest.approx(min(0.5 / angle, 1.0), rel=2e-3)
-        if status == "fail":
-            assert len(kinks.positions_mm) == len(bends.positions_mm) == 1
-            assert kinks.positions_mm[0] == pytest.approx((-11.25, 0))
+        bends = find(pad, "fibre_bend", with_settings(pad={"leads": leads}))
+        assert bends.status == status
+        assert bends.measured == pytest.approx(min(0.5 / np.arctan(rise), 1.0), rel=2e-3)
+        assert len(bends.positions_mm) == (status == "fail")
+        if bends.positions_mm:
             assert bends.positions_mm[0] == pytest.approx((-11.25, 0), abs=0.02)
 
     def test_fibre_bend_includes_leads(self):
@@ -282,7 +277,6 @@ def test_messages_of_findings_have_their_lengths_in_mm():
         "same_family_crossings": "0 crossings of fibres of one family",
         "cover": "4.2 mm of silicone lie beyond the deepest tracks",
         "fibre_bend": "no fibre bends below 1 mm, in the mean over 0.5 mm",
-        "lead_kinks": "fibres meet their leads at corners of 0.0 degrees at most, allowed are 28.6; fibre 1",
         "numbers": "every number has room",
     }
     assert {name: messages[name] for name in expected} == expected
