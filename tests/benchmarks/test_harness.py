@@ -18,6 +18,7 @@ from padforge.benchmarks.harness import (
 )
 from padforge.design.common.progress import ignore_progress
 from padforge.design.common.validation import InputError
+from tests.helpers.less import blank_pictures
 
 
 def bench(error=0.1, work=lambda: None, name="x"):
@@ -39,6 +40,7 @@ def document(seconds=1.0, error=0.1, visited=0.25, pace=1e-3, way="ours"):
 def _quick(monkeypatch):
     monkeypatch.setattr(harness, "BUDGET_S", 0)
     monkeypatch.setattr(harness.time, "sleep", lambda seconds: None)
+    blank_pictures(monkeypatch)
 
 
 def test_measure_round_repeats_requested_trials_and_evaluates_once(monkeypatch):

@@ -12,7 +12,7 @@ from padforge.sense.recording.run_directory import Recorder
 from tests.helpers.door import called, refused
 from tests.helpers.less import blank_pictures
 
-SMALL = "[pad]\ngrid = 2\n[search]\nknots = 2\nstarts = 1\nsteps = 5\nmax_failures = 1\n[rules]\nenforce = false\n"
+SMALL = "[pad]\ngrid = 1\n[search]\nknots = 1\nstarts = 1\nsteps = 2\nmax_failures = 1\n[rules]\nenforce = false\n"
 DESIGN = "design --out pad"
 
 
@@ -26,7 +26,7 @@ def designed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("designed")
     (folder / "pad.toml").write_text(SMALL)
     assert called(*DESIGN.split(), cwd=folder).code == 0
-    Morphology.straight(2).save(folder / "other.json")
+    Morphology.straight(1).save(folder / "other.json")
     assert called("design", "show", "other.json", "--out", "plan.svg", cwd=folder).code == 0
     return folder
 

@@ -95,7 +95,6 @@ def test_run_without_resume_reuses_nothing(folder: Path, monkeypatch: pytest.Mon
     ("old", "new", "kept", "others"),
     [
         ("epochs = 4", "epochs = 5", "design, mould, recording, contacts", set()),
-        ("presses = 60", "presses = 70", "design, mould, contacts", {"recording"}),
         ("[rig]", "[mould]\nwall_mm = 3\n[rig]", "design, recording, contacts, calibration", {"mould.stl"}),
     ],
 )

