@@ -25,7 +25,7 @@ from padforge.fabricate.mesh import BODY_COLOURS
 from padforge.fabricate.mould import Body, Prism
 from padforge.fabricate.settings import DEFAULTS, DispenserSettings
 from tests.fabricate.planted import level_pad, with_settings
-from tests.helpers.less import blank_pictures, small_pictures
+from tests.helpers.less import small_pictures
 
 PAD = Morphology.random(1, 2, seed=7)
 FILES = {
@@ -35,11 +35,6 @@ FILES = {
     *("laying.gcode", "toolpath.svg"),
 }
 SETTINGS = with_settings({"lid": True, "pins": True, "conductive": True, "holder": True})
-
-
-@pytest.fixture(autouse=True)
-def _blank(monkeypatch):
-    blank_pictures(monkeypatch)
 
 
 @pytest.fixture(scope="module")

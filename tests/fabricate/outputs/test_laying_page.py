@@ -23,7 +23,6 @@ from padforge.fabricate.outputs.laying_page import (
 from padforge.fabricate.plan import Plan
 from padforge.fabricate.settings import DEFAULTS, FabricationSettings, MouldSettings, PrinterSettings
 from tests.fabricate.planted import exact_fibre, level_pad, with_settings
-from tests.helpers.less import blank_pictures
 
 
 def fabrication_document(plan: Plan, findings: tuple[dict, ...] = ()) -> dict:
@@ -71,8 +70,7 @@ def test_silicone_fills_straight_pad(draft_deg):
     assert mixed["part_a_g"] == pytest.approx(10 * mixed["part_b_g"], abs=0.06)
 
 
-def test_silicone_ignores_pins_and_grows_with_thickness(tmp_path, monkeypatch):
-    blank_pictures(monkeypatch)
+def test_silicone_ignores_pins_and_grows_with_thickness(tmp_path):
     pad = Morphology.straight(2)
     settings = [with_settings({"pins": pins}, silicone={"shrinkage": 0.04}) for pins in (True, False)]
     pinned, plain = (build(pad, tmp_path, [], each) for each in settings)

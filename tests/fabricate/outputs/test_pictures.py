@@ -59,9 +59,9 @@ def faces_of(figure: Figure) -> tuple[np.ndarray, list[str]]:
     return corners, [to_hex(colour) for colour in np.asarray(faces.get_facecolor())]
 
 
-def colour_at(figure: Figure, x: float, y: float) -> str:
+def colour_at(faces: tuple[np.ndarray, list[str]], x: float, y: float) -> str:
     """Return the colour of the uppermost triangle at a position, mm."""
-    corners, colours = faces_of(figure)
+    corners, colours = faces
     (a, b, c), point = np.moveaxis(corners, 1, 0), np.array([x, y])
     cross = [
         u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0] for u, v in ((b - a, point - a), (c - b, point - b), (a - c, point - c))
@@ -74,23 +74,24 @@ def test_mould_picture_has_colours_by_family_and_height(tmp_path, figures):
     mould = {"wall_draft_deg": 10.0, "ridge_draft_deg": 8.0, "pins": True}
     plan = Plan(level_pad(1.8, 1.2), with_settings(mould, pad={"keep_out_mm": [[[8, 8], [9, 8], [9, 9], [8, 9]]]}))
     draw_mould(plan, *mesh_of(plan), [], tmp_path / "mould.png")
+    faces = faces_of(figures[0])
     for layer in fibre_layers(plan):
         for fibre in layer.fibres:
             ahead = plan.lines[fibre].interpolate(1.0)  # in the exit, where no ridge crosses
-            assert colour_at(figures[0], ahead.x, ahead.y) == layer.colour
+            assert colour_at(faces, ahead.x, ahead.y) == layer.colour
     digits = [number for number in plan.numbers if number is not None]
-    assert colour_at(figures[0], *digits[0].representative_point().coords[0]) == "#8a867d"
-    assert colour_at(figures[0], 0.0, -14.0) == PAPER
+    assert colour_at(faces, *digits[0].representative_point().coords[0]) == "#8a867d"
+    assert colour_at(faces, 0.0, -14.0) == PAPER
     edge = plan.tray.bounds[2] - 0.5
     for position in ((edge, 1.0), (8.5, 8.5)):
-        assert colour_at(figures[0], *position) == FAINT
+        assert colour_at(faces, *position) == FAINT
 
 
 def test_mesh_picture_has_upper_faces_on_top(tmp_path, figures):
     """A roof that rises along x, from 0 to 10, under a small plate at 7 in its upper left corner."""
     vertices = [[0, 0, 0], [10, 0, 10], [10, 10, 10], [0, 10, 0], [1, 7, 7], [3, 7, 7], [3, 9, 7], [1, 9, 7.0]]
     draw_findings(vertices, [[4, 5, 6], [4, 6, 7], [0, 1, 2], [0, 2, 3]], [], tmp_path / "mesh.png")
-    plate, roof = colour_at(figures[0], 2, 8), colour_at(figures[0], 2, 3)
+    plate, roof = (colour_at(faces_of(figures[0]), 2, y) for y in (8, 3))
     assert sum(bytes.fromhex(plate[1:])) < sum(bytes.fromhex(roof[1:]))  # the ramp darkens with height
     assert figures[0].axes[0].get_xlim() == (0, 10)
 
