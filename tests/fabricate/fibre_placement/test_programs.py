@@ -129,6 +129,10 @@ def test_toolpath_picture_shows_every_fibre_with_its_number_turn_and_depth(tmp_p
         assert (path < (x_max, y_max)).all()
     turns = [word for turn, each in enumerate(strokes, 1) for word in (f"{each.fibre + 1}", f"{turn}.")]
     assert [text.get_text() for text in axes.texts] == turns
+    ends = [end for stroke in strokes for end in stroke.positions_mm[[0, -1]]]
+    for text, end in zip(axes.texts, ends, strict=True):  # 2.5 mm beyond its end of the fibre
+        assert np.hypot(*(text.get_position() - end)) == pytest.approx(2.5)
+        assert np.hypot(*text.get_position()) > np.hypot(*end)
     travels = [np.array(line.get_xydata()) for line in axes.lines if line.get_label() == "travel"]
     for travel, before, after in zip(travels, strokes[:-1], strokes[1:], strict=True):
         assert travel == pytest.approx(np.array([before.positions_mm[-1], after.positions_mm[0]]))
