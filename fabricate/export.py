@@ -33,13 +33,13 @@ from padforge.fabricate.checks import Finding, check_result
 from padforge.fabricate.checks.mesh_checks import SOLID_CHECKS, check_solid, check_triangles
 from padforge.fabricate.checks.plan_checks import check_plan
 from padforge.fabricate.checks.surface import TriangleMesh
-from padforge.fabricate.fibre_placement import Step, check_toolpath, gcode, plan_toolpath, urscript
+from padforge.fabricate.fibre_placement import Step, check_toolpath, gcode, plan_toolpath
 from padforge.fabricate.materials import PLASTICS
 from padforge.fabricate.mesh import build_mesh, mesh_arrays, write_3mf, write_stl
 from padforge.fabricate.mould import Body, bed_frame, lid_holes, printed_bodies, sizes
-from padforge.fabricate.outputs.drawings import ORIENTATION_FILE, orientation_svg, toolpath_svg, tracks_dxf, tracks_svg
+from padforge.fabricate.outputs.drawings import ORIENTATION_FILE, tracks_dxf, tracks_svg
 from padforge.fabricate.outputs.laying_page import laying_document, laying_page, pad_document
-from padforge.fabricate.outputs.pictures import draw_mould, draw_tracks
+from padforge.fabricate.outputs.pictures import draw_mould, draw_orientation, draw_toolpath, draw_tracks
 from padforge.fabricate.plan import Plan
 from padforge.fabricate.settings import DEFAULTS, FabricationSettings
 
@@ -159,6 +159,11 @@ def _write_body_3mf(fabrication: Fabrication, body: PrintedBody, path: Path) -> 
     write_3mf(path, body.vertices, body.triangles, name=body.name, title=title, material=material)
 
 
+def _draw_mould_png(fabrication: Fabrication, path: Path) -> None:
+    mould = fabrication.bodies[0]
+    draw_mould(fabrication.plan.shrinkage_compensated, mould.vertices, mould.triangles, fabrication.findings, path)
+
+
 def _write_cad(fabrication: Fabrication, path: Path) -> None:
     from padforge.fabricate.cad.model import assemble
     from padforge.fabricate.cad.step_file import write_step
@@ -186,14 +191,6 @@ def _check_cad(fabrication: Fabrication) -> list[Finding]:
     return [check_result("cad_solid", True, measured, limit, message)]
 
 
-def _program(file: str, language: Callable[[Plan, Sequence[Step]], str]) -> dict[str, Callable[..., None]]:
-    """Return the files of a program: with it comes a drawing of the toolpath, the same for all languages."""
-    return {
-        file: lambda f, path: _write_utf8(path, language(f.plan, f.toolpath)),
-        "toolpath.svg": lambda f, path: _write_utf8(path, toolpath_svg(f.plan, f.toolpath)),
-    }
-
-
 FORMATS: dict[str, Mapping[str, Callable[..., None]]] = {
     "stl": {"*.stl": lambda _, body, path: write_stl(path, body.vertices, body.triangles)},
     "3mf": {"*.3mf": _write_body_3mf},
@@ -202,11 +199,13 @@ FORMATS: dict[str, Mapping[str, Callable[..., None]]] = {
     "svg": {"tracks.svg": lambda f, path: _write_utf8(path, tracks_svg(f.plan.shrinkage_compensated))},
     "dxf": {"tracks.dxf": lambda f, path: _write_utf8(path, tracks_dxf(f.plan.shrinkage_compensated))},
     "png": {
-        "mould.png": lambda f, path: draw_mould(f.plan.shrinkage_compensated, f.findings, path),
+        "mould.png": _draw_mould_png,
         "tracks.png": lambda f, path: draw_tracks(f.plan.shrinkage_compensated, path),
     },
-    "gcode": _program("laying.gcode", gcode),
-    "urscript": _program("laying.script", urscript),
+    "gcode": {
+        "laying.gcode": lambda f, path: _write_utf8(path, gcode(f.plan, f.toolpath)),
+        "toolpath.svg": lambda f, path: draw_toolpath(f.plan, f.toolpath, path),
+    },
 }
 """Writers of the files of every format, called with the fabrication, the body where the name has "*", and the path."""
 
@@ -263,7 +262,7 @@ def build(
         if "mould.step" in writers:
             fabrication.findings.extend(_check_cad(fabrication))
     result = _compile_build(fabrication, list(writers), origin)
-    writers[ORIENTATION_FILE] = partial(_write_utf8, text=orientation_svg(plan))
+    writers[ORIENTATION_FILE] = partial(draw_orientation, plan)
     writers["laying.md"] = partial(_write_utf8, text=laying_page(result.to_dict()))
     return _write_files(out, writers, result)
 
@@ -278,7 +277,7 @@ def _check_bodies(plan: Plan, bodies: Sequence[PrintedBody]) -> list[Finding]:
     by_body = [check_triangles(mould.vertices, mould.triangles, plan.settings.printer, genus=0, has_plan=True)]
     for body in others:
         genus = lid_holes(plan) if body.name == "lid" else 0
-        by_body.append(check_solid(TriangleMesh.weld(body.vertices, body.triangles), genus, is_built=True))
+        by_body.append(check_solid(TriangleMesh.weld(body.vertices, body.triangles), genus))
     for body, findings in zip(bodies, by_body, strict=True):
         if broken := [f.message for f in findings if f.name in SOLID_CHECKS and f.status == "fail"]:
             raise InputError(f"{body.name}: no closed solid ({'; '.join(broken)}); nothing was written")
@@ -289,16 +288,13 @@ def _choose_writers(
     fabrication: Fabrication, formats: Sequence[Mapping[str, Callable[..., None]]]
 ) -> dict[str, Callable[[Path], None]]:
     """Return the writer of each file, those of the bodies first."""
-    writers = {}
     files = [item for export in formats for item in export.items()]
-    for body, (file, write) in product(fabrication.bodies, files):
-        if "*" in file:
-            writers[file.replace("*", body.name)] = partial(write, fabrication, body)
-    for file, write in files:
-        if "*" not in file:
-            writers.pop(file, None)  # a drawing that several programs share comes after the last of them
-            writers[file] = partial(write, fabrication)
-    return writers
+    by_body = {
+        file.replace("*", body.name): partial(write, fabrication, body)
+        for body, (file, write) in product(fabrication.bodies, files)
+        if "*" in file
+    }
+    return by_body | {file: partial(write, fabrication) for file, write in files if "*" not in file}
 
 
 def _compile_build(fabrication: Fabrication, files: list[str], origin: Mapping[str, Any]) -> Build:

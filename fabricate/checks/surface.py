@@ -13,11 +13,9 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from shapely.geometry.base import BaseGeometry
 
-from padforge.design.common.compilation import inner_kernel, kernel
-from padforge.design.common.validation import InputError, check_array
 from padforge.design.morphology import Array
-from padforge.fabricate.mesh import MAX_COORDINATE_MM, Numbers
-from padforge.fabricate.plan import areas, overlap, without
+from padforge.fabricate.mesh import Numbers
+from padforge.fabricate.plan import SNAP_MM, areas, overlap, without
 
 FaceMask = NDArray[np.bool_]
 Shapes = NDArray[np.object_]
@@ -39,25 +37,13 @@ class TriangleMesh:
 
     @classmethod
     def weld(cls, vertices: ArrayLike, triangles: ArrayLike) -> "TriangleMesh":
-        """Build a mesh: merge equal vertices, and drop triangles with two equal corners.
+        """Build a mesh from vertices (n, 3), mm, and triangles (m, 3) of vertex indices.
 
-        Args:
-            vertices: (n, 3), mm.
-            triangles: (m, 3) vertex indices.
-
-        Raises:
-            InputError: vertices beyond MAX_COORDINATE_MM, or indices out of range.
+        Equal vertices are merged, and triangles with two equal corners dropped.
         """
-        points = check_array("vertices", vertices, MAX_COORDINATE_MM) + 0.0  # turns -0 into 0
-        indices = check_array("triangles", triangles)
-        for name, rows, array in (("vertices", "n", points), ("triangles", "m", indices)):
-            if array.ndim != 2 or array.shape[1] != 3:
-                raise InputError(f"{name} have shape {array.shape}, expected ({rows}, 3)")
-        if not ((indices >= 0) & (indices < len(points)) & (indices == np.trunc(indices))).all():
-            extremes = f"{indices.min():g} to {indices.max():g}"
-            raise InputError(f"triangles hold {extremes}, allowed are numbers of {len(points)} vertices")
+        points = np.asarray(vertices, np.float64) + 0.0  # turns -0 into 0
         unique, index = np.unique(points[:, ::-1], axis=0, return_inverse=True)
-        corners = index.ravel()[indices.astype(np.int64)]
+        corners = index.ravel()[np.asarray(triangles, np.int64)]
         return cls(unique[:, ::-1], corners[(corners != np.roll(corners, 1, axis=1)).all(axis=1)])
 
     @cached_property
@@ -141,96 +127,15 @@ class TriangleMesh:
         _, first = np.unique(labels[order], return_index=True)
         return self.centroids[faces[order[first]], :2]
 
-    def find_self_intersections(self, max_pairs: int) -> Numbers:
-        """Find triangles that penetrate each other by more than `PENETRATION_MM` or overlap in one plane.
-
-        Args:
-            max_pairs: number of pairs after which the search ends; m triangles in a heap may have m² / 2.
-
-        Returns:
-            Pairs of triangle indices, (k, 2).
-        """
-        faces = np.flatnonzero(2 * self.areas > _DEGENERATE_MM * self._longest_sides)
-        low, high = self.corners[faces].min(axis=1), self.corners[faces].max(axis=1)
-        # Sweep along the axis on which the fewest bounding boxes overlap; the axes stay right-handed.
-        overlaps = [np.searchsorted(np.sort(low[:, i]), high[:, i], side="right").sum() for i in range(3)]
-        axes = (np.argmin(overlaps) + np.arange(3)) % 3
-        order = np.argsort(low[:, axes[0]], kind="stable")
-        faces, low, high = faces[order], low[order][:, axes], high[order][:, axes]
-        corners = self.corners[faces][:, :, axes]
-        normals = (self._crosses[faces] / (2 * self.areas[faces, None]))[:, axes]
-        tolerance = _PLANE_ULPS * float(np.finfo(np.float32).eps) * float(np.abs(corners).max(initial=0.0))
-        pairs = np.empty((max_pairs, 2), dtype=np.int64)
-        edges = np.roll(corners, -1, axis=1) - corners
-        corners, edges, normals, low, high = map(np.ascontiguousarray, (corners, edges, normals, low, high))
-        return faces[pairs[: _sweep(corners, edges, normals, low, high, tolerance, pairs)]]
-
-
-PENETRATION_MM = 1e-3  # triangles that penetrate less only touch: a thousand times the rounding of an STL
-_PLANE_ULPS = 4  # distance from a plane, in float32 steps, up to which corners lie in it: the precision of an STL
-_DEGENERATE_MM = 1e-6  # triangles of less height have no plane and no area to intersect
-_PARALLEL = 1e-16  # squared sine below which edges are parallel: their cross product is noise
-
-
-@inner_kernel
-def _project(points: Any, x: float, y: float, z: float) -> tuple[float, float]:
-    """Return the range of the projections of points (3, 3) on an axis, times its length."""
-    a = points[0, 0] * x + points[0, 1] * y + points[0, 2] * z
-    b = points[1, 0] * x + points[1, 1] * y + points[1, 2] * z
-    c = points[2, 0] * x + points[2, 1] * y + points[2, 2] * z
-    return min(a, b, c), max(a, b, c)
-
-
-@inner_kernel
-def _is_separated(a: Any, b: Any, first: Any, second: Any) -> bool:
-    """Return whether a cross product of rows of `first` and `second` separates two triangles but for PENETRATION_MM."""
-    for ux, uy, uz in first:
-        for vx, vy, vz in second:
-            x, y, z = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
-            square = x * x + y * y + z * z
-            if square > _PARALLEL * (ux * ux + uy * uy + uz * uz) * (vx * vx + vy * vy + vz * vz):
-                low_a, high_a = _project(a, x, y, z)
-                low_b, high_b = _project(b, x, y, z)
-                if min(high_a - low_b, high_b - low_a) <= PENETRATION_MM * np.sqrt(square):
-                    return True
-    return False
-
-
-@inner_kernel
-def _penetrate(corners: Any, edges: Any, normals: Any, i: int, j: int, tolerance: float) -> bool:
-    """Return whether triangles i and j penetrate by more than PENETRATION_MM, by the separating axis theorem."""
-    across = True
-    for a, b in ((i, j), (j, i)):
-        x, y, z = normals[a]
-        offset = corners[a, 0, 0] * x + corners[a, 0, 1] * y + corners[a, 0, 2] * z
-        low, high = _project(corners[b], x, y, z)
-        if low - offset >= -tolerance and high - offset <= tolerance:  # coplanar: axes in the plane
-            normal = normals[a : a + 1]
-            separated = _is_separated(corners[i], corners[j], normal, edges[i])
-            return not (separated or _is_separated(corners[i], corners[j], normal, edges[j]))
-        across = across and low - offset < -PENETRATION_MM and high - offset > PENETRATION_MM
-    return across and not _is_separated(corners[i], corners[j], edges[i], edges[j])
-
-
-@kernel
-def _sweep(corners: Any, edges: Any, normals: Any, low: Any, high: Any, tolerance: float, pairs: Any) -> int:
-    """Write the penetrating pairs until `pairs` is full and return their number; triangles sorted by `low[:, 0]`."""
-    count = 0
-    for a in range(len(corners)):
-        for b in range(a + 1, len(corners)):
-            if low[b, 0] > high[a, 0] + tolerance:
-                break
-            possible = True
-            for i in range(3):  # boxes that only touch must both be flat
-                shared = min(high[a, i] - low[b, i], high[b, i] - low[a, i])
-                size = max(high[a, i] - low[a, i], high[b, i] - low[b, i])
-                possible = possible and shared >= -tolerance and (shared > PENETRATION_MM or size <= PENETRATION_MM)
-            if possible and _penetrate(corners, edges, normals, a, b, tolerance):
-                pairs[count, 0], pairs[count, 1] = a, b
-                count += 1
-                if count == len(pairs):
-                    return count
-    return count
+    def cut(self, z: float) -> Array:
+        """Cut the triangles at height `z`, mm: directed segments (k, 2, 2), mm, with the solid on their left."""
+        above = self.corners[:, :, 2] > z
+        next_above, ends = np.roll(above, -1, axis=1), np.roll(self.corners, -1, axis=1)
+        points = []
+        for edges in (above & ~next_above, ~above & next_above):  # one of either in every triangle that is cut
+            start, side = self.corners[edges], ends[edges] - self.corners[edges]
+            points.append((start + ((z - start[:, 2]) / side[:, 2])[:, None] * side)[:, :2])
+        return np.stack(points, axis=1)
 
 
 _MIN_SLABS, _MAX_SLABS = 8, 12  # moulds of up to ten layers are cut between all their horizontal faces
@@ -306,6 +211,24 @@ def cut_solid(solid: Any, z: float) -> BaseGeometry:
     parts = solid.slice(z).decompose()
     rings = [part.to_polygons() for part in parts if not part.is_empty()]
     return shapely.MultiPolygon([shapely.Polygon(outer, holes) for outer, *holes in rings])
+
+
+def find_overlaps(mesh: TriangleMesh, z: float) -> Array:
+    """Find where the solid overlaps itself at height `z`, mm: a position (k, 2), mm, in each such part.
+
+    The outlines of the triangles, solid on the left, wind once around every point of the solid and not at all around
+    others; where they wind twice or backwards, the surface intersects itself.
+    """
+    segments = mesh.cut(z)
+    noded = shapely.union_all(shapely.linestrings(segments), grid_size=SNAP_MM)
+    faces = _drop_specks(shapely.polygonize(shapely.get_parts(noded)))
+    points = shapely.get_coordinates(shapely.point_on_surface(faces))
+    start, side = segments[:, 0], segments[:, 1] - segments[:, 0]
+    x, y = np.moveaxis(points[:, None] - start, 2, 0)
+    is_left = side[:, 0] * y > side[:, 1] * x
+    rises, falls = (y >= 0) & (y < side[:, 1]), (y < 0) & (y >= side[:, 1])
+    winding = (rises & is_left).sum(axis=1) - (falls & ~is_left).sum(axis=1)
+    return points[(winding != 0) & (winding != 1)]
 
 
 def fill_outline(area: BaseGeometry) -> BaseGeometry:

@@ -349,12 +349,11 @@ def _lay_lines(document: Document) -> Iterator[str]:
             sealed = f"{volume_ml:.2f} ml" if entry["number"] == numbers[-1] else ""
             rows.append((step, entry["number"], entry["fibre"], f"{entry['depth_mm']:.3g} mm", *lengths_mm, sealed))
     yield from _table_lines(("step", "number", "fibre", "depth", "in the pad", "cut to", "then seal with"), rows)
-    if programs := [f"`{name}`" for name in document["files"] if name.startswith("laying.")]:
+    if "laying.gcode" in document["files"]:
         yield ""
         yield (
-            "Or let a machine lay them in this order, on the pad turned over: its toolpath is in"
-            f" {' and '.join(programs)} and drawn in `toolpath.svg`. It waits while you fasten and cut each fibre and"
-            " seal each step."
+            "Or let a machine lay them in this order, on the pad turned over: its toolpath is in `laying.gcode` and"
+            " drawn in `toolpath.svg`. It waits while you fasten and cut each fibre and seal each step."
         )
 
 

@@ -1,4 +1,4 @@
-"""Pictures of a mould, of the tracks in its casting, and of any mesh with findings, from above, as PNG files.
+"""Pictures from above of a mould, of tracks and toolpath, of any mesh with findings, and of a pad's orientation.
 
 The same input gives the same bytes; files are small, for some are kept in git.
 """
@@ -6,18 +6,20 @@ The same input gives the same bytes; files are small, for some are kept in git.
 import math
 import textwrap
 from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise, repeat
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import shapely
 from numpy.typing import ArrayLike, NDArray
-from shapely.geometry.base import BaseGeometry
 
 from padforge.design.common.plotting import ALARM, FAINT, INK, PAPER
 from padforge.design.morphology import Array
 from padforge.fabricate.checks import Finding
-from padforge.fabricate.mould import mould_body
-from padforge.fabricate.outputs.drawings import SCALE_MM, orientation_sentence
+from padforge.fabricate.fibre_placement import Step, mirror_x
+from padforge.fabricate.outputs.drawings import ORIENTATION_CAPTION, SCALE_MM, Bounds, orientation_sentence
 from padforge.fabricate.plan import (
     FAMILIES,
     FAMILY_COLOURS,
@@ -29,146 +31,6 @@ from padforge.fabricate.plan import (
     polygon_rings,
 )
 
-Ints = NDArray[np.intp]
-Bounds = tuple[float, float, float, float]
-
-FLOOR, WALL, NUMBER, RIDGE = 0, 1, 2, 3
-"""Classes of pixels of a mould; `RIDGE` + layer index for the ridges of a layer."""
-_MAX_PIXELS = 2_000_000
-"""Pixels of triangles rasterized together: bounds memory at about 200 MB for meshes of any size."""
-_ROUNDING = 1e-6
-"""Pixels by which triangles are enlarged: no pixel between two neighbours is lost to rounding."""
-_MIN_MM = 1e-6
-"""Size of smaller meshes, and slope of steeper walls."""
-_SHADES = 8
-"""Shades on either side of flat: enough for the eye, and small files."""
-
-
-def mould_relief(plan: Plan, width: int, height: int) -> tuple[Array, Ints]:
-    """Rasterize a mould seen from above in pixels of its tray.
-
-    Returns:
-        Heights above the tray's floor, mm, and classes of pixels; shape (height, width).
-    """
-    mould, pixels = plan.settings.mould, (width, height)
-    walls = _rasterize_walls(plan, pixels)
-    walls[_rasterize_area(plan.pillars, plan.tray.bounds, pixels)] = plan.silicone_mm
-    heights = walls.copy()
-    for prism in mould_body(plan).adds:
-        mask = _rasterize_area(prism.area, plan.tray.bounds, pixels)
-        heights[mask] = np.maximum(heights[mask], prism.top_mm - mould.floor_mm)
-    classes = np.where(walls > 0, WALL, FLOOR)
-    raised = (heights > walls) & (heights <= plan.silicone_mm)
-    classes[raised] = NUMBER
-    for layer, height_mm in enumerate(plan.heights_mm):  # taller ridges come later and cover lower ones
-        base = plan.outline(layer, height_mm) if plan.settings.ridge_slope else plan.ridges[layer]
-        classes[raised & _rasterize_area(base, plan.tray.bounds, pixels)] = RIDGE + layer
-    return heights, classes
-
-
-def mesh_relief(vertices: Array, triangles: Ints, pixels: int) -> tuple[Array, Bounds]:
-    """Rasterize the upper surface of any mesh, closed or not, in so many pixels along the longer side.
-
-    Returns:
-        Heights at the pixels' centres in the frame of the mesh, -inf beside it, and their x_min, y_min, x_max, y_max.
-    """
-    low, high = vertices[:, :2].min(axis=0), vertices[:, :2].max(axis=0)
-    scale = pixels / max(float((high - low).max()), _MIN_MM)
-    columns, rows = np.maximum(2, np.ceil((high - low) * scale - _ROUNDING)).astype(int).tolist()  # 2 have a slope
-    corners = np.column_stack([(vertices[:, :2] - low) * scale - 0.5, vertices[:, 2]])[triangles]
-    heights = np.full(rows * columns, -np.inf)
-    # Triangles that are visible from above, a bounded number of pixels at a time
-    a, b = np.moveaxis(corners[:, 1:, :2] - corners[:, :1, :2], 1, 0)
-    area = np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]) / 2
-    visible = area > 0
-    cost = area + np.ptp(corners[..., 1], axis=1) + 1
-    batch = np.cumsum(cost[visible]) // _MAX_PIXELS
-    for part in np.split(corners[visible], np.flatnonzero(np.diff(batch)) + 1):
-        row, column, height = _rasterize_triangles(part, rows, columns)
-        np.maximum.at(heights, row * columns + column, height)
-    x_max, y_max = (low + np.array([columns, rows]) / scale).tolist()
-    return heights.reshape(rows, columns)[::-1], (float(low[0]), float(low[1]), x_max, y_max)
-
-
-def _shade(colours: Array, heights_mm: Array) -> Array:
-    """Shade colours (r, c, 3), 0 to 1, with light from the upper left on heights (r, c); flat areas keep theirs."""
-    from scipy.ndimage import uniform_filter
-
-    # The root sets low steps off from high ones, whose colour would be lost otherwise.
-    eased = uniform_filter(np.sqrt(heights_mm - heights_mm.min(), dtype=np.float32), 3, mode="nearest")
-    down, across = np.gradient(eased)
-    slope = np.rint(_SHADES * np.clip(down + across, -1, 1)) / _SHADES
-    sloping = slope != 0
-    flat, tilt = colours[sloping], slope[sloping, None]
-    shaded = colours.copy()
-    shaded[sloping] = flat + np.where(tilt > 0, 0.6 * tilt * (1 - flat), 0.5 * tilt * flat)
-    return shaded
-
-
-def _rasterize_walls(plan: Plan, pixels: tuple[int, int]) -> Array:
-    """Return the heights of the walls alone, which lean outwards from the outline of the floor."""
-    low, high = np.reshape(plan.tray.bounds, (2, 2))
-    x, y = (a + (np.arange(n) + 0.5) * (b - a) / n for a, b, n in zip(low, high, pixels, strict=True))
-    distance = np.full(pixels[::-1], np.inf)  # from the floor
-    for hollow in (plan.cavity, *plan.exits):
-        x_min, y_min, x_max, y_max = hollow.bounds
-        distance_x, distance_y = np.maximum(x_min - x, x - x_max), np.maximum(y_min - y, y - y_max)[::-1]
-        rows, columns = (np.flatnonzero(side <= plan.flare_mm) for side in (distance_y, distance_x))
-        window = np.ix_(rows, columns)
-        distance[window] = np.minimum(distance[window], np.maximum.outer(distance_y[rows], distance_x[columns]))
-    return plan.silicone_mm * np.clip(distance / max(plan.flare_mm, _MIN_MM), 0, 1)
-
-
-def _rasterize_area(area: BaseGeometry, bounds: Bounds, pixels: tuple[int, int]) -> NDArray[np.bool_]:
-    """Return which pixels of the rectangle `bounds` have their centre in `area`."""
-    (low, high), (width, height) = np.reshape(bounds, (2, 2)), pixels
-    rings = [(ring - low) / (high - low) * pixels - 0.5 for polygon in polygon_rings(area) for ring in polygon]
-    if not rings:
-        return np.zeros((height, width), dtype=bool)
-    # A pixel lies inside if an odd number of edges crosses its row on its left.
-    starts, ends = np.concatenate(rings), np.concatenate([np.roll(ring, -1, axis=0) for ring in rings])
-    edge_rows = np.ceil(np.stack([starts[:, 1], ends[:, 1]])).clip(0, height).astype(np.intp)
-    edge, row = _expand_ranges(edge_rows.min(axis=0), edge_rows.max(axis=0) - 1)
-    (x, y), (to_x, to_y) = starts[edge].T, ends[edge].T
-    column = np.ceil(x + (row - y) * (to_x - x) / (to_y - y)).clip(0, width).astype(np.intp)
-    n_edges = np.bincount(row * (width + 1) + column, minlength=height * (width + 1)).reshape(height, width + 1)
-    return (np.cumsum(n_edges[::-1, :-1], axis=1) % 2).astype(bool)
-
-
-def _rasterize_triangles(corners: Array, rows: int, columns: int) -> tuple[Ints, Ints, Array]:
-    """Return row, column and height of all pixels whose centres lie in triangles (m, 3, 3)."""
-    low, high = corners.min(axis=1), corners.max(axis=1)
-    triangle, row = _expand_ranges(*_covered(low[:, 1], high[:, 1], rows))
-    # The row cuts the sides of the triangle at its first and at its last column.
-    x, y = np.moveaxis(corners[triangle, :, :2], 2, 0)
-    run, rise = np.roll(x, -1, axis=1) - x, np.roll(y, -1, axis=1) - y
-    share = np.divide(row[:, None] - y, rise, out=np.full(rise.shape, np.nan), where=rise != 0)
-    meets = (share >= -_ROUNDING) & (share <= 1 + _ROUNDING)
-    cuts = np.where(meets, x + np.clip(share, 0, 1) * run, np.nan)
-    x_min, x_max = np.fmin.reduce(cuts, axis=1, initial=np.inf), np.fmax.reduce(cuts, axis=1, initial=-np.inf)
-    line, column = _expand_ranges(*_covered(x_min, x_max, columns))
-    triangle, row = triangle[line], row[line]
-    origin, a, b = corners[:, 0], corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
-    normal = np.cross(a, b)
-    tilt = -normal[:, :2] / normal[:, 2:]
-    offset = np.stack([column, row], axis=1) - origin[triangle, :2]
-    height = origin[triangle, 2] + (tilt[triangle] * offset).sum(axis=1)
-    return row, column, np.clip(height, low[triangle, 2], high[triangle, 2])
-
-
-def _covered(start: Array, end: Array, count: int) -> tuple[Ints, Ints]:
-    """Return the first and the last of the pixels 0..count-1 within start..end (n,); last < first for none."""
-    first, last = np.ceil(start - _ROUNDING), np.floor(end + _ROUNDING)
-    return np.clip(first, 0, count).astype(np.intp), np.clip(last, -1, count - 1).astype(np.intp)
-
-
-def _expand_ranges(first: Ints, last: Ints) -> tuple[Ints, Ints]:
-    """Return all integers of the ranges first..last (n,), one range after the other, and before them its index."""
-    lengths = np.maximum(0, last - first + 1)
-    index = np.repeat(np.arange(len(lengths)), lengths)
-    return index, np.arange(len(index)) - np.repeat(np.cumsum(lengths) - lengths - first, lengths)
-
-
 CARE = "#7b3fa0"
 """Colour of warnings: unlike both families, and unlike failures."""
 _NUMBER, _EDGE, _GREY = "#8a867d", "#a7a49c", "#77746c"
@@ -178,8 +40,10 @@ _RAMP = (PAPER, "#a9c4c9", "#4f7f8e", "#24404c")
 _DPI = 100
 PIXELS = 900
 """Longer side of the axes: 14 pixels a mm for the published pad, about six for a ridge."""
-_MIN_WIDTH = 600
-"""Pixels, with room for a title and a legend."""
+_MIN_WIDTH, _MIN_MM = 600, 1e-6
+"""Pixels, with room for a title and a legend; and the size of smaller meshes."""
+_FLAT = 1e-3
+"""Slope above which a face is not flat, and z of the normal below which it is upright."""
 _MARGIN_LEFT, _MARGIN_RIGHT, _MARGIN_TOP, _MARGIN_BOTTOM = 66, 24, 44, 62
 """Pixels for title, ticks and axis labels; the rows of the legend come below."""
 _ROW, _COLUMNS = 21, 3
@@ -190,18 +54,22 @@ _FAIL_MARKS, _WARN_MARKS = "osp8H", "D^v<>"
 """Markers of the first checks that fail or warn; all further ones have a cross."""
 
 
-def draw_mould(plan: Plan, findings: Sequence[Finding], path: Path) -> None:
-    """Write the mould from above as PNG: colour stands for family and height, shade for the slope.
+def draw_mould(plan: Plan, vertices: ArrayLike, triangles: ArrayLike, findings: Sequence[Finding], path: Path) -> None:
+    """Write the mesh of a mould from above as PNG: colour stands for family and height.
 
     Rings mark where a check fails and diamonds where it warns; with more checks come further marks.
+
+    Args:
+        plan: of the mould.
+        vertices: (n, 3), mm.
+        triangles: (m, 3) vertex indices.
+        findings: of the checks.
+        path: of the picture.
     """
-    from matplotlib.colors import to_rgb
     from matplotlib.patches import Patch
 
     x_min, y_min, x_max, y_max = plan.tray.bounds
-    heights, classes = mould_relief(plan, *_count_pixels(plan.tray.bounds))
     layers = fibre_layers(plan)
-    colours = [PAPER, FAINT, _NUMBER, *(layer.colour for layer in reversed(layers))]
     entries = [(PAPER, "floor"), (FAINT, f"wall, {plan.silicone_mm:g} mm")]
     if any(plan.numbers):
         entries.append((_NUMBER, f"mirrored numbers, {plan.settings.mould.shallow_ridge_height_mm:g} mm"))
@@ -211,8 +79,22 @@ def draw_mould(plan: Plan, findings: Sequence[Finding], path: Path) -> None:
     depth_mm = plan.settings.mould.floor_mm + plan.silicone_mm
     title = f"Mould from above, {x_max - x_min:.4g} x {y_max - y_min:.4g} x {depth_mm:.4g} mm"
     picture = _Picture(plan.tray.bounds, title, len(handles) + len(_remarks(findings)))
-    picture.show(_shade(np.array(list(map(to_rgb, colours)))[classes], heights))
+    corners = np.asarray(vertices, dtype=float)[np.asarray(triangles)]
+    picture.show(corners, _mould_colours(plan, corners))
     picture.save(path, [*handles, *picture.mark(findings)])
+
+
+def _mould_colours(plan: Plan, corners: Array) -> NDArray[np.str_]:
+    """Return the colour (m,) of every triangle (m, 3, 3) of a mould: floor, walls, numbers or ridges of a layer."""
+    z = corners[:, :, 2] - plan.settings.mould.floor_mm
+    x, y, height = corners.mean(axis=1).T[0], corners.mean(axis=1).T[1], z.mean(axis=1)
+    is_flat = np.ptp(z, axis=1) < _FLAT
+    raised = is_flat & (height > _FLAT) & (height < plan.silicone_mm - _FLAT)
+    colours = np.where(is_flat & (height <= _FLAT), PAPER, np.where(raised, _NUMBER, FAINT))
+    for layer in reversed(fibre_layers(plan)):  # taller ridges come later and cover lower ones
+        base = plan.outline(layer.index, plan.heights_mm[layer.index])
+        colours[raised & shapely.contains_xy(base, x, y)] = layer.colour
+    return colours
 
 
 def draw_tracks(plan: Plan, path: Path) -> None:
@@ -238,27 +120,32 @@ def draw_tracks(plan: Plan, path: Path) -> None:
 
 
 def draw_findings(vertices: ArrayLike, triangles: ArrayLike, findings: Sequence[Finding], path: Path) -> None:
-    """Write any mesh from above as PNG: colour stands for the height, shade for the slope, marks for findings.
+    """Write any mesh from above as PNG: colour stands for the height, marks for findings.
 
     Vertices (n, 3), mm, are finite, and there is at least one triangle (m, 3).
     """
     from matplotlib.colors import LinearSegmentedColormap
 
-    corners = np.asarray(vertices, dtype=float)
-    heights, bounds = mesh_relief(corners, np.asarray(triangles, dtype=np.intp), PIXELS)
-    mask = np.isfinite(heights)
-    low, high = (float(heights[mask].min()), float(heights[mask].max())) if mask.any() else (0.0, 0.0)
-    heights[~mask] = low
+    points = np.asarray(vertices, dtype=float)
+    corners = points[np.asarray(triangles)]
+    upwards = corners[_normal_z(corners) > _FLAT]
+    z = (upwards if len(upwards) else corners)[:, :, 2]  # the underside is hidden, if the mesh has one
+    low, high, ground = float(z.min()), float(z.max()), float(points[:, 2].min())
     ramp = LinearSegmentedColormap.from_list("heights", _RAMP)
-    colours = _shade(ramp((heights - low) / ((high - low) or 1.0))[..., :3], heights)
-    colours[~mask] = 1
-
-    size = " x ".join(f"{side:.4g}" for side in np.ptp(corners, axis=0))
+    x_min, y_min, x_max, y_max = *points[:, :2].min(axis=0).tolist(), *points[:, :2].max(axis=0).tolist()
+    bounds = (x_min, y_min, max(x_max, x_min + _MIN_MM), max(y_max, y_min + _MIN_MM))
+    size = " x ".join(f"{side:.4g}" for side in np.ptp(points, axis=0))
     picture = _Picture(bounds, f"Mesh from above, {size} mm", len(_remarks(findings)))
-    picture.show(colours)
-    ground = float(corners[:, 2].min())
+    picture.show(corners, ramp((corners[:, :, 2].mean(axis=1) - low) / ((high - low) or 1.0)))
     picture.colour_bar(ramp, f"{low - ground:.3g} mm", f"{high - ground:.3g} mm above the lowest point")
     picture.save(path, picture.mark(findings))
+
+
+def _normal_z(corners: Array) -> Array:
+    """Compute z of the unit normals (m,) of triangles (m, 3, 3); 0 for degenerate ones."""
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    lengths = np.linalg.norm(normals, axis=1)
+    return np.divide(normals[:, 2], lengths, out=np.zeros(len(lengths)), where=lengths > 0)
 
 
 def _draw_layer(picture: "_Picture", plan: Plan, layer: FibreLayer) -> list[Any]:
@@ -283,6 +170,170 @@ def _draw_layer(picture: "_Picture", plan: Plan, layer: FibreLayer) -> list[Any]
                 color=FAMILY_COLOURS[layer.family], fontsize=size, fontweight="bold",
             )  # fmt: skip
     return handles[:1]
+
+
+# Orientation
+
+TURN_DEG = 20.0
+"""Angle of the pad in use under the arm: an example."""
+_WIDTH_MM, _HEIGHT_MM, _HALF_MM = 64.0, 56.0, 21.0
+"""Width and height of a panel, and half the side of the mould in it."""
+_PANELS = (
+    ("1  In the mould", "tracks down, numbers mirrored"),
+    ("2  Turned over, left to right", "tracks up, numbers read right: lay here"),
+    ("3  In use", "tracks up: this face is pressed"),
+)
+_LABEL_MM, _BESIDE_MM = 2.6, 1.2
+"""Text height, and gap between an edge and the number beside it."""
+_SLAB_MM, _TRACK_MM, _FLOOR_MM, _WALL_MM = 6.0, 1.6, 1.5, 2.0
+"""Pad, track, and floor and wall of the mould in the side views, which are not to scale."""
+
+
+@dataclass(frozen=True)
+class _Panel:
+    """A view of the pad from above, its centre at (x, 0) mm, turned over if `mirrored`, then counter-clockwise."""
+
+    x: float
+    scale: float
+    mirrored: bool = False
+    turn_deg: float = 0.0
+
+    def project(self, points: ArrayLike) -> Array:
+        """Return the points (n, 2) on the drawing of points (n, 2) of the plan, mm."""
+        cos, sin = math.cos(math.radians(self.turn_deg)), math.sin(math.radians(self.turn_deg))
+        scaled = self.scale * np.asarray(points) * [-1 if self.mirrored else 1, 1]
+        return (self.x, 0.0) + scaled @ np.array([[cos, sin], [-sin, cos]])
+
+
+def draw_orientation(plan: Plan, path: Path) -> None:
+    """Draw the pad from above and from the near side: in the mould, turned over, and in use under an arm."""
+    scale = _HALF_MM / np.abs(plan.tray.bounds).max()
+    poses = ((False, 0.0), (True, 0.0), (True, TURN_DEG))
+    panels = [_Panel((column + 0.5) * _WIDTH_MM, scale, *pose) for column, pose in enumerate(poses)]
+    bounds = (0.0, -_HEIGHT_MM / 2 - 19, 3 * _WIDTH_MM, _HEIGHT_MM / 2 + 9)
+    sentence = orientation_sentence(plan.pad.layout.counts, plan.settings.pad.leads)
+    picture = _Picture(bounds, ORIENTATION_CAPTION, 0, sentence)
+    picture.axes.set_axis_off()
+    for panel, (title, note) in zip(panels, _PANELS, strict=True):
+        _draw_panel(picture, plan, panel)
+        for row, (text, weight) in enumerate(((title, "bold"), (note, "normal"))):
+            position = panel.x - _WIDTH_MM / 2 + 4, _HEIGHT_MM / 2 + 6 - 4 * row
+            picture.axes.text(*position, text, size=picture.points(_LABEL_MM), weight=weight)
+    _draw_arm(picture, panels[2])
+    _draw_sides(picture, plan, panels)
+    picture.save(path, [])
+
+
+def _draw_panel(picture: "_Picture", plan: Plan, panel: _Panel) -> None:
+    """Draw the pad in a panel with its axes, and every fibre's number outside the pad beside its start."""
+    axes = picture.axes
+    if not panel.mirrored:
+        axes.fill(*panel.project(plan.tray.exterior.coords).T, color=FAINT)
+    for polygon in polygon_rings(plan.silicone):
+        for ring in polygon:
+            axes.fill(*panel.project(ring).T, facecolor=PAPER, edgecolor=_EDGE, linewidth=0.5)
+    for layer in fibre_layers(plan):
+        for fibre in layer.fibres:
+            line = plan.lines[fibre].simplify(0.05)
+            axes.plot(*panel.project(line.coords).T, color=layer.colour, linewidth=1)
+    size = min(_LABEL_MM, 0.6 * plan.min_pitch_mm * panel.scale)
+    edges = (plan.silicone if panel.mirrored else plan.tray).bounds
+    for fibre, (lead, cast) in enumerate(zip(plan.ends(0), plan.numbers or repeat(None), strict=False)):
+        colour = FAMILY_COLOURS[plan.family(fibre)]
+        for outer, *holes in polygon_rings(cast) if cast is not None else ():
+            axes.fill(*panel.project(outer).T, color=colour, gid="cast")
+            for hole in holes:
+                axes.fill(*panel.project(hole).T, color=PAPER)
+        start = lead.turned_mm.copy()
+        start[lead.axis] = edges[lead.axis] - (_BESIDE_MM + size / 2) / panel.scale
+        picture.write(str(fibre + 1), panel.project([start])[0], size, color=colour, weight="bold")
+    length = 0.45 * math.sqrt(math.prod(plan.cavity.bounds[2:]))
+    for axis, tip in zip("xy", np.eye(2) * length, strict=True):
+        start, end, label = panel.project([0 * tip, tip, 1.2 * tip])
+        picture.arrow(start, end)
+        picture.write(axis, label, _LABEL_MM)
+
+
+def _draw_arm(picture: "_Picture", panel: _Panel) -> None:
+    """Draw the axes of the arm's base beside the pad in use, and the pad's angle to them."""
+    corner = np.array([panel.x - _WIDTH_MM / 2 + 4, 2 - _HEIGHT_MM / 2])
+    for axis, tip in zip("xy", 9.0 * np.eye(2), strict=True):
+        picture.arrow(corner, corner + tip)
+        picture.write(axis, corner + 1.2 * tip, _LABEL_MM)
+    picture.write("arm", corner + np.array([4.5, 2.5]), _LABEL_MM)
+    top = 1.25 * _HALF_MM
+    picture.axes.plot([panel.x] * 2, [0, top], ":", color=INK, linewidth=0.8)
+    picture.write("pad_angle_deg", (panel.x + 10, top), _LABEL_MM)
+
+
+def _draw_sides(picture: "_Picture", plan: Plan, panels: Sequence[_Panel]) -> None:
+    """Draw cross-sections of all panels at the near side, where fibres start; heights are not to scale."""
+    top = -_HEIGHT_MM / 2 - 6
+    bottom, half = top - _SLAB_MM, plan.cavity.bounds[2] * panels[0].scale
+    floor = bottom - _FLOOR_MM
+
+    def box(x: float, y: float, width: float, height: float, colour: str) -> None:
+        corners = [(x, y), (x + width, y), (x + width, y + height), (x, y + height)]
+        picture.axes.fill(*np.transpose(corners), facecolor=colour, edgecolor=_EDGE, linewidth=0.5)
+
+    box(panels[0].x - half - _WALL_MM, floor, 2 * (half + _WALL_MM), top - floor, FAINT)
+    size = min(_LABEL_MM, 0.6 * plan.min_pitch_mm * panels[0].scale)
+    starts = [(fibre, lead.turned_mm[0]) for fibre, lead in enumerate(plan.ends(0)) if lead.axis == 1]
+    for panel, y, colour in zip(panels, (bottom, *[top - _TRACK_MM] * 2), (FAINT, "white", ""), strict=True):
+        box(panel.x - half, bottom, 2 * half, _SLAB_MM, PAPER)
+        for fibre, x_mm in starts:
+            x = panel.x + (-x_mm if panel.mirrored else x_mm) * panel.scale
+            family = FAMILY_COLOURS[plan.family(fibre)]
+            box(x - 0.4, y, 0.8, _TRACK_MM, colour or family)
+            picture.write(str(fibre + 1), (x, floor - size), size, color=family)
+    x = panels[2].x
+    turn = np.linspace(np.pi, 2 * np.pi, 20)
+    probe = np.column_stack([x + 2 * np.cos(turn), top + 2 + 2 * np.sin(turn)])
+    picture.axes.fill(*np.vstack([(x - 2, top + 5), probe, (x + 2, top + 5)]).T, color=INK)
+    picture.axes.plot([x - half - 6, x + half + 6], [bottom] * 2, color=INK, linewidth=1.2)
+
+
+# Toolpath
+
+
+def draw_toolpath(plan: Plan, steps: Sequence[Step], path: Path) -> None:
+    """Draw the toolpath of the needle on the pad turned over, and the order of the fibres.
+
+    A ring with the fibre's number marks where it is fastened, a dot with its turn where it is cut. Travel moves above
+    the pad are dashed, and the needle's box is red.
+    """
+    strokes, dispenser = [stroke for step in steps for stroke in step.strokes], plan.settings.dispenser
+    points = np.vstack([stroke.positions_mm for stroke in strokes])
+    (x_min, y_min), (x_max, y_max) = (points.min(axis=0) - 6).tolist(), (points.max(axis=0) + 6).tolist()
+    note = (
+        "The pad lies turned over, tracks up, seen from above. Ring: number of the fibre, fasten it. Dot: its turn, cut"
+        f" it. Dashed: at z = {dispenser.travel_height_mm:g} mm. Red: the needle's box."
+    )
+    picture = _Picture((x_min, y_min, x_max, y_max), "The needle's toolpath, from above", len(steps), note)
+    axes = picture.axes
+    for ring in (ring for polygon in polygon_rings(plan.silicone) for ring in polygon):
+        axes.fill(*mirror_x(ring).T, facecolor="none", edgecolor=_EDGE, linewidth=0.8)
+    (x0, x1), (y0, y1) = np.reshape(dispenser.box_mm[:4], (2, 2)) - np.reshape(dispenser.origin_mm, (2, 1))
+    axes.plot([x0, x1, x1, x0, x0], [y0, y0, y1, y1, y0], color=ALARM, linewidth=1.6, label="box")
+    axes.plot(0, 0, "+", color=INK, ms=12)
+    for cut, fastened in pairwise(strokes):
+        ends = np.array([cut.positions_mm[-1], fastened.positions_mm[0]])
+        axes.plot(*ends.T, "--", color=FAINT, linewidth=0.8, label="travel")
+    handles = []
+    for number, step in enumerate(steps, 1):
+        depth, z = f"{step.layer.depth_mm:.3g} mm deep", round(step.strokes[0].z_mm, 3)
+        label = f"{number}. {FAMILIES[step.layer.family]}, {depth}, z = {z:g} mm"
+        style = {"color": step.layer.colour, "linewidth": 1.2, "label": label}
+        lines = [axes.plot(*stroke.positions_mm.T, **style)[0] for stroke in step.strokes]
+        handles.append(lines[0])
+    for turn, stroke in enumerate(strokes, 1):
+        start, end = stroke.positions_mm[[0, -1]]
+        before, after = (2.5 * mirror_x(lead.outward) for lead in plan.leads.pairs[stroke.fibre])
+        axes.plot(*start, "o", mfc="none", mec=INK, ms=6)
+        axes.plot(*end, "o", color=INK, ms=3)
+        picture.write(str(stroke.fibre + 1), start + before, 2.5)
+        picture.write(f"{turn}.", end + after, 2.5)
+    picture.save(path, handles)
 
 
 def _remarks(findings: Sequence[Finding]) -> list[Finding]:
@@ -318,9 +369,16 @@ class _Picture:
         x_min, x_max, *_ = self.extent
         return length_mm * self.pixels[0] / (x_max - x_min) * 72 / _DPI
 
-    def show(self, colours: Array) -> None:
-        """Fill the axes with colours (rows, columns, 3), 0 to 1."""
-        self.axes.imshow(colours, extent=self.extent, interpolation="nearest", aspect="auto")
+    def show(self, corners: Array, colours: ArrayLike) -> None:
+        """Draw triangles (m, 3, 3), mm, from above in their colours (m,), and upright ones as lines."""
+        from matplotlib.collections import PolyCollection
+        from matplotlib.colors import to_rgba_array
+
+        faces = to_rgba_array(colours)
+        edges = np.where(np.abs(_normal_z(corners))[:, None] < _FLAT, to_rgba_array(_EDGE), faces)
+        order = np.argsort(corners[:, :, 2].mean(axis=1), kind="stable")  # painter's algorithm: the lowest first
+        style = {"facecolors": faces[order], "edgecolors": edges[order], "linewidths": 0.3}
+        self.axes.add_collection(PolyCollection(list(corners[order, :, :2]), **style), autolim=False)
 
     def mark(self, findings: Sequence[Finding]) -> list[Any]:
         """Mark the positions of the findings that fail or warn; return the legend's entries."""
@@ -334,6 +392,17 @@ class _Picture:
             self.axes.plot(*positions, mec="white", mew=3.4, **style)  # sets the mark off from its background
             handles += self.axes.plot(*positions, mec=colour, mew=1.5, label=label, **style)
         return handles
+
+    def write(self, text: str, position: Sequence[float] | Array, height_mm: float, **style: Any) -> None:
+        """Write a text centred at a position, mm."""
+        x, y = position
+        self.axes.text(x, y, text, **{"size": self.points(height_mm), "ha": "center", "va": "center", **style})
+
+    def arrow(self, start: Array, end: Array) -> None:
+        """Draw an arrow with a white rim, which sets it off from its background."""
+        for colour, width in (("white", 3.5), (INK, 1.2)):
+            style = {"arrowstyle": "->", "color": colour, "linewidth": width, "shrinkA": 0, "shrinkB": 0}
+            self.axes.annotate("", (end[0], end[1]), (start[0], start[1]), arrowprops=style)
 
     def scale_bar(self) -> None:
         """Draw a scale bar under the lower right corner."""

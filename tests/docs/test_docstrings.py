@@ -7,7 +7,9 @@ from pathlib import Path
 from typing import Any
 
 import griffe
+import pytest
 
+pytestmark = pytest.mark.slow
 ROOT = Path(__file__).parents[2]
 
 

@@ -28,6 +28,8 @@ from unittest.mock import patch
 
 import pytest
 
+from padforge.design.objectives import bayes_error
+from padforge.design.optimize import problem
 from padforge.sense.health import trace_model
 from tests.docs.pages import BLOCK, ROOT, command_lines, relative
 from tests.helpers.door import Ended, called
@@ -48,7 +50,7 @@ BASES = {
 """Pages that are run, and the page that each continues."""
 REWRITE = "REWRITE_DOCS" in os.environ
 SHORTER = 1 if REWRITE else 10
-"""What finds faults learns for this share of its time, which no page shows."""
+"""What finds faults learns for this share of its time, which no page shows; so do searches whose numbers may vary."""
 SECONDS = re.compile(r"(?<![\w.])\d+(\.\d+)? s\b")
 NUMBER = re.compile(r"(?<![\w.])-?\d+(?:\.\d+)?(?:e-?\d+)?")
 OUTPUT = re.compile(r"\s*```text\n(.*?)^```$", re.MULTILINE | re.DOTALL)
@@ -236,8 +238,13 @@ def run(commands: str, folder: Path, code: int) -> str:
 
 def run_padforge(words: list[str], folder: Path) -> Ended:
     """Run padforge in this process, which has all libraries loaded."""
-    steps = patch.object(trace_model, "MAX_STEPS", trace_model.MAX_STEPS // SHORTER)
-    with patch.dict(os.environ, COLUMNS="80"), steps:
+    share = SHORTER if "--twin" in words or words[:2] == ["design", "compare"] else 1
+    with (
+        patch.dict(os.environ, COLUMNS="80"),
+        patch.object(trace_model, "MAX_STEPS", trace_model.MAX_STEPS // SHORTER),
+        patch.dict(problem.STEPS, {contact: steps // share for contact, steps in problem.STEPS.items()}),
+        patch.object(bayes_error, "PRESSES", bayes_error.PRESSES // share),
+    ):
         return called(*words, cwd=folder)
 
 

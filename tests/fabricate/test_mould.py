@@ -8,7 +8,6 @@ from shapely import affinity
 
 from padforge.design.common.validation import InputError
 from padforge.design.morphology import Morphology
-from padforge.fabricate.cad.model import body_solid
 from padforge.fabricate.checks.plan_checks import check_plan
 from padforge.fabricate.mesh import build_mesh, mesh_arrays
 from padforge.fabricate.mould import (
@@ -27,8 +26,6 @@ from padforge.fabricate.plan import Plan
 from padforge.fabricate.settings import WELL_MM
 from tests.fabricate.planted import with_settings
 
-EVERYTHING = {"pins": True, "lid": True, "spout": True, "conductive": True, "border_mm": 1.0, "ridge_draft_deg": 4.0}
-
 
 def as_read(body: Body) -> trimesh.Trimesh:
     """The mesh as whoever reads its STL finds it: single precision, equal vertices joined."""
@@ -40,14 +37,6 @@ def assert_one_closed_body(read: trimesh.Trimesh, genus: int = 0) -> None:
     assert read.is_winding_consistent
     assert read.body_count == 1
     assert read.euler_number == 2 - 2 * genus
-
-
-def assert_both_ways_agree(body: Body) -> None:
-    """The CAD kernel's own Boolean operations on the same prisms are the oracle for the mesh."""
-    oracle = body_solid(body)
-    assert oracle.volume == pytest.approx(build_mesh(body).volume(), rel=1e-5)  # circles are polygons in the mesh
-    box = np.array([[*oracle.bounding_box().min], [*oracle.bounding_box().max]])
-    assert box == pytest.approx(as_read(body).bounds, abs=1e-4)
 
 
 def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -70,8 +59,8 @@ def height_at(solid: trimesh.Trimesh, x: float, y: float) -> float:
 @pytest.mark.parametrize(
     "pad",
     [
-        *((1, 1, 0), (2, 10, 2), (1, 30, 1032)),
-        *(pytest.param(each, marks=pytest.mark.slow) for each in ((4, 30, 1032), (9, 4, 4), "5para_dis", "20para")),
+        *((2, 10, 2), (1, 30, 1032)),
+        *(pytest.param(each, marks=pytest.mark.slow) for each in ((4, 30, 1032), "20para")),
     ],
 )
 def test_random_and_published_moulds_are_closed(request, pad):
@@ -95,32 +84,8 @@ def test_bodies_without_room_are_refused(make, pad, mould, line):
         make(Plan(Morphology.straight(*pad), with_settings(mould)))
 
 
-@pytest.mark.parametrize(
-    "settings",
-    [
-        pytest.param(
-            with_settings({"border_mm": 3.0, "wall_mm": 0.8, "ridge_width_mm": 1.5, "exit_mm": 0.0}),
-            marks=pytest.mark.slow,
-        ),
-        with_settings({"tolerance_mm": 0.05, "floor_mm": 0.4, "wall_draft_deg": 0.0}, pad={"deep_family": "vertical"}),
-        pytest.param(  # the oracle's pins are round
-            with_settings({**EVERYTHING, "pins": False}, printer={"layer_mm": 0.4}), marks=pytest.mark.slow
-        ),
-    ],
-)
-def test_mesh_agrees_with_the_cad_kernel(settings):
-    tapered = settings.mould.ridge_draft_deg > 0  # terraces of curves would take the oracle minutes
-    plan = Plan(Morphology.straight(1) if tapered else Morphology.random(1, 3, seed=5), settings)
-    body = mould_body(plan)
-    assert_both_ways_agree(body)
-    assert_one_closed_body(as_read(body))
-    if settings.mould.conductive:
-        assert_both_ways_agree(conductive_body(conductive_plan(plan)))
-
-
-@pytest.mark.parametrize("mould", [{}, {"exit_mm": 0.0, "border_mm": 1.5}, {"floor_mm": 1.2, "wall_mm": 0.8}])
-def test_holder_fits_the_pad_with_its_leads(mould):
-    plan = Plan(Morphology.random(3, 2, seed=4), with_settings(mould))
+def test_holder_fits_the_pad_with_its_leads():
+    plan = Plan(Morphology.random(2, 2, seed=4), with_settings({"border_mm": 1.5, "floor_mm": 1.2}))
     read, frame = as_read(holder_body(plan)), bed_frame(plan)
     assert_one_closed_body(read)
     floor, wall, out = plan.settings.mould.floor_mm, frame["walls_mm"], plan.tray.bounds[2]
@@ -140,7 +105,7 @@ def test_holder_fits_the_pad_with_its_leads(mould):
         height_at(read, x, y) for x, y in ((inside, inside), (-inside, inside), (-inside, -inside))
     ] == pytest.approx([wall] * 3)
     with pytest.raises(ValueError, match="zero-size array"):
-        height_at(read, inside, -inside)  # where fibres 1 and 4 start, as the pad lies
+        height_at(read, inside, -inside)  # where fibres 1 and 3 start, as the pad lies
 
 
 def test_ridges_run_to_the_end_of_their_slots():
@@ -194,7 +159,7 @@ def test_lid_has_holes_for_pins_vents_and_spout():
 
 @pytest.mark.parametrize(
     ("tapered", "knots", "layer_mm"),
-    [(5.0, 1, 0.3), (17.0, 2, 0.3), *(pytest.param(draft, 4, 0.1, marks=pytest.mark.slow) for draft in (5.0, 17.0))],
+    [(17.0, 1, 0.3), pytest.param(5.0, 4, 0.1, marks=pytest.mark.slow)],
 )
 def test_tapered_moulds_with_wells_are_closed(tapered, knots, layer_mm):
     tapers = with_settings({"ridge_draft_deg": tapered, "pins": True}, printer={"layer_mm": layer_mm})
@@ -227,10 +192,9 @@ def test_mesh_arrays_separates_coincident_vertices():
         assert (block.bounds[:, :2] <= low + 1).all()
 
 
-@pytest.mark.parametrize(("knots", "seed"), [(5, 4), pytest.param(20, 5, marks=pytest.mark.slow)])
-def test_crossing_gap_is_a_lower_bound(knots, seed):
+def test_crossing_gap_is_a_lower_bound():
     """Fibres as cylinders on the floors of their tracks, which are the tops of the ridges, measured on the mesh."""
-    plan = Plan(Morphology.random(2, knots, seed))
+    plan = Plan(Morphology.random(2, 3, seed=4))
     read, fibre = as_read(mould_body(plan)), plan.settings.fibre.material.diameter_mm
     floors = []
     for line in plan.lines:
@@ -241,14 +205,6 @@ def test_crossing_gap_is_a_lower_bound(knots, seed):
     assert isinstance(stated, float)
     for c in plan.crossings:
         assert abs(floors[c.first] - floors[c.second]) - fibre > stated - 1e-4
-
-
-def test_vents_of_a_small_lid_are_at_its_quarters():
-    plan = Plan(Morphology.straight(1, 5.0), with_settings({"lid": True}))
-    quarter = (plan.cavity.bounds[2] - plan.cavity.bounds[0]) / 4
-    vents = {(hole.area.centroid.x, hole.area.centroid.y) for hole in lid_body(plan).cuts}
-    corners = [(x, y) for x in (-quarter, quarter) for y in (-quarter, quarter)]
-    assert np.array(sorted(vents)) == pytest.approx(np.array(corners))
 
 
 def test_pins_are_on_three_corners_so_that_a_lid_fits_one_way() -> None:

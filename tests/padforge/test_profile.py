@@ -9,7 +9,7 @@ from importlib.machinery import PathFinder
 import numpy as np
 import pytest
 
-from padforge.design import Morphology, signals, signals_sparse
+from padforge.design import Morphology, signals
 from padforge.design.common import profiling
 from padforge.design.optimize.search import SearchOptions, search
 from padforge.design.settings import PUBLISHED_CONTACT, PadSettings, RulesSettings, SearchSettings
@@ -88,11 +88,10 @@ def test_import_of_heavy_library_is_a_stage(clock, monkeypatch, tmp_path):
     del sys.modules["weighty"], sys.modules["passing"]
 
 
-@pytest.mark.parametrize("of", [signals, signals_sparse])
-def test_press_visits_only_fibres_in_reach(of):
+def test_press_visits_only_fibres_in_reach():
     presses = [[1, 1], [2.5, 3.0], [0.7, 2.5]]  # reaching 1 + 1, 2 + 1 and 1 + 2 of 4 + 4 fibres
     with profiling.profiled() as profile:
-        of(Morphology.straight(4), presses, PUBLISHED_CONTACT)
+        signals(Morphology.straight(4), presses, PUBLISHED_CONTACT)
     assert profile.counts == {"fibres, press by press": [8, 24], "spans, press by press": [8, 24]}
 
 
@@ -130,7 +129,7 @@ def test_finished_starts_are_not_repeated(tmp_path, monkeypatch):
 def test_only_requested_formats_are_written(tmp_path):
     with profiling.profiled() as profile:
         build(Morphology.straight(1), tmp_path, ("svg", "dxf"))
-    assert profile.counts["formats"] == [2, 8]
+    assert profile.counts["formats"] == [2, 7]
     assert {"write tracks.svg", "write tracks.dxf"} <= set(profile.seconds)
     assert not {"CAD solid", "write mould.stl"} & set(profile.seconds)
 

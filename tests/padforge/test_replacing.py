@@ -12,7 +12,7 @@ from padforge.sense.recording.run_directory import Recorder
 from tests.helpers.door import called, refused
 from tests.helpers.less import blank_pictures
 
-SMALL = "[pad]\ngrid = 2\n[search]\nknots = 2\nstarts = 1\nsteps = 5\nmax_failures = 1\n[rules]\nenforce = false\n"
+SMALL = "[pad]\ngrid = 1\n[search]\nknots = 1\nstarts = 1\nsteps = 2\nmax_failures = 1\n[rules]\nenforce = false\n"
 DESIGN = "design --out pad"
 
 
@@ -26,7 +26,7 @@ def designed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("designed")
     (folder / "pad.toml").write_text(SMALL)
     assert called(*DESIGN.split(), cwd=folder).code == 0
-    Morphology.straight(2).save(folder / "other.json")
+    Morphology.straight(1).save(folder / "other.json")
     assert called("design", "show", "other.json", "--out", "plan.svg", cwd=folder).code == 0
     return folder
 
@@ -51,8 +51,6 @@ def contents(folder: Path) -> dict[str, bytes]:
     "words",
     [
         f"{DESIGN} --seed 1",
-        f"{DESIGN} --seed 1 --resume",
-        f"{DESIGN} --start-from pad/morphology.json",
         "design import plan.svg --out pad",
         "design edit other.json --out pad/morphology.json",
     ],
@@ -79,10 +77,9 @@ def undrawn(pad: Path) -> dict[str, bytes]:
     return {name: found[name] for name in found if name not in ("design.json", "design.png", "design.svg")}
 
 
-@pytest.mark.parametrize("words", [f"{DESIGN} --seed 1", "design import plan.svg --out pad"])
-def test_force_replaces_pad_in_use(pad: Path, words: str) -> None:
+def test_force_replaces_pad_in_use(pad: Path) -> None:
     before = sha256(pad / "pad" / "morphology.json")
-    assert called(*words.split(), "--force", cwd=pad).code in (0, 1)
+    assert called(*DESIGN.split(), "--seed", "1", "--force", cwd=pad).code in (0, 1)
     assert sha256(pad / "pad" / "morphology.json") != before
 
 
@@ -116,7 +113,7 @@ def test_run_does_not_replace_localizer_of_measured_presses(tmp_path: Path, told
 
 
 def test_run_does_not_replace_measured_recording(folder: Path) -> None:
-    """Of a real pad, at work, with files of others in it, behind a link, or none at all."""
+    """Of a real pad, at work, with files of others in it, or behind a link."""
     recording = folder / "out" / "pad" / "recording"
     kept = contents(recording)
     with Recorder.resume(recording):
@@ -129,19 +126,7 @@ def test_run_does_not_replace_measured_recording(folder: Path) -> None:
     (recording / "notes.txt").write_text("of the day")
     assert "holds notes.txt, which is no part of a recording" in refused("run", cwd=folder)
     (recording / "notes.txt").unlink()
-    journal = recording / "journal.ndjson"
-    elsewhere = journal.rename(folder / "journal")
-    journal.mkdir()
-    (journal / "thesis").touch()
-    assert "holds journal.ndjson, which is no part of a recording" in refused("run", cwd=folder)
-    shutil.rmtree(journal)
-    journal.symlink_to(elsewhere)
-    assert "holds journal.ndjson, which is no part of a recording" in refused("run", cwd=folder)
-    journal.unlink()
     recording.rename(folder / "recording")
     recording.symlink_to(folder / "recording")
     assert "is a link" in refused("run", cwd=folder)
-    recording.unlink()
-    recording.touch()
-    assert "is no folder" in refused("run", cwd=folder)
     assert (folder / "recording" / "readings.bin").read_bytes() == kept["readings.bin"]

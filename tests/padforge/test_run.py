@@ -4,7 +4,6 @@ import json
 import math
 import os
 import re
-import shutil
 import signal
 import threading
 from pathlib import Path
@@ -22,7 +21,7 @@ from padforge.design.contact_set import judged_contacts
 from padforge.design.report import press_sections
 from padforge.run import Run
 from padforge.sense.report.calibration import calibrate_into
-from tests.helpers.door import called, refused, started
+from tests.helpers.door import called, refused
 from tests.helpers.less import blank_pictures, compare_little, small_pictures
 from tests.padforge.conftest import SMALL
 
@@ -81,30 +80,10 @@ def test_run_compares_contacts(finished: tuple[Path, str]) -> None:
     assert printed.count("\ncontact: expected error ") == 1
 
 
-@pytest.mark.slow
-def test_run_is_deterministic(folder: Path) -> None:
-    """In a process of its own, as people run it."""
-    before = digests(folder, *VOLATILE)
-    result = started("run", "--formats", "stl", cwd=folder)
-    assert result.returncode == 0, result.stderr
-    again = digests(folder, *VOLATILE)
-    assert again["mould.stl"] == before["mould.stl"]
-    assert again["morphology.json"] == before["morphology.json"]
-
-
 def test_resume_reuses_finished_run(folder: Path) -> None:
     before = digests(folder, "report.html")
     assert resumed(folder) == ALL
     assert digests(folder, "report.html") == before
-
-
-def test_resume_reuses_files_in_whatever_order_they_are_noted(folder: Path) -> None:
-    note = folder / "out" / "pad" / "run.json"
-    document = json.loads(note.read_text())
-    for stage in document["stages"].values():
-        stage["files"] = dict(reversed(stage["files"].items()))
-    note.write_text(json.dumps(document))
-    assert resumed(folder) == ALL
 
 
 def test_run_without_resume_reuses_nothing(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -115,23 +94,20 @@ def test_run_without_resume_reuses_nothing(folder: Path, monkeypatch: pytest.Mon
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "more", "kept", "others"),
+    ("old", "new", "kept", "others"),
     [
-        ("epochs = 4", "epochs = 5", (), "design, mould, recording, contacts", set()),
-        ("presses = 60", "presses = 70", (), "design, mould, contacts", {"recording"}),
-        ("[rig]", "[mould]\nwall_mm = 3\n[rig]", (), "design, recording, contacts, calibration", {"mould.stl"}),
-        pytest.param("", "", ("--seed", "1"), "", {"recording"}, marks=pytest.mark.slow),
+        ("epochs = 4", "epochs = 5", "design, mould, recording, contacts", set()),
+        ("[rig]", "[mould]\nwall_mm = 3\n[rig]", "design, recording, contacts, calibration", {"mould.stl"}),
     ],
 )
 def test_resume_repeats_stages_of_changed_settings(
-    folder: Path, old: str, new: str, more: tuple[str, ...], kept: str, others: set[str]
+    folder: Path, old: str, new: str, kept: str, others: set[str]
 ) -> None:
     before = digests(folder)
     (folder / "pad.toml").write_text(SMALL.replace(old, new))
-    assert resumed(folder, *more) == kept
+    assert resumed(folder) == kept
     after = digests(folder)
-    watched = ("recording",) if more else ("mould.stl", "recording")  # another seed may find another pad or none
-    assert {name for name in watched if after[name] != before[name]} == others
+    assert {name for name in ("mould.stl", "recording") if after[name] != before[name]} == others
 
 
 def test_resume_with_another_seed_searches_again(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -143,7 +119,7 @@ def test_resume_with_another_seed_searches_again(folder: Path, monkeypatch: pyte
 def test_resume_repeats_stages_of_changed_files(folder: Path) -> None:
     def kept() -> dict[str, str]:
         files = digests(folder, "fabrication.json", *VOLATILE)  # the former has digests of pictures, which are blank
-        return {name: digest for name, digest in files.items() if not name.endswith(".png")}
+        return {name: digest for name, digest in files.items() if not name.endswith((".png", "orientation.svg"))}
 
     before = kept()
     (folder / "out" / "pad" / "mould.stl").unlink()
@@ -230,21 +206,11 @@ def test_interrupted_run_keeps_earlier_recording(folder: Path) -> None:
     assert "fabrication (fabricate) is of another pad than the morphology.json here" in result.err
 
 
-@pytest.mark.parametrize(
-    ("wrong", "said"),
-    [
-        pytest.param("[rules]\nmin_gap_mm = 30\n", "min_gap_mm", marks=pytest.mark.slow),
-        ("[printer]\nbed_mm = [30, 30, 30]\n", "bed"),
-    ],
-)
-def test_run_exits_1_on_broken_rule_or_check(
-    folder: Path, wrong: str, said: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("padforge.design.optimize.gradient.REPAIR_STEPS", 20)
-    (folder / "pad.toml").write_text(SMALL + wrong)
+def test_run_exits_1_on_a_failed_check(folder: Path) -> None:
+    (folder / "pad.toml").write_text(SMALL + "[printer]\nbed_mm = [30, 30, 30]\n")
     ended = called("run", "--resume", "--formats", "svg", cwd=folder)
     assert ended.code == 1, ended
-    assert said in ended.out
+    assert "bed" in ended.out
     assert ended.out.splitlines()[-1] == f"report: {Path('out/pad/report.html')}"  # it is written nevertheless
 
 
@@ -265,12 +231,12 @@ def test_time_budget_covers_all_stages(tmp_path: Path, monkeypatch: pytest.Monke
         return run(*arguments, **more)
 
     monkeypatch.setattr("padforge.sense.report.calibration.calibrate_into", noted)
-    words = ("run", "--time-budget", "20", "--formats", "stl")
+    words = ("run", "--time-budget", "8", "--formats", "stl")
     ended = called(*words, cwd=tmp_path)
     assert ended.code in (0, 1), ended
     assert "(out of time: the best so far)" in ended.out
     assert len(given) == 1
-    assert 0 < given[0] < 19
+    assert 0 < given[0] < 7
     assert "not trained out" in ended.out
     again = called(*words, "--resume", cwd=tmp_path)
     assert f"earlier run: {ALL}" in again.err, again
@@ -294,9 +260,7 @@ def test_remaining_time_counts_from_the_start_of_the_run(monkeypatch: pytest.Mon
     assert Run(Spec({}), Path("pad"), started_s=100.0).remaining_s(0.5) is None
 
 
-@pytest.mark.parametrize(
-    "stages", ["", ', "stages": 3', ', "stages": {"sense": {"files": {}}}', ', "stages": {"sense": {"files": 3}}']
-)
+@pytest.mark.parametrize("stages", ["", ', "stages": {"sense": {"files": 3}}'])
 def test_damaged_note_is_refused(folder: Path, stages: str) -> None:
     """Before a stage is done again, whichever stage's entry is damaged."""
     (folder / "out" / "pad" / "run.json").write_text(f'{{"format": "padforge-run/2"{stages}}}')
@@ -313,13 +277,3 @@ def test_report_is_deterministic(folder: Path, monkeypatch: pytest.MonkeyPatch) 
         pages.append(page.read_bytes())
     assert pages[0] == pages[1]
     assert b">Calibration</h2>" in pages[0]
-
-
-@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="pipes as POSIX has them")
-def test_pipe_in_place_of_result_is_refused(folder: Path) -> None:
-    (folder / "out" / "pad" / "mould.stl").unlink()
-    os.mkfifo(folder / "out" / "pad" / "mould.stl")
-    shutil.rmtree(folder / "out" / "pad" / "recording")
-    ended = called("run", "--resume", cwd=folder)
-    assert (ended.code, ended.err.count("\n")) == (2, 1), ended
-    assert "mould.stl: " in ended.err

@@ -115,11 +115,9 @@ def test_mould_model_edges_are_half_a_width_from_exact_fibres(pad, mould):
 SETTINGS = {
     "upright": {"wall_draft_deg": 0.0},
     "leaning": {"wall_draft_deg": 5.0},
-    "border": {"border_mm": 2.5},
     "no exits": {"exit_mm": 0.0},
     "terraces": {"ridge_draft_deg": 6.0},
     "pins": {"pins": True, "wall_mm": 3.0},
-    "wide": {"ridge_width_mm": 1.5},
 }
 
 
@@ -127,25 +125,20 @@ ODD = {
     "a family that crosses itself": (level_pad(1.8, 1.2), {}),
     "two that lie on each other": (level_pad(1.5, 1.5), {}),
     "two nearly so": (level_pad(1.5, 1.501), {}),
-    "two that overlap by a micrometre": (level_pad(1.5, 1.5399), {}),
     "two that overlap by three nanometres": (level_pad(1.5, 1.5399997), {}),
     "two a micrometre apart": (level_pad(1.5, 1.5401), {}),
     "along the wall": (level_pad(0.0, 1.5), {"wall_draft_deg": 0.0}),
-    "half in the wall": (level_pad(0.01, 1.5), {}),
     "touching the wall": (level_pad(0.02, 1.5), {"wall_draft_deg": 0.0, "exit_mm": 0.0}),
-    "touching a wall that leans": (level_pad(0.02, 1.5), {}),
     "grazing the wall": (winding_pad((0.7, 0.4), (1.0, 0.015), (1.3, 0.4)), {}),
     "a tip on the wall": (winding_pad((0.9999, 0.5), (1.0, 0.02), (1.0001, 0.5)), {"ridge_width_mm": 2.0}),
-    "a tight S": (winding_pad((0.57, 0.5), (0.6, 0.3), (0.63, 1.5), (0.66, 1.2)), {}),
     "a hairpin": (winding_pad((0.59, 0.5), (0.595, 1.6), (0.6, 0.5), (0.605, 1.6), (0.61, 0.5)), {}),
-    "a step": (winding_pad((0.6, 0.5), (0.6 + 1e-7, 1.5)), {}),
     "a fold in a wide track": (winding_pad((0.5, 0.6), (0.6, 1.5), (0.7, 0.6)), {"ridge_width_mm": 2.0}),
     "three knots at one place": (winding_pad((0.6, 1.3), (0.6, 1.3), (0.6, 1.3), (1.5, 0.4)), {}),
 }
 
 
 NARROW = "two that overlap by three nanometres"
-RARE = {*SETTINGS, *ODD} - {*[*SETTINGS, *ODD][::3], NARROW}
+RARE = {*SETTINGS, *ODD} - {*[*SETTINGS, *ODD][::5], NARROW}
 
 
 @pytest.mark.parametrize(
@@ -158,13 +151,13 @@ def test_mould_models_are_valid_and_match_their_meshes(case):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("grid", "knots", "seed"), [(5, 8, 0), (4, 20, 41)])
+@pytest.mark.parametrize(("grid", "knots", "seed"), [(3, 8, 0)])
 def test_mould_models_of_dense_pads_match_their_meshes(grid, knots, seed):
     judged(Plan(Morphology.random(grid, knots, seed)))
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["1para", "5para_dis", "20para"])
+@pytest.mark.parametrize("name", ["5para_dis"])
 def test_mould_models_of_published_pads_match_their_meshes(published, name):
     judged(Plan(Morphology.load(published / f"{name}.mat")))
 

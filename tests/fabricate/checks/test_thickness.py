@@ -4,8 +4,6 @@ import numpy as np
 import pytest
 import shapely
 import trimesh
-from hypothesis import assume, given, settings
-from hypothesis import strategies as st
 from manifold3d import CrossSection, Manifold, Mesh, OpType
 
 from padforge.fabricate.checks.mesh_checks import SOLID_CHECKS
@@ -37,29 +35,8 @@ class TestGoodBodies:
         assert findings["wall_thickness"].measured == pytest.approx(WALL, rel=0.03)
         assert findings["floor_thickness"].measured == pytest.approx(FLOOR)
 
-    @settings(max_examples=6)
-    @given(
-        st.floats(0, 8),
-        st.floats(0.8, 4),
-        st.floats(0.4, 1.0),
-        st.floats(30, 150),
-        st.floats(0.2, 1.0),
-        st.floats(0.0, 1.5),
-        st.integers(1, 4),
-    )
-    def test_random_trays_pass(self, draft_deg, wall, width, angle_deg, height, further, count):
-        pitch = SIZE / (count + 1)
-        rows = [-SIZE / 2 + pitch * (n + 1) for n in range(count)]
-        end = 6 * math.sin(math.radians(angle_deg))
-        assume(all(abs(abs(end) - abs(y)) > 1.5 for y in rows))  # an end just beside a ridge is thin indeed
-        lines = [spanning(y, width) for y in rows]
-        across = shapely.affinity.rotate(line((-6, 0), (6, 0), width=width), angle_deg, (0, 0))
-        adds = [ridge(outline, height + further) for outline in lines]
-        assert not failures(check_body(tray(*adds, ridge(across, height), draft_deg=draft_deg, wall=wall)))
-
-    @pytest.mark.parametrize("angle_deg", [30, 60, 120])
-    def test_crossing_ridges_of_one_height_pass(self, angle_deg):
-        crossing = shapely.union(spanning(0.5), shapely.affinity.rotate(spanning(0.5), angle_deg, (0, 0.5)))
+    def test_crossing_ridges_of_one_height_pass(self):
+        crossing = shapely.union(spanning(0.5), shapely.affinity.rotate(spanning(0.5), 30, (0, 0.5)))
         assert not failures(check_body(tray(ridge(crossing & shapely.box(-10.5, -10.5, 10.5, 10.5)))))
 
     def test_bends_numbers_and_exits_pass(self):
@@ -83,7 +60,7 @@ class TestGoodBodies:
 
 
 class TestWidth:
-    @pytest.mark.parametrize(("width", "status"), [(0.2, "fail"), (0.36, "fail"), (0.39, "pass")])
+    @pytest.mark.parametrize(("width", "status"), [(0.36, "fail"), (0.39, "pass")])
     def test_ridge_width_of_a_narrow_ridge(self, width, status):
         thin = ridge(line((2, -6), (7, -5), width=width), 0.8)
         findings = check_body(tray(*CROSS, thin))
@@ -97,8 +74,6 @@ class TestWidth:
     @pytest.mark.parametrize(
         ("printer", "status"),
         [
-            ({"nozzle_mm": 0.6}, "fail"),
-            ({"nozzle_mm": 0.05, "resin": True}, "pass"),
             ({"nozzle_mm": 0.25, "resin": True}, "fail"),
             ({"nozzle_mm": 0.25}, "pass"),
         ],
@@ -106,9 +81,7 @@ class TestWidth:
     def test_ridge_width_by_printer(self, printer, status):
         assert check_body(tray(*CROSS), printer=PrinterSettings.model_validate(printer))["ridge_width"].status == status
 
-    @pytest.mark.parametrize(
-        ("gap", "status"), [(0.05, "fail"), (0.09, "fail"), (0.12, "warn"), (0.35, "warn"), (0.4, "pass")]
-    )
+    @pytest.mark.parametrize(("gap", "status"), [(0.09, "fail"), (0.12, "warn"), (0.4, "pass")])
     def test_silicone_wall_between_ridges(self, gap, status):
         findings = check_body(
             tray(*CROSS, ridge(spanning(3.4 + gap), 1.2), ridge(spanning(-7)), ridge(spanning(-6.6 + gap)))
@@ -126,24 +99,12 @@ class TestWidth:
         assert failures(findings) == {"silicone_wall": "warn"}
         assert len(findings["silicone_wall"].positions_mm) == 2
 
-    def test_silicone_wall_before_a_wall(self):
-        findings = check_body(tray(*CROSS, ridge(spanning(9.5)), draft_deg=0))
-        assert failures(findings) == {"silicone_wall": "warn"}
-        assert findings["silicone_wall"].measured == pytest.approx(0.3, abs=0.015)
-        assert all(9.6 < y < 10.1 for _, y in findings["silicone_wall"].positions_mm)
-
-    def test_silicone_wall_of_a_slotted_tray(self):
-        slot = Manifold.cube((10, 1.5, DEPTH + 1)).translate((5, -0.75, FLOOR))
-        assert failures(check_body(tray(*CROSS) - slot)) == {"tight": "fail"}
-        findings = check_body(tray(*CROSS, ridge(spanning(3.7), 1.2)) - slot)
-        assert failures(findings) == {"silicone_wall": "warn", "tight": "fail"}
-
-    @pytest.mark.parametrize(("height", "status"), [(0.4, "pass"), (0.55, "pass"), (0.65, "warn")])
+    @pytest.mark.parametrize(("height", "status"), [(0.55, "pass"), (0.65, "warn")])
     def test_silicone_wall_between_similar_heights(self, height, status):
         findings = check_body(tray(*CROSS, ridge(spanning(3.7), height)))
         assert findings["silicone_wall"].status == status
 
-    @pytest.mark.parametrize(("wall", "status"), [(0.3, "fail"), (0.6, "warn"), (0.85, "pass")])
+    @pytest.mark.parametrize(("wall", "status"), [(0.3, "fail"), (0.6, "warn")])
     def test_wall_thickness_of_a_thin_wall(self, wall, status):
         cut = Manifold.cube((5, 40, 20), True).translate((SIZE / 2 + wall + 2.5, 0, 5))
         findings = check_body(tray(*CROSS, draft_deg=0) - cut)
@@ -152,29 +113,28 @@ class TestWidth:
         assert all(SIZE / 2 < x < SIZE / 2 + wall for x, _ in findings["wall_thickness"].positions_mm)
         assert bool(findings["wall_thickness"].positions_mm) == (status != "pass")
 
-    @pytest.mark.parametrize("layer", [0.1, 0.4])
-    def test_wall_thickness_of_a_leaning_wall(self, layer):
+    def test_wall_thickness_of_a_leaning_wall(self):
         """A wall 0.5 mm thick at the rim, and thicker by half a millimetre a millimetre below it."""
         side, top, over = 20.0, FLOOR + DEPTH, 1.0
         flare = 1 + (DEPTH + over) / side
         hollow = Manifold.extrude(CrossSection.square((side, side), True), DEPTH + over, scale_top=(flare, flare))
         outer = side + DEPTH + 2 * 0.5
         box = Manifold.cube((outer, outer, top), True).translate((0, 0, top / 2))
-        findings = check_body(box - hollow.translate((0, 0, FLOOR)), printer=PrinterSettings(layer_mm=layer))[
+        findings = check_body(box - hollow.translate((0, 0, FLOOR)), printer=PrinterSettings(layer_mm=0.4))[
             "wall_thickness"
         ]
-        assert findings.measured == pytest.approx(0.5 + layer / 2 * 0.5, abs=0.015)
+        assert findings.measured == pytest.approx(0.5 + 0.4 / 2 * 0.5, abs=0.015)
 
     @pytest.mark.parametrize(
         ("floor", "layer", "status"),
-        [(0.2, 0.1, "fail"), (0.37, 0.1, "fail"), (0.39, 0.1, "pass"), (0.55, 0.3, "fail"), (0.59, 0.3, "pass")],
+        [(0.37, 0.1, "fail"), (0.55, 0.3, "fail"), (0.59, 0.3, "pass")],
     )
     def test_floor_thickness_by_layer(self, floor, layer, status):
         findings = check_body(tray(floor=floor), printer=PrinterSettings(layer_mm=layer))["floor_thickness"]
         assert (findings.status, findings.limit) == (status, pytest.approx(max(0.4, 2 * layer)))
         assert findings.measured == pytest.approx(floor)
 
-    @pytest.mark.parametrize(("lean_deg", "status"), [(0, "fail"), (8, "fail"), (12, "pass")])
+    @pytest.mark.parametrize(("lean_deg", "status"), [(8, "fail"), (12, "pass")])
     def test_floor_thickness_over_a_gable(self, lean_deg, status):
         """A groove from below, with a roof that leans to either side and leaves 0.3 mm of floor over its ridge."""
         fall = 3 * math.tan(math.radians(lean_deg))
@@ -184,12 +144,6 @@ class TestWidth:
         assert floor.status == status
         if status == "fail":
             assert floor.measured == pytest.approx(0.3, abs=0.02)
-
-    def test_floor_thickness_over_a_pit(self):
-        pit = Manifold.cylinder(FLOOR - 0.3, 1.0).translate((4, -5, 0))
-        floor = check_body(tray(*CROSS) - pit)["floor_thickness"]
-        assert floor.measured == pytest.approx(0.3, abs=1e-5)
-        assert has_position_near(floor, 4, -5)
 
 
 class TestLean:
@@ -201,16 +155,6 @@ class TestLean:
             assert findings[name].measured == pytest.approx(90)
             assert has_position_near(findings[name], 4.5, -6, 2.6)
 
-    def test_undercut_of_a_slotted_wall(self):
-        slot = Manifold.cube((10, 1.5, DEPTH + 1)).translate((5, -0.75, FLOOR))
-        assert failures(check_body(tray(draft_deg=-3) - slot)) == {"undercut": "fail", "tight": "fail"}
-
-    @pytest.mark.parametrize(("side", "status"), [(0.08, "pass"), (0.13, "fail")])
-    def test_overhang_ignores_specks(self, side, status):
-        bracket = Manifold.cube((1.0, 1.0, 4.0)).translate((-9.5, 0, FLOOR - 0.2))
-        speck = Manifold.cube((side, side, 0.5)).translate((-8.5, 0.2, FLOOR + 2))
-        assert check_body(tray(bracket, speck), printer=PrinterSettings(layer_mm=0.1))["overhang"].status == status
-
     def test_overhang_ignores_the_first_layer(self):
         """A foot that is set back by a millimetre, for half a layer and for two."""
         for foot, status in ((0.05, "pass"), (0.2, "fail")):
@@ -218,7 +162,7 @@ class TestLean:
             solid = Manifold.batch_boolean([_manifold(top), _manifold(low)], OpType.Add)
             assert check_body(solid, printer=PrinterSettings(layer_mm=0.1))["overhang"].status == status
 
-    @pytest.mark.parametrize("lean_deg", [0.05, 0.2, 3, 10])
+    @pytest.mark.parametrize("lean_deg", [0.05, 3])
     def test_undercut_of_a_leaning_wall(self, lean_deg):
         undercut = check_body(tray(*CROSS, draft_deg=-lean_deg))["undercut"]
         assert (undercut.status, undercut.limit) == ("pass" if lean_deg < 0.1 else "fail", 0)
@@ -228,7 +172,7 @@ class TestLean:
         assert undercut.positions_mm
         assert all(max(abs(x), abs(y)) == pytest.approx(SIZE / 2, abs=1) for x, y in undercut.positions_mm)
 
-    @pytest.mark.parametrize(("lean_deg", "status"), [(30, "pass"), (45.8, "pass"), (46.3, "fail")])
+    @pytest.mark.parametrize(("lean_deg", "status"), [(45.8, "pass"), (46.3, "fail")])
     def test_overhang_of_a_funnel(self, lean_deg, status):
         top = 4 + 4 * math.tan(math.radians(lean_deg))
         cup = Manifold.cylinder(4, 4, top, 64) - Manifold.cylinder(5, 2, 2, 64).translate((0, 0, -0.5))
@@ -244,7 +188,7 @@ def _manifold(mesh: trimesh.Trimesh) -> Manifold:
     return Manifold(Mesh(np.float32(mesh.vertices), np.uint32(mesh.faces)))
 
 
-@pytest.mark.parametrize(("layers", "status"), [(0.4, "pass"), (0.6, "fail"), (1.5, "fail"), (4.0, "fail")])
+@pytest.mark.parametrize(("layers", "status"), [(0.4, "pass"), (0.6, "fail")])
 def test_ridges_of_half_a_layer_or_more_are_as_wide_as_the_nozzle(layers: float, status: str) -> None:
     """Lower ones are not printed."""
     printer = PrinterSettings(layer_mm=0.2)

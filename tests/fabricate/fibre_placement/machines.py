@@ -1,4 +1,4 @@
-"""Machines that do what a program says, each in its own words, and the fibres as the course should have them."""
+"""A machine that does what G-code says, and the fibres as the needle should place them."""
 
 import math
 import re
@@ -13,8 +13,6 @@ from padforge.fabricate.plan import Plan
 from tests.fabricate.planted import exact_fibre
 
 G_CODE = re.compile(r"([A-Z])([-+]?\d+(?:\.\d+)?)")
-POPUP = re.compile(r'  popup\("([^"]+)", title="padforge", blocking=True\)')
-GO = re.compile(r"  (movel|movep)\(at\(([^)]+)\), a=([\d.e-]+), v=([\d.e-]+)(?:, r=([\d.e-]+))?\)")
 
 
 @dataclass
@@ -38,8 +36,8 @@ class Run:
         if self.asked:
             self.ways.append(Way(corners, np.array(speeds), lays))
 
-    def laid(self) -> list[tuple[int, Way]]:
-        """The fibres, 0.., that were laid, in that order."""
+    def placed_fibres(self) -> list[tuple[int, Way]]:
+        """The fibres, 0.., that were placed, in that order."""
         fibres = []
         for message, way in zip(self.asked, self.ways, strict=True):
             if "fasten" in message:
@@ -87,50 +85,7 @@ def run_gcode(text: str) -> Run:
     return run
 
 
-def run_urscript(text: str) -> Run:
-    """The moves of the body of a script in the frame of the pad, each blend an arc that touches both its pieces."""
-    run, corners, speeds, blends = Run(), [], [], []
-    kinds: list[bool] = []
-    for line in text.splitlines():
-        if popup := POPUP.fullmatch(line):
-            run.end_way(blended(corners, blends), speeds, kinds)
-            run.asked.append(popup[1])
-            corners, blends, speeds, kinds = corners[-1:], blends[-1:] and [0.0], [], []
-        elif move := GO.fullmatch(line):
-            place = [float(part) for part in move[2].split(",")] if "here" not in move[2] else None
-            if place:
-                kinds += [move[1] == "movep"] if corners else []
-                speeds += [1000 * float(move[4])] if corners else []
-                corners.append(place)
-                blends.append(1000 * float(move[5] or 0))
-    run.end_way(blended(corners, blends), speeds, kinds)
-    return run
-
-
-def blended(corners: list[list[float]], blends: list[float]) -> Array:
-    """Corners (n, 3) cut off by arcs (in the plane z) that begin `blends` before them and end as far behind."""
-    whole = np.array(corners)
-    if len(whole) < 3:
-        return whole
-    out = [whole[0]]
-    for before, corner, after, blend in zip(whole, whole[1:], whole[2:], blends[1:], strict=False):
-        ahead, behind = corner - before, after - corner
-        assert blend <= min(np.linalg.norm(ahead), np.linalg.norm(behind)) / 2
-        ahead, behind = ahead / np.linalg.norm(ahead), behind / np.linalg.norm(behind)
-        turn = math.atan2(float(np.linalg.norm(np.cross(ahead, behind))), float(ahead @ behind))
-        if turn < 1e-6 or blend == 0:
-            out.append(corner)
-            continue
-        start, end = corner - blend * ahead, corner + blend * behind
-        outward = (behind - ahead) / np.linalg.norm(behind - ahead)
-        centre = corner + outward * blend / math.sin(turn / 2)
-        share = np.linspace(0, 1, 9)[:, None]
-        arc = (np.sin((1 - share) * turn) * (start - centre) + np.sin(share * turn) * (end - centre)) / math.sin(turn)
-        out.extend(centre + arc)
-    return np.vstack([*out, whole[-1:]])
-
-
-def exact_course(plan: Plan, fibre: int) -> Array:
+def exact_path(plan: Plan, fibre: int) -> Array:
     """(n, 2) a fibre from lead to lead by scipy's PCHIP, on the pad turned over, from its middle."""
     mould, line = plan.settings.mould, exact_fibre(plan.pad, fibre)
     ends = line[[0, -1]]
@@ -138,7 +93,7 @@ def exact_course(plan: Plan, fibre: int) -> Array:
     return np.vstack([ends[:1], line, ends[1:]]) * (-1, 1)
 
 
-def apart(one: Array, other: Array, points: int) -> float:
+def max_distance(one: Array, other: Array, points: int) -> float:
     """How far `points` places of either polyline (n, 2) lie at most from the other one, mm, to a micrometre."""
     dense = [shapely.get_coordinates(shapely.segmentize(shapely.LineString(line), 0.004)) for line in (one, other)]
     looked_at = [line[np.linspace(0, len(line) - 1, points).astype(int)] for line in dense]

@@ -54,8 +54,6 @@ def test_feeds_in_bends_are_within_machine_and_fibre_limits(stretch):
     ("radius_mm", "acceleration", "stretch", "feed"),
     [
         (4.0, 9.5, math.inf, 6.0),  # sqrt(9.5 * 4) = 6.16 mm/s
-        (4.0, 26.0, math.inf, 10.0),
-        (2.0, 9.5, math.inf, 4.0),  # sqrt(9.5 * 2) = 4.36 mm/s
         (4.0, 26.0, 0.07, 4.0),  # 1 - 0.3 / (2 * 4 * 0.07) = 0.464 of the feed
         (4.0, 9.5, 0.11, 6.0),  # the fibre bears 6.59 mm/s
     ],
@@ -118,7 +116,6 @@ def test_dispenser_box_finding_has_margin_and_positions(keys, room, places):
         (0.37, {}, "pass"),
         (0.41, {}, "fail"),
         (0.64, {"ridge_width_mm": 0.7}, "pass"),
-        (0.71, {"ridge_width_mm": 0.7}, "fail"),
     ],
 )
 def test_dispenser_tip_fails_if_wider_than_a_track(tip, mould, status):

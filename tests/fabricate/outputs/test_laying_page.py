@@ -56,7 +56,7 @@ def straight_volume_mm3(draft_deg: float) -> float:
     return sum(quad(layer, *stretch)[0] for stretch in pairwise(bounds))
 
 
-@pytest.mark.parametrize("draft_deg", [0.0, 2.0, 10.0])
+@pytest.mark.parametrize("draft_deg", [0.0, 10.0])
 def test_silicone_fills_straight_pad(draft_deg):
     plan = Plan(Morphology.straight(4), with_settings({"wall_draft_deg": draft_deg, "number_mm": 0.0}))
     silicone = laying_document(plan, mould_mesh(plan).volume())["silicone"]
@@ -72,12 +72,11 @@ def test_silicone_fills_straight_pad(draft_deg):
 
 def test_silicone_ignores_pins_and_grows_with_thickness(tmp_path):
     pad = Morphology.straight(2)
-    for shrinkage in (0.0, 0.04):
-        settings = [with_settings({"pins": pins}, silicone={"shrinkage": shrinkage}) for pins in (True, False)]
-        made = [build(pad, tmp_path, [], each) for each in settings]
-        box_ml = made[1].sizes["tray_mm"] ** 2 * made[1].sizes["tray_height_mm"] / 1000
-        assert made[1].silicone_volume_ml == pytest.approx(box_ml - made[1].mould_volume_ml, abs=1e-3)
-        assert made[0].silicone_volume_ml == pytest.approx(made[1].silicone_volume_ml, abs=1e-3)
+    settings = [with_settings({"pins": pins}, silicone={"shrinkage": 0.04}) for pins in (True, False)]
+    pinned, plain = (build(pad, tmp_path, [], each) for each in settings)
+    box_ml = plain.sizes["tray_mm"] ** 2 * plain.sizes["tray_height_mm"] / 1000
+    assert plain.silicone_volume_ml == pytest.approx(box_ml - plain.mould_volume_ml, abs=1e-3)
+    assert pinned.silicone_volume_ml == pytest.approx(plain.silicone_volume_ml, abs=1e-3)
     plan = Plan(level_pad(1.8, 1.2), with_settings({"silicone_mm": 2.5}))
     silicone = laying_document(plan, mould_mesh(plan).volume())["silicone"]
     assert silicone["thickness_mm"] == plan.silicone_mm == 3.0
@@ -96,6 +95,7 @@ def test_lengths_match_curves(mould):
         assert entry["cut_mm"] == pytest.approx(entry["in_pad_mm"] + 2 * plan.settings.mould.lead_mm, abs=0.011)
 
 
+@pytest.mark.slow
 def test_published_pad_is_laid_deepest_first_with_silicone_at_every_crossing(published):
     plan = Plan(Morphology.load(published / "5para_dis.mat"))
     document = laying_document(plan, 1.0)
@@ -162,81 +162,6 @@ def rows(page: str, head: str) -> list[list[str]]:
     return [[cell.strip() for cell in line.strip("|").split("|")] for line in body[:end]]
 
 
-def test_page_lists_masses_and_cut_lengths():
-    plan = Plan(level_pad(1.8, 1.2))
-    document = fabrication_document(plan)
-    page = laying_page(document)
-    ((_, a, b, _),) = rows(page, "EcoFlex 00-20")
-    assert a == b == f"{document['silicone']['part_a_g']:.1f} g"
-    table = rows(page, "step")
-    assert [row[1] for row in table] == [str(n) for step in document["laying_order"] for n in step]
-    for row in table:
-        fibre = document["fibres"][int(row[1]) - 1]
-        assert row[2:4] == [fibre["fibre"], f"{fibre['depth_mm']:g} mm"]
-        assert float(row[5].split()[0]) == pytest.approx(fibre["cut_mm"], abs=0.051)
-    assert "of PLA" in page
-    assert "4 hours" in page
-
-
-@pytest.mark.parametrize(("resin", "plastic"), [(False, "124 g of PLA"), (True, "110 g of resin")])
-def test_page_weighs_the_mould(resin, plastic):
-    document = fabrication_document(Plan(Morphology.straight(1), with_settings(printer={"resin": resin})))
-    page = laying_page(document | {"mould_volume_ml": 100.0})
-    assert f"takes 100.0 ml, {plastic} if solid" in page
-
-
-def test_page_lists_resistance_and_fixed_resistor_of_every_fibre():
-    plan = Plan(Morphology.random(2, 3, seed=5), with_settings(fibre={"ohm_per_mm": 130.0, "min_bend_radius_mm": 2.5}))
-    document = fabrication_document(plan)
-    page = laying_page(document)
-    table = rows(page.partition("## Wire")[2], "number")
-    assert [row[:2] for row in table] == [[str(f["number"]), f["fibre"]] for f in document["fibres"]]
-    for fibre, (*_, resistance, fixed) in zip(document["fibres"], table, strict=True):
-        assert fibre["resistance_ohm"] == pytest.approx(130 * fibre["cut_mm"], abs=130 * 0.0051)
-        assert float(resistance.removesuffix(" kOhm")) == pytest.approx(fibre["resistance_ohm"] / 1e3, rel=0.005)
-        assert float(fixed.removesuffix(" kOhm")) * 1e3 == fibre["divider_ohm"]
-    assert "carbon-black TPE bears 80 % of stretch at most and bends of no less than 2.5 mm radius." in page
-
-
-@pytest.mark.parametrize(
-    ("silicone", "pot_life", "cure"),
-    [
-        ({"name": "Dragon Skin 10 fast"}, "8 minutes", "75 minutes"),
-        ({"name": "EcoFlex 00-50", "cure_h": 2.5, "pot_life_min": 120}, "2 hours", "2.5 hours"),
-    ],
-)
-def test_page_follows_silicone(silicone, pot_life, cure):
-    plan = Plan(Morphology.straight(2), with_settings(silicone=silicone))
-    page = laying_page(fabrication_document(plan))
-    assert f"The pot life is {pot_life}:" in page
-    assert f"Leave it for {cure} at room temperature." in page
-    assert rows(page, plan.settings.silicone.material.name)
-    assert "shrinks by 0.1 %" in page
-
-
-def test_page_omits_absent_parts():
-    plain = fabrication_document(Plan(Morphology.straight(2)))
-    page = laying_page(plain)
-    for absent in ("holder", "machine", "the lid", "of resin", "pour through its spout"):
-        assert absent not in page
-    section = page.partition("## Orientation\n")[2].partition("\n## ")[0]
-    assert orientation_sentence((2, 2), "edges") in section
-    assert "Horizontal fibres are 1 to 2, vertical ones 3 to 4." in section
-    assert f"]({ORIENTATION_FILE})" in section
-    wire = page.partition("## Wire")[2].partition("##")[0]
-    assert {fibre["resistance_ohm"] for fibre in plain["fibres"]} == {None}
-    assert "unknown: measure 100 mm of it and set `[fibre] ohm_per_mm`" in wire
-    assert "|" not in wire
-    assert rows(page, "PrusaSlicer")[0][:3] == [*2 * ["Layer height: 0.1 mm"], "Layer Height: 0.1 mm"]
-    table = rows(page, "fibres")
-    assert [row[0] for row in table] == ["1 and 3", "1 and 4", "2 and 3", "2 and 4"]
-    assert table[0][1:3] == ["-5.6 mm", "-5.6 mm"]  # fibres 1 and 3 meet at the lower left of the tray
-    page = laying_page(plain | {"files": ["mould.stl", "laying.gcode", "laying.script", "toolpath.svg"]})
-    assert "in `laying.gcode` and `laying.script` and drawn in `toolpath.svg`" in page.partition("## Lay\n")[2]
-    page = laying_page(fabrication_document(Plan(Morphology.straight(4), with_settings({"holder": True}))))
-    assert "tracks up; fibres 1 and 5 start at the cut corner" in page
-
-
 def test_page_lists_failed_checks_and_follows_settings():
     findings = (
         {"name": "bed", "status": "pass", "message": "fits", "positions_mm": []},
@@ -279,7 +204,7 @@ def test_every_slicer_has_every_setting_and_reason():
 
 @pytest.mark.parametrize(
     ("floor", "layer", "nozzle", "first"),
-    [(2, 0.1, 0.4, 0.2), (2, 0.2, 0.4, 0.2), (2, 0.3, 0.4, 0.2), (2.05, 0.1, 0.4, 0.15), (0.4, 0.2, 1, 0.4)],
+    [(2, 0.3, 0.4, 0.2), (2.05, 0.1, 0.4, 0.15), (0.4, 0.2, 1, 0.4)],
 )
 def test_floor_above_first_layer_is_whole_layers(floor, layer, nozzle, first):
     printer = PrinterSettings(layer_mm=layer, nozzle_mm=nozzle)
@@ -295,8 +220,6 @@ def test_floor_above_first_layer_is_whole_layers(floor, layer, nozzle, first):
     ("ridge", "nozzle", "width", "why"),
     [
         (0.4, 0.4, "0.4 mm", "0.4 mm wide is one line"),
-        (0.5, 0.4, "0.5 mm", "0.5 mm wide is one line"),
-        (0.8, 0.4, "0.4 mm", "0.8 mm wide is 2 lines"),
         (0.65, 0.4, "0.65 mm", "0.65 mm wide is one line"),  # two would be narrower than 0.85 nozzles
         (0.68, 0.4, "0.34 mm", "0.68 mm wide is 2 lines"),
         (0.4, 0.6, "0.51 mm", "0.4 mm wide is narrower than the nozzle: see the checks"),
@@ -307,7 +230,7 @@ def test_ridge_is_whole_lines(ridge, nozzle, width, why):
     assert print_setting("Extrusion width, External perimeters", mould, printer) == (width, f"a ridge {why}")
 
 
-@pytest.mark.parametrize(("layer", "layers"), [(0.1, 8), (0.2, 4), (0.3, 3), (0.5, 2)])
+@pytest.mark.parametrize(("layer", "layers"), [(0.1, 8), (0.3, 3)])
 def test_solid_layers_hide_the_infill_below_them(layer, layers):
     value, _ = print_setting("Solid layers, Top", MouldSettings(), PrinterSettings(layer_mm=layer))
     assert value.startswith(f"{layers}; ")  # 0.8 mm or more
@@ -475,5 +398,9 @@ def test_page_says_what_the_settings_ask_for():
         "The pad is worn on a cylinder whose axis runs along y, the face with the tracks outwards: fibres stretch"
         " by 3 %."
     )
+    unknown = document["fibre"] | {"ohm_per_mm": None}
+    [line] = section(page(fibre=unknown), "Wire")
+    assert "unknown: measure 100 mm of it and set `[fibre] ohm_per_mm`" in line
+    assert f"]({ORIENTATION_FILE})" in section(document, "Orientation")[-1]
     plain = document["fibre"] | {"max_strain": None, "min_bend_radius_mm": None}
     assert section(page(fibre=plain), "Lay")[1].endswith("with 20 mm out at both ends.")

@@ -83,20 +83,6 @@ def test_section_counts_checks_and_gives_first_positions(made: Path) -> None:
     assert text.index("so thin") < text.index("is warn") < text.index("Checks that pass") < text.index("is pass")
 
 
-@pytest.mark.parametrize(
-    ("deep", "key"),
-    [
-        ("horizontal", "Tops of horizontal ridges are blue, of vertical ones and the numbers orange."),
-        ("vertical", "Tops of horizontal ridges and the numbers are blue, of vertical ones orange."),
-    ],
-)
-def test_numbers_have_the_colour_of_the_shallow_family(made: Path, deep: str, key: str) -> None:
-    document = json.loads((made / "fabrication.json").read_text())
-    document["settings"]["pad"]["deep_family"] = deep
-    mould, _ = fabrication_sections(made, document)
-    assert key in "".join(mould.body)
-
-
 def test_oversized_mesh_is_simplified_or_omitted(made: Path, pad: Path, monkeypatch) -> None:
     mould = pack_mesh(made / "mould.stl")
     assert mould

@@ -1,6 +1,5 @@
 """The report: one page that holds everything, lets nothing in, and is honest about files it cannot read."""
 
-import hashlib
 import json
 import re
 import shutil
@@ -13,10 +12,9 @@ import pytest
 from markupsafe import escape
 
 from padforge.design.common.files import provenance
-from padforge.design.common.plotting import ALARM, HORIZONTAL, VERTICAL
+from padforge.design.common.plotting import HORIZONTAL, VERTICAL
 from padforge.design.common.validation import Fault, InputError
 from padforge.design.contact import FIBRE_BLUR_MM, contact_press, half_widths_mm, profile_weights
-from padforge.design.layer import Tool
 from padforge.design.morphology import Morphology
 from padforge.design.report import contact_lines, contact_sections, design_sections, draw_press, press_sections
 from padforge.design.settings import Contact, RulesSettings
@@ -33,7 +31,6 @@ from padforge.sense.report.sections import (
 from tests.helpers.less import blank_pictures
 from tests.padforge.report.conftest import (
     HOSTILE,
-    PAD,
     contacts_document,
     design_document,
     errors,
@@ -82,33 +79,6 @@ def test_text_from_files_is_escaped(pad: Path) -> None:
     assert text.count("<script") == text.count("</script>") == 3
 
 
-def test_report_shows_results_of_rules_and_checks(pad: Path) -> None:
-    design, mould = design_document(), json.loads((pad / "fabrication.json").read_text())
-    broken = {"rule": "min_gap_mm", "fibres": [1, 2], "measured": 0.25, "limit": 0.8, "place_mm": [1.0, 2.0]}
-    design["violations"] = [broken]
-    mould["findings"][0] |= {"status": "warn", "message": "thin", "positions_mm": [[k, 0.5] for k in range(5)]}
-    written(pad / "design.json", design)
-    written(pad / "fabrication.json", mould)
-    text = write_report(pad).read_text()
-    assert re.search(r'<td class="fail">fail</td><td.*?>min_gap_mm</td>', text)
-    assert re.search(r'<td class="pass">pass</td><td.*?>border_mm</td>', text)
-    assert "(1.0, 2.0)" in text
-    assert '<td class="warn">warn</td><td>thin</td>' in text.replace(' class="short"', "")
-    assert "(0.0, 0.5) (1.0, 0.5) (2.0, 0.5) and 2 more" in text
-
-
-def test_report_compares_with_straight_fibres(pad: Path) -> None:
-    text = write_report(pad).read_text()
-    assert "expected error of the design" in text
-    rows = [[cell.strip() for cell in row] for row in error_rows(text)]
-    assert rows == [["0", "0.675", "1.35"], ["1", "0.900", "2.70"]]
-
-
-def error_rows(text: str) -> list[list[str]]:
-    table = text.partition("Errors by failed fibres")[2].partition("</table>")[0]
-    return [re.findall(r"<td.*?>(.*?)</td>", row) for row in table.split("<tr>")[2:]]
-
-
 def test_report_contains_laying_guide(made: Path, page: Path) -> None:
     document, text = json.loads((made / "fabrication.json").read_text()), page.read_text()
     for fibre in document["fibres"]:
@@ -117,13 +87,6 @@ def test_report_contains_laying_guide(made: Path, page: Path) -> None:
     for line in (made / "laying.md").read_text().split("\n"):
         if line.startswith(("1. ", "2. ")):
             assert escape(line[3:]) in text
-
-
-def test_report_names_worst_failures(page: Path) -> None:
-    text = page.read_text()
-    assert "of one fibre, 2 (4.25 mm); of two fibres, 2 and 4 (6.25 mm)" in text
-    assert "<title>without 2 and 4: 6.25 mm</title>" in text
-    assert text.count("<title>without ") == 4 + 6
 
 
 def test_fibre_loss_study_replaces_errors_of_calibration(pad: Path) -> None:
@@ -164,11 +127,9 @@ def test_provenance_names_inputs_elsewhere_and_opens_none(pad: Path) -> None:
 
 def test_report_warns_of_design_of_other_pad(pad: Path) -> None:
     document = json.loads((pad / "design.json").read_text())
-    digest = hashlib.sha256((pad / "morphology.json").read_bytes()).hexdigest()
-    for of, strange in ((digest, False), ("0" * 64, True)):
-        written(pad / "design.json", document | {"morphology_sha256": of})
-        with pytest.raises(Fault, match=r"design .* is of another pad") if strange else nullcontext():
-            write_report(pad)
+    written(pad / "design.json", document | {"morphology_sha256": "0" * 64})
+    with pytest.raises(Fault, match=r"design .* is of another pad"):
+        write_report(pad)
 
 
 def test_report_warns_of_errors_on_other_recording(pad: Path) -> None:
@@ -189,20 +150,7 @@ def test_report_warns_of_errors_on_other_recording(pad: Path) -> None:
     write_report(pad)
 
 
-def test_names_in_documents_never_leave_the_folder(pad: Path) -> None:
-    """Else a report would tell of any file whether it is the one that somebody has the digest of."""
-    outside = pad.parent / "secret.txt"
-    outside.write_text("secret")
-    document = json.loads((pad / "design.json").read_text())
-    digest = hashlib.sha256(b"secret").hexdigest()
-    document["provenance"]["inputs"] = {str(outside): digest, "../secret.txt": digest, "/dev/zero": digest}
-    (pad / "design.json").write_text(json.dumps(document))
-    text = write_report(pad).read_text()
-    assert text.count(digest) == 3
-    assert f"{digest} (" not in text
-
-
-@pytest.mark.parametrize("name", ["design", "fabrication", "calibration", "studies/drift"])
+@pytest.mark.parametrize("name", ["design", "calibration"])
 def test_report_works_with_one_stage(made: Path, tmp_path: Path, name: str) -> None:
     (tmp_path / "studies").mkdir()
     shutil.copy(made / f"{name}.json", tmp_path / f"{name}.json")
@@ -223,9 +171,7 @@ DAMAGED = {
     "fabrication.json": ['{"format": "padforge-fabrication/2", "findings": []}'],
     "calibration.json": ['{"format": "padforge-calibration/3", "errors": []}'],
     "fibre_loss.json": ['{"format": "padforge-fibre-loss/3", "methods": {"x": {"by_subset": [{"failed": [1]}]}}}'],
-    "recording/start.json": ['{"format": "padforge-recording/2", "fibres": 4}'],
     "mould.stl": ["solid nothing"],
-    "mould.png": ["no picture"],
     "studies/drift.json": [
         '{"format": "padforge-study-drift/2", "title": "a", "text": [], "rows": [{"a": 1}, {"b": 1}]}'
     ],
@@ -241,7 +187,7 @@ def test_report_refuses_damaged_file_in_one_line(pad: Path, name: str, content: 
     assert "\n" not in str(told.value)
 
 
-@pytest.mark.parametrize("name", ["mould.stl", "mould.png", "tracks.png", "orientation.svg"])
+@pytest.mark.parametrize("name", ["mould.stl", "orientation.svg"])
 def test_report_omits_mould_of_other_checks(
     pad: Path, tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -252,26 +198,6 @@ def test_report_omits_mould_of_other_checks(
         InputError, match=rf"{name}: is not the one fabrication\.json was written with; fabricate again"
     ):
         write_report(pad)
-
-
-def test_report_omits_pictures_of_other_mould(pad: Path) -> None:
-    build(PAD, pad, ["stl"])
-    shutil.copy(pad / "studies" / "drift.png", pad / "mould.png")
-    pictures = write_report(pad).read_text().count("data:image/")
-    assert pictures == 4, "plan, press, which way round, and the study's figure"
-
-
-def test_report_shows_errors_by_contact(page: Path) -> None:
-    assert contact_lines(contacts_document()) == [
-        "contact: expected error 0.50 mm under the assumed contact, 4.00 to 4.00 mm otherwise;"
-        " of straight fibres 1.00 mm under the assumed contact, 3.00 to 3.00 mm otherwise",
-        "  straight fibres are as good or better: published disc, K = 0.6 with 0 and 1 failed",
-    ]
-    section = page.read_text().split("Contact model</h2>")[1].split("</section>")[0]
-    rows = [re.findall(r"<td.*?>(.*?)</td>", row) for row in re.findall(r"<tr>(.*?)</tr>", section, re.S)]
-    assert ["published disc, K = 0.6", "designed", "4.00", "6.00"] in rows
-    assert ["", "designed / straight", "133%", "120%"] in rows
-    assert len([row for row in rows if row]) == 6
 
 
 def test_report_shows_depth_and_force(pad: Path) -> None:
@@ -286,16 +212,11 @@ def test_report_shows_depth_and_force(pad: Path) -> None:
     ]
     journal = "".join(json.dumps(line) + "\n" for line in lines)
     (pad / "recording" / "journal.ndjson").write_text(journal)
-    document = json.loads((pad / "calibration.json").read_text())
-    for row in document["errors"]:
-        row |= {"depth_mean_mm": 0.123, "depth_p95_mm": 0.3, "depth_within_r90": 0.912}
-    (pad / "calibration.json").write_text(json.dumps(document))
     page = write_report(pad).read_text()
     words = " ".join(re.sub("<[^>]*>", " ", page).split())
     assert "presses 0.5 to 5 mm deep" in words
     for row in (("depth commanded (mm)", 2, "0.50", "2.75", "5.00"), ("force (N)", 1, "1.25", "1.25", "1.25")):
         assert " ".join(map(str, row)) in words
-    assert "depth, mean (mm) 95 % in r90 0 0.12 0.30 91.2%" in words
     (pad / "recording" / "journal.ndjson").write_text("{}\n")
     with pytest.raises(InputError, match=r"journal\.ndjson: line 1"):
         write_report(pad)
@@ -316,21 +237,13 @@ def test_report_compares_strain_of_fibres_with_what_they_bear(pad: Path) -> None
     assert not (pad / "press.png").exists()
 
 
-def test_report_of_other_contacts_has_no_press(pad: Path) -> None:
-    design = design_document()
-    design["provenance"]["settings"]["contact"] = Contact(radius=0.6).model_dump(mode="json")
-    written(pad / "design.json", design)
-    assert ">Press</h2>" not in write_report(pad).read_text()
-
-
-@pytest.mark.parametrize("tool", ["dome", "ball"])
-def test_drawn_tool_touches_the_face_within_its_contact(tool: Tool) -> None:
+def test_drawn_tool_touches_the_face_within_its_contact() -> None:
     """The silicone follows the tool up to the edge of the contact, where it leaves it downwards."""
-    contact = Contact(tool=tool, tool_radius_mm=12.0, depth_mm=2.0, thickness_mm=8.0)
+    contact = Contact(tool="ball", tool_radius_mm=12.0, depth_mm=2.0, thickness_mm=8.0)
     edge_mm = contact_press(contact).contact_radius_mm
     section = draw_press(contact, 11.25).axes[0]
     x, face = (np.asarray(part, float) for part in section.lines[0].get_data())
-    rise = x**2 / 24 if tool == "dome" else 12 - np.sqrt(np.maximum(12**2 - x**2, 0))
+    rise = 12 - np.sqrt(np.maximum(12**2 - x**2, 0))
     inside = np.abs(x) < 0.95 * edge_mm
     np.testing.assert_allclose(face[inside], 6.0 + rise[inside], atol=0.02)
     # of the tool: its surface, and the top of the picture
@@ -338,14 +251,6 @@ def test_drawn_tool_touches_the_face_within_its_contact(tool: Tool) -> None:
     for at, height in zip(x, 6.0 + rise, strict=True):
         if edge_mm < abs(at) and height < drawn[:, 1].max():
             assert np.isclose(drawn[np.isclose(drawn[:, 0], at), 1], height).any()
-
-
-def test_fibre_loss_lists_mean_errors_of_the_sets_that_a_fibre_is_in() -> None:
-    errors_mm = {(): 1.0, (0,): 2.0, (1,): 4.0, (2,): 8.0, (0, 1): 10.0, (0, 2): 20.0, (1, 2): 30.0}
-    by_subset = [{"failed": list(failed), "mean_mm": error} for failed, error in errors_mm.items()]
-    (section,) = fibre_loss_sections(Path(), {"by_subset": by_subset})
-    words = " ".join(re.sub("<[^>]*>", " ", " ".join(section.body)).split())
-    assert "alone (mm) with one fibre more 1 2.00 15.00 2 4.00 20.00 3 8.00 25.00" in words
 
 
 def test_loss_chart_has_two_failed_fibres_in_the_column_of_the_first_and_the_row_of_the_second() -> None:
@@ -366,56 +271,6 @@ def test_loss_chart_has_two_failed_fibres_in_the_column_of_the_first_and_the_row
         assert float(row[0]) < corners["1"][0]
         assert float(column[0]) == pytest.approx(x + 19)
         assert float(column[1]) > corners["3"][1] + 40
-
-
-def test_drawn_fibres_sink_by_the_strain_below_them() -> None:
-    contact = Contact()
-    press, height_mm = contact_press(contact), contact.thickness_mm - contact.fibre_depths_mm[0]
-    heights_mm = (np.arange(40) + 0.5) / 40 * height_mm
-    x, drawn = (np.asarray(part, float) for part in draw_press(contact, 11.25).axes[0].lines[2].get_data())
-    strains = [press.strains(np.abs(x), z, FIBRE_BLUR_MM).compressive for z in heights_mm]
-    sunk = np.mean(strains, axis=0) * height_mm
-    np.testing.assert_allclose(drawn, height_mm - sunk, atol=0.01 * sunk.max())
-
-
-def test_press_stretches_fibres_by_the_greater_of_both_strains_in_the_plane(monkeypatch: pytest.MonkeyPatch) -> None:
-    blank_pictures(monkeypatch)
-    contact = Contact(tool="flat", tool_radius_mm=5.0, depth_mm=1.0, fibre_depths_mm=(0.8, 0.8))
-    press = contact_press(contact)
-    r = np.linspace(0, 2 * press.contact_radius_mm, 100)
-    strains = press.strains(r, contact.thickness_mm - 0.8, FIBRE_BLUR_MM)
-    greatest = sorted((strains.radial.max(), strains.hoop.max()))
-    assert greatest[1] > 1.2 * greatest[0]
-    document = {"provenance": {"settings": {"contact": contact.model_dump(mode="json"), "pad": {}}}}
-    (section,) = press_sections(document, None)
-    cells = [re.findall(r"<td[^>]*>(.*?)</td>", row) for row in re.findall(r"<tr>(.*?)</tr>", section.body[-1], re.S)]
-    assert [row[4] for row in cells if row] == [f"{greatest[1]:.0%}"] * 2
-
-
-def test_loss_chart_of_many_fibres_is_as_legible_and_has_the_scale_of_its_colours() -> None:
-    """Cells have no numbers then, and every fifth fibre a label; letters grow with the chart."""
-    charts = {}
-    for fibres in (16, 17, 60):
-        single = {(fibre,): 1.0 + fibre for fibre in range(fibres)}
-        pairs = {(first, second): 100.0 for first in range(fibres) for second in range(first + 1, fibres)}
-        text = loss_chart({(): 0.25} | single | pairs, fibres)
-        width, height = map(float, re.findall(r'viewBox="0 0 (\d+) (\d+)"', text)[0])
-        labels = re.findall(r'<text x="([\d.]+)" y="([\d.]+)" font-size="(\d+)">(\d+)</text>', text)
-        sizes = {int(size) for *_, size, _ in labels}
-        charts[fibres] = (width, max(sizes), len(labels))
-        numbers = [str(n) for n in range(1, fibres + 1) if fibres == 16 or n % 5 == 0]
-        assert [number for *_, number in labels] == [number for number in numbers for _ in range(2)]
-        assert "0.25</text>" in text  # the least
-        assert "100.00 mm</text>" in text  # and the greatest
-        assert all(0 <= float(x) <= width and 0 <= float(y) <= height for x, y, *_ in labels)
-        shades = re.findall(r'height="\d+" fill="#(\w+)"/>', text)
-        assert len(shades) == 5
-        reds_alike = [int(shade[2:4], 16) for shade in shades]  # greens fall as the colour becomes ALARM
-        assert reds_alike == sorted(reds_alike, reverse=True)
-        assert f"#{shades[-1]}" == ALARM.lower()
-    assert [count for *_, count in charts.values()] == [32, 6, 24]
-    legible = charts[16][1] / charts[16][0]
-    assert all(size / width > 0.9 * legible for width, size, _ in charts.values())
 
 
 def words(body: Sequence[str]) -> str:
@@ -526,7 +381,6 @@ def test_press_is_drawn_with_weights_lengthwise_and_crosswise() -> None:
             {"kind": "rig", "rig": {"rate_hz": 50, "depths_mm": [4.0, 1.5]}},
             "a rig, 50 a second; presses 1.5 to 4 mm",
         ),
-        ({"kind": "hand", "rig": {"rate_hz": 10, "depth_mm": 5.0}}, "presses by hand, 10 a second."),
         ({"kind": "published", "file": "5.mat"}, "from 5.mat."),
         ({"kind": "simulated", "twin": {}}, "the simulated rig, by the twin of a printed pad."),
     ],
