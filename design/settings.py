@@ -531,7 +531,7 @@ class SearchSettings(Settings):
     knots: int = Field(default=21, ge=1, le=64, description="inner knots per fibre (N); the rules take 3 a turn")
     starts: int = Field(default=4, ge=1, le=10_000, description="random starts of the gradient search")
     steps: Steps = Field(
-        default=None, description="steps of a start of the gradient search, by its contact: 1000, of a shape 3000"
+        default=None, description="steps of a start of the gradient search, by its contact: 1200, of a shape 3000"
     )
     population: int = Field(default=200, ge=4, le=100_000, description="pads per generation of the genetic search")
     generations: int = Field(default=50, ge=1, le=1_000_000, description="generations of the genetic search")

@@ -262,7 +262,7 @@ def test_what_fine_steps_do_not_repair_firm_ones_do():
 @pytest.mark.parametrize(
     ("contact", "others", "steps", "expected"),
     [
-        (Contact(), (), None, 1000),
+        (Contact(), (), None, 1200),
         (PUBLISHED_CONTACT, (), None, 3000),
         (Contact(), (PUBLISHED_CONTACT,), None, 3000),
         (PUBLISHED_CONTACT, (), 7, 7),
