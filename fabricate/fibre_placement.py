@@ -207,13 +207,14 @@ def gcode(plan: Plan, steps: Sequence[Step]) -> str:
         for stroke in step.strokes:
             name = f"fibre {stroke.fibre + 1}, {fibre_name(plan, stroke.fibre)}"
             (start_x, start_y), *corners = stroke.positions_mm.tolist()
+            end_x, end_y = corners[-1]
             move_to(start_x, start_y, height, dispenser.travel_mm_s)
             move_to(start_x, start_y, stroke.z_mm, dispenser.feed_mm_s)
             lines.append(f"M0 ({name}: fasten its end under the needle)")
             for (u, v), feed in zip(corners, stroke.feeds_mm_s.tolist(), strict=True):
                 move_to(u, v, stroke.z_mm, feed)
             lines.append(f"M0 ({name}: cut it at the needle)")
-            move_to(*corners[-1], height, dispenser.travel_mm_s)
+            move_to(end_x, end_y, height, dispenser.travel_mm_s)
         lines.append(f"M0 (layer {number} of {len(steps)}, {step.layer.depth_mm:.3g} mm deep: seal it and let it cure)")
     return "\n".join([*lines, ""])
 

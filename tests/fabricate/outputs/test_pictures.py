@@ -55,7 +55,7 @@ def count_colour(picture: np.ndarray, colour: str) -> int:
 def faces_of(figure: Figure) -> tuple[np.ndarray, list[str]]:
     """Return the corners (m, 3, 2) of the triangles of a mesh, in drawing order, and their colours."""
     [faces] = figure.axes[0].collections
-    corners = np.array([path.vertices[:3] for path in faces.get_paths()])
+    corners = np.array([np.asarray(path.vertices)[:3] for path in faces.get_paths()])
     return corners, [to_hex(colour) for colour in np.asarray(faces.get_facecolor())]
 
 
@@ -71,7 +71,7 @@ def colour_at(faces: tuple[np.ndarray, list[str]], x: float, y: float) -> str:
 
 
 def test_mould_picture_has_colours_by_family_and_height(tmp_path, figures):
-    mould = {"wall_draft_deg": 10.0, "ridge_draft_deg": 8.0, "pins": True}
+    mould: dict[str, object] = {"wall_draft_deg": 10.0, "ridge_draft_deg": 8.0, "pins": True}
     plan = Plan(level_pad(1.8, 1.2), with_settings(mould, pad={"keep_out_mm": [[[8, 8], [9, 8], [9, 9], [8, 9]]]}))
     draw_mould(plan, *mesh_of(plan), [], tmp_path / "mould.png")
     faces = faces_of(figures[0])
@@ -137,7 +137,7 @@ def texts_in(figure: Figure, panel: int, low: float, high: float) -> dict[str, n
     positions = {
         text.get_text(): np.array(text.get_position())
         for text in figure.axes[0].texts
-        if text.get_ha() == "center"
+        if text.get_horizontalalignment() == "center"
         and abs(text.get_position()[0] - middle) < WIDTH_MM / 2
         and low < text.get_position()[1] < high
     }
@@ -175,9 +175,8 @@ def test_side_views_number_fibres_as_panels(tmp_path, figures):
 
 
 def test_orientation_picture_has_sentence_titles_and_numbers(tmp_path, figures):
-    for mould in ({}, {"number_mm": 0.0}):
-        plan = Plan(Morphology.straight(2), with_settings(mould))
-        draw_orientation(plan, tmp_path / "orientation.svg")
+    for settings in (with_settings(), with_settings({"number_mm": 0.0})):
+        draw_orientation(Plan(Morphology.straight(2), settings), tmp_path / "orientation.svg")
     note = " ".join(text.get_text() for text in figures[0].texts)
     assert note == orientation_sentence((2, 2), "edges")
     assert {text.get_text() for text in figures[0].axes[0].texts} >= {"1  In the mould", "pad_angle_deg", "arm"}
@@ -204,8 +203,8 @@ def test_fibres_are_drawn_as_wide_as_they_are(tmp_path, figures):
 
 def test_colours_of_a_mesh_are_named_by_height_above_its_lowest_point(tmp_path, figures):
     low, high = (trimesh.creation.box(bounds=[(x, 0, 1), (x + 10, 10, z)]) for x, z in ((0, 3), (10, 6)))
-    steps = trimesh.util.concatenate([low, high])
-    draw_findings(steps.vertices, steps.faces, [], tmp_path / "mesh.png")
+    vertices, faces = np.vstack([low.vertices, high.vertices]), np.vstack([low.faces, high.faces + len(low.vertices)])
+    draw_findings(vertices, faces, [], tmp_path / "mesh.png")
     assert [text.get_text() for text in figures[0].axes[1].texts] == ["2 mm", "5 mm above the lowest point"]
 
 
@@ -268,7 +267,7 @@ def test_tracks_are_labelled_by_depth_with_a_number_at_every_end(tmp_path, figur
         line = np.array(plan.lines[fibre].coords)
         assert np.hypot(*(line[[0, -1]] - text.xy).T).min() < 3.5  # within the wall
         assert text.get_color() == (HORIZONTAL, VERTICAL)[plan.family(fibre)]
-        assert (text.get_ha(), text.get_va()) == ("center", "top")
+        assert (text.get_horizontalalignment(), text.get_verticalalignment()) == ("center", "top")
     bar = axes.lines[-1].get_xdata()
     assert bar[1] - bar[0] == pytest.approx(10)
     assert [text.get_text() for text in axes.texts if "mm" in text.get_text()] == ["10 mm"]
