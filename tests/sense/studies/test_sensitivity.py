@@ -53,7 +53,9 @@ def test_profile_has_no_size_to_vary() -> None:
 
 
 @pytest.mark.slow
-def test_study_finds_that_larger_objects_are_localized_better(tmp_path: Path) -> None:
+def test_study_finds_that_larger_objects_are_localized_better(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name, value in (("SIDE", 16), ("TEST", 200), ("HIDDEN", 12)):
+        monkeypatch.setattr(sensitivity, name, value)
     document = run(sensitivity_study(PADS, contact=PUBLISHED_CONTACT), tmp_path)
     assert len(document["rows"]) == 16
     keys = "trained_radius", "trained_sides", "radius", "sides"
