@@ -1,7 +1,7 @@
 """The contacts that a pad may really meet: those that a search serves, and those that a finished pad is judged by."""
 
 from padforge.design.contact import half_width_mm, widened
-from padforge.design.settings import MEASURED_PROFILE, MEASURED_STD_MM, PUBLISHED_CONTACT, Contact, SearchSettings
+from padforge.design.settings import MEASURED_STD_MM, PUBLISHED_CONTACT, Contact, SearchSettings
 
 NARROWER, WIDER = 0.75, 1.25
 """Widths of the isotropic profiles that a pad designed for a layer must serve, as shares of the measured one."""
@@ -31,7 +31,7 @@ def _plausible_contacts(assumed: Contact) -> dict[str, Contact]:
     if assumed.model == "layer":
         scale = half_width_mm(assumed) / half_width_mm(Contact())
         return {
-            f"isotropic, {half_width_mm(profile):.1f} mm": profile
+            f"isotropic, {half_width_mm(profile):.2g} mm": profile
             for profile in (widened(Contact(model="profile"), scale * share) for share in (NARROWER, WIDER))
         }
     if assumed.model == "profile":
@@ -56,10 +56,7 @@ def judged_contacts(assumed: Contact, search: SearchSettings) -> dict[str, Conta
         others = {name: Contact(**assumed.model_dump() | change) for name, change in changes.items()}
     else:
         others = {
-            f"profile of {std:g} mm": Contact(
-                sensitivity_profile=tuple((std / MEASURED_STD_MM * d, weight) for d, weight in MEASURED_PROFILE)
-            )
-            for std in PROFILE_STD_MM
+            f"profile of {std:g} mm": widened(Contact(model="profile"), std / MEASURED_STD_MM) for std in PROFILE_STD_MM
         }
         others["published disc, K = 0.6"] = PUBLISHED_CONTACT
     served = served_contacts(assumed, search)

@@ -380,7 +380,8 @@ class GradientSearch:
             presses = objective.window_presses(pad, window, objective.SEARCH_SIDE, self.rng)
         masks = sample_failures(pad.layout.fibres, shares, self.rng)
         # 2. errors under one contact, and how straight fibres compare
-        value, by_means = objective.relative_error(self._means, straight := self.problem.straight_errors, shares)
+        straight = self.problem.straight_errors
+        value, by_means = objective.relative_error(self._means, straight, shares)
         parts = (by_means * self._means).sum(axis=1) / value  # in the mean, of each contact; they add up to 1
         which = int(self.rng.choice(len(parts), p=parts))
         contact, scale = self.problem.contacts[which], self.scales[which]

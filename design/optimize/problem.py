@@ -58,10 +58,14 @@ class SearchProblem:
         """Return what a search minimises, always on the same presses: terms are those under the main contact."""
         shares = failure_shares(self.search.max_failures)
         value, _ = relative_error(self._criterion(pad), self.straight_errors, shares)
-        scored = ScoredPad(pad, self.contacts[0], self.search, self.rules, self.pad)
+        scored = self.scored(pad)
         return value + sum(
             weight * scored.terms([term.name])[term.name] for weight, term in weighted_terms(self.search)
         )
+
+    def scored(self, pad: Morphology) -> ScoredPad:
+        """Return the scores of a pad under the main contact."""
+        return ScoredPad(pad, self.contacts[0], self.search, self.rules, self.pad)
 
     def _criterion(self, pad: Morphology) -> Array:
         return np.array([criterion_errors(pad, contact, self.search, self.pad) for contact in self.contacts])

@@ -159,6 +159,7 @@ def search(
     finished = sum(bool(state["done"]) for state in states.values())
     profiling.add_count("starts", len(problem.starts) - finished, len(problem.starts))
     with profiling.stage("search"), stop_on_interrupt(stop):
+        _ = problem.straight_errors  # kept with the problem, else every slice on a cluster computes them
         starts, half_way = [*problem.starts], problem.steps // 2 // HISTORY_STEPS * HISTORY_STEPS
         if len(starts) > MIN_STARTS and half_way:
             _advance(problem, starts, half_way, states, stop, run, checkpoints)
@@ -203,8 +204,7 @@ class Candidate:
     @cached_property
     def scored(self) -> ScoredPad:
         """Its scores under the main contact."""
-        p = self.problem
-        return ScoredPad(self.pad, p.contacts[0], p.search, p.rules, p.pad)
+        return self.problem.scored(self.pad)
 
     def to_result(self, straight: "Candidate") -> SearchResult:
         """Return the result of a search that ends with it."""

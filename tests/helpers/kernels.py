@@ -5,7 +5,6 @@
 
 import subprocess
 import sys
-import tempfile
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
@@ -50,10 +49,8 @@ def use_design() -> None:
 
 
 def use_other_stages() -> None:
-    """Call filters, the check of a mesh, a calibration and a twin."""
-    import trimesh
-
-    from padforge import design, fabricate, sense
+    """Call filters, a calibration and a twin."""
+    from padforge import design, sense
     from padforge.design.twin import PlanTransform
     from padforge.sense.twin.as_built import AsBuiltPad, PadPlan
 
@@ -61,10 +58,6 @@ def use_other_stages() -> None:
     sense.total_variation(readings, 2.0)
     sense.total_variation(readings, 2.0, "squares")
     sense.running_median(readings, 5)
-    with tempfile.TemporaryDirectory() as folder:
-        box = Path(folder) / "box.stl"
-        trimesh.creation.box((4, 4, 4)).export(box)
-        fabricate.check_mesh(box)
     straight = design.Morphology.straight(2)
     recording = sense.simulate(straight, sense.RigSettings(presses=60))
     quick = sense.LocalizerSettings(members=1, hidden=8, layers=1, epochs=1, batch=64, max_failures=1)
