@@ -4,8 +4,8 @@ from pathlib import Path
 
 import click
 
-from padforge.design.common.command_line import json_option, out_option, progress_bar, show_result
-from padforge.design.common.validation import InputError
+from padforge.common.command_line import json_option, out_option, progress_bar, show_result
+from padforge.common.validation import InputError
 
 BENCHES = {
     "contact": "contact:CONTACT",

@@ -12,7 +12,7 @@ from scipy.interpolate import PchipInterpolator
 from scipy.optimize import brentq
 
 from padforge.benchmarks.harness import Bench, BenchTrial
-from padforge.design.common.profiling import profiled
+from padforge.common.profiling import profiled
 from padforge.design.contact import signals, signals_quantized, signals_sparse
 from padforge.design.kernels.pchip import pchip_sample
 from padforge.design.morphology import Array, Morphology

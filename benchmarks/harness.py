@@ -18,11 +18,11 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
-from padforge.design.common.command_line import text_table
-from padforge.design.common.files import check_writable, provenance, read_json, write_json
-from padforge.design.common.plotting import CURVES, FAINT, INK, add_title, save_figure, style_axes
-from padforge.design.common.progress import OnProgress
-from padforge.design.common.validation import InputError
+from padforge.common.command_line import text_table
+from padforge.common.files import check_writable, provenance, read_json, write_json
+from padforge.common.plotting import CURVES, FAINT, INK, add_title, save_figure, style_axes
+from padforge.common.progress import OnProgress
+from padforge.common.validation import InputError
 
 ROUNDS = 3
 MAX_RECHECKS = 5

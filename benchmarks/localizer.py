@@ -12,9 +12,9 @@ import numpy as np
 import torch
 
 from padforge.benchmarks.harness import Bench, BenchTrial
+from padforge.common.parallel import one_torch_thread
+from padforge.common.progress import ignore_progress
 from padforge.design import Morphology
-from padforge.design.common.parallel import one_torch_thread
-from padforge.design.common.progress import ignore_progress
 from padforge.design.published.networks import fit_batch, initial_weights
 from padforge.sense import settings
 from padforge.sense.arrays import Array, Floats

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from padforge.benchmarks.harness import Bench, BenchTrial
-from padforge.design.common.parallel import one_torch_thread
+from padforge.common.parallel import one_torch_thread
 from padforge.design.contact import signals
 from padforge.design.morphology import Array, Morphology
 from padforge.design.objectives.fibre_loss import failure_subsets

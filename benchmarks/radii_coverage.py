@@ -12,8 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from padforge.common.parallel import one_torch_thread
 from padforge.design import Morphology
-from padforge.design.common.parallel import one_torch_thread
 from padforge.sense import LocalizerSettings, RigSettings, calibrate, simulate
 
 PRESSES = (300, 3000)

@@ -1,6 +1,3 @@
-from .common.settings import Spec as Spec
-from .common.validation import Fault as Fault
-from .common.validation import InputError as InputError
 from .contact import indented_signals as indented_signals
 from .contact import press_forces_n as press_forces_n
 from .contact import signals as signals

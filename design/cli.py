@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from padforge.design.common import command_line as common
+from padforge.common import command_line as common
 
 if TYPE_CHECKING:
     from rich.progress import TaskID
 
-    from padforge.design.common.progress import OnProgress
-    from padforge.design.common.settings import Spec
+    from padforge.common.progress import OnProgress
+    from padforge.common.settings import Spec
     from padforge.design.morphology import Morphology
     from padforge.design.objectives.rules import Violation
     from padforge.design.settings import Contact, PadSettings
@@ -102,8 +102,8 @@ def design(
     """
     if context.invoked_subcommand is not None:
         return
-    from padforge.design.common.files import locked_folder
-    from padforge.design.common.parallel import cluster
+    from padforge.common.files import locked_folder
+    from padforge.common.parallel import cluster
     from padforge.design.design_run import run_design, summary_lines
     from padforge.design.optimize.search import SearchOptions
     from padforge.design.settings import Contact
@@ -130,8 +130,8 @@ def show(morphology: Path, spec: Path | None, out: Path | None) -> None:
     padforge design show out/pad/morphology.json                  into out/pad/plan.svg
     padforge design show out/pad/morphology.json --out plan.png
     """
-    from padforge.design.common.plotting import save_figure
-    from padforge.design.common.validation import InputError
+    from padforge.common.plotting import save_figure
+    from padforge.common.validation import InputError
     from padforge.design.report import draw_plan
     from padforge.design.settings import read_contact
 
@@ -229,9 +229,9 @@ def edit(pad: Path | None, spec: Path | None, out: Path | None, force: bool, por
     Drag knots, or select them with Tab and move them with the arrow keys. Saving (Ctrl+S in the page) replaces no
     earlier file except the one that --out names. Ctrl-C here ends the session.
     """
-    from padforge.design.common.files import check_writable
-    from padforge.design.common.server import LocalPage, page_text
-    from padforge.design.common.validation import InputError
+    from padforge.common.files import check_writable
+    from padforge.common.server import LocalPage, page_text
+    from padforge.common.validation import InputError
 
     from .editor import EditSession, free_name
 
@@ -286,7 +286,7 @@ def import_(
     [pad] of the settings defines the number of fibres and where they end. Curves are read from layers or groups whose
     names begin with fibre, horizontal or vertical, or else from all open curves; an element named pad is the border.
     """
-    from padforge.design.common.files import atomic_files, check_replaceable, provenance
+    from padforge.common.files import atomic_files, check_replaceable, provenance
     from padforge.design.morphology import Morphology
     from padforge.design.objectives.rules import check_rules
     from padforge.design.paths.import_plan import import_plan

@@ -9,12 +9,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from padforge.design.common.command_line import text_table
-from padforge.design.common.files import provenance, write_json
-from padforge.design.common.plotting import CURVES, FAINT, add_caption, add_title, new_figure, save_figure, style_axes
-from padforge.design.common.profiling import stage
-from padforge.design.common.settings import Spec
-from padforge.design.common.validation import InputError, short_repr
+from padforge.common.command_line import text_table
+from padforge.common.files import provenance, write_json
+from padforge.common.plotting import CURVES, FAINT, add_caption, add_title, new_figure, save_figure, style_axes
+from padforge.common.profiling import stage
+from padforge.common.settings import Spec
+from padforge.common.validation import InputError, short_repr
 from padforge.design.contact import half_width_mm
 from padforge.design.contact_comparison import beside_straight, design_contact, errors_by_contact
 from padforge.design.contact_set import served_contacts

@@ -12,10 +12,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
-from padforge.design.common import profiling
-from padforge.design.common.parallel import map_chunks
-from padforge.design.common.settings import or_default
-from padforge.design.common.validation import MAX_VALUES, InputError, check_array, check_float, check_int, check_type
+from padforge.common import profiling
+from padforge.common.parallel import map_chunks
+from padforge.common.settings import or_default
+from padforge.common.validation import MAX_VALUES, InputError, check_array, check_float, check_int, check_type
 from padforge.design.kernels import geometry, measured_signals
 from padforge.design.kernels.exact_signals import exact_signals
 from padforge.design.kernels.pchip import population_slopes
@@ -95,17 +95,15 @@ def signals(pad: Morphology | Array, presses: ArrayLike, contact: Contact | None
 def relative_stretch(pad: Morphology, presses: ArrayLike, contact: Contact) -> Array:
     """Compute the relative stretch (Q, F) of each fibre, which is what a voltage divider measures: signal over length.
 
-    A fibre is a strain gauge: its resistance grows with its relative stretch, less on a longer fibre. Of a layer it is
-    summed over elements of the fibres, with a root mean squared error below 1e-3 of the largest, in a tenth of the
-    time of `signals`.
+    A fibre is a strain gauge: its resistance grows with its relative stretch, less on a longer fibre. Of a layer and of
+    a profile it is summed over elements of the fibres, with a root mean squared error below 1e-3 of the largest, in a
+    tenth of the time of `signals`.
     """
     return evaluated_signals(pad, presses, contact) / lengths(pad)
 
 
 def evaluated_signals(pad: Morphology, presses: ArrayLike, contact: Contact) -> Array:
-    """Compute `signals` (Q, F) as a pad is evaluated by them: of a layer to FINE_PRECISION, others exactly."""
-    if contact.model != "layer":
-        return signals(pad, presses, contact)
+    """Compute `signals` (Q, F) to evaluate a pad: by elements to FINE_PRECISION, those of a shape exactly."""
     return quick_signals(pad, presses, contact, measured_signals.FINE_PRECISION)
 
 

@@ -9,15 +9,15 @@ from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from padforge.design.common.files import provenance, write_json
-from padforge.design.common.profiling import stage
+from padforge.common.files import provenance, write_json
+from padforge.common.profiling import stage
 from padforge.design.contact_set import judged_contacts
 from padforge.design.morphology import Morphology
 from padforge.design.objectives.bayes_error import expected_errors
 from padforge.design.settings import Contact, PadSettings, SearchSettings, read_contact
 
 if TYPE_CHECKING:
-    from padforge.design.common.settings import Spec
+    from padforge.common.settings import Spec
 
 FORMAT, NAME = "padforge-contacts/1", "contacts.json"
 

@@ -5,11 +5,11 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from padforge.design.common import files
-from padforge.design.common.parallel import Checkpoints
-from padforge.design.common.plotting import save_figure
-from padforge.design.common.profiling import stage
-from padforge.design.common.validation import InputError
+from padforge.common import files
+from padforge.common.parallel import Checkpoints
+from padforge.common.plotting import save_figure
+from padforge.common.profiling import stage
+from padforge.common.validation import InputError
 from padforge.design.contact_comparison import design_contact
 from padforge.design.morphology import Morphology
 from padforge.design.objectives.rules import Violation
@@ -26,7 +26,7 @@ from padforge.design.report import FORMAT, draw_plan
 from padforge.design.settings import Contact, PadSettings, RulesSettings, SearchSettings
 
 if TYPE_CHECKING:
-    from padforge.design.common.settings import Spec
+    from padforge.common.settings import Spec
 
 SIGNIFICANT = 0.05  # relative difference of expected errors from which trained networks agree which pad is better
 MAX_VIOLATIONS = 10  # violations that the summary lists

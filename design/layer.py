@@ -28,7 +28,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from padforge.design.common.validation import InputError
+from padforge.common.validation import InputError
 
 Array = NDArray[np.float64]
 Tool = Literal["dome", "ball", "flat", "finger"]

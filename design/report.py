@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from padforge.design.common.page import PageSection, collapsible, columns, figures, heading, paragraph, table
-from padforge.design.common.plotting import (
+from padforge.common.page import PageSection, collapsible, columns, figures, heading, paragraph, table
+from padforge.common.plotting import (
     ALARM,
     FAINT,
     HORIZONTAL,
@@ -19,7 +19,7 @@ from padforge.design.common.plotting import (
     save_figure,
     style_axes,
 )
-from padforge.design.common.validation import InputError, check_array, check_type
+from padforge.common.validation import InputError, check_array, check_type
 from padforge.design.contact import FIBRE_BLUR_MM, contact_press, half_width_mm, half_widths_mm, profile_weights
 from padforge.design.layer import LayerPress
 from padforge.design.settings import Contact, Corners, PadSettings, RulesSettings

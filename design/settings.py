@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
 from pydantic import BeforeValidator, Field, ValidationInfo, field_validator, model_validator
 
-from padforge.design.common.settings import Settings, Spec, as_tuple, null_as, to_builtins, validate
-from padforge.design.common.validation import InputError, check_float, check_int, short_repr
+from padforge.common.settings import Settings, Spec, as_tuple, null_as, to_builtins, validate
+from padforge.common.validation import InputError, check_float, check_int, short_repr
 
 if TYPE_CHECKING:
     import numpy as np

@@ -6,7 +6,7 @@ from functools import cached_property
 
 import numpy as np
 
-from padforge.design.common import profiling
+from padforge.common import profiling
 from padforge.design.contact import element_spacings, press_shape, record_visits, weight_table
 from padforge.design.kernels.exact_gradient import signals_gradient
 from padforge.design.kernels.exact_signals import exact_signals

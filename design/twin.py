@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from padforge.design.common.files import read_json, write_json
-from padforge.design.common.validation import (
+from padforge.common.files import read_json, write_json
+from padforge.common.validation import (
     InputError,
     check_array,
     check_float,
@@ -22,7 +22,7 @@ from padforge.design.common.validation import (
     check_type,
     short_repr,
 )
-from padforge.design.common.validation import check_path as as_path
+from padforge.common.validation import check_path as as_path
 from padforge.design.contact import check_presses
 from padforge.design.kernels.geometry import EUCLIDEAN, profile_law
 from padforge.design.kernels.measured_signals import sum_elements

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from padforge.design.common.command_line import (
+from padforge.common.command_line import (
     json_option,
     load_spec,
     out_option,
@@ -14,10 +14,10 @@ from padforge.design.common.command_line import (
     show_result,
     spec_option,
 )
-from padforge.design.common.validation import InputError
+from padforge.common.validation import InputError
 
 if TYPE_CHECKING:
-    from padforge.design.common.settings import Spec
+    from padforge.common.settings import Spec
     from padforge.design.morphology import Morphology
 
 _MARKS = {"pass": "ok  ", "warn": "warn", "fail": "FAIL"}
@@ -86,7 +86,7 @@ def build(morphology: Path, formats: tuple[str, ...], spec: Path | None, out: Pa
 
     The mould is written whatever the checks find, and their findings are printed; `check` exits 1 when one fails.
     """
-    from padforge.design.common.files import locked_folder
+    from padforge.common.files import locked_folder
     from padforge.design.morphology import Morphology
     from padforge.fabricate.export import build as build_files
 
@@ -133,7 +133,7 @@ def check(ctx: click.Context, mesh_or_morphology: Path, spec: Path | None, pictu
     padforge fabricate check out/pad/mould.stl
     padforge fabricate check out/pad/morphology.json --picture findings.png
     """
-    from padforge.design.common.files import atomic_file
+    from padforge.common.files import atomic_file
     from padforge.fabricate.checks.plan_checks import check_file
     from padforge.fabricate.outputs.pictures import draw_findings
 

@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from padforge.design.common import profiling
-from padforge.design.common.files import (
+from padforge.common import profiling
+from padforge.common.files import (
     atomic_files,
     check_file,
     find_unchanged,
@@ -27,7 +27,7 @@ from padforge.design.common.files import (
     sha256,
     write_json,
 )
-from padforge.design.common.validation import InputError, check_path, check_type, short_repr
+from padforge.common.validation import InputError, check_path, check_type, short_repr
 from padforge.design.morphology import Morphology
 from padforge.fabricate.checks import Finding, check_result
 from padforge.fabricate.checks.mesh_checks import SOLID_CHECKS, check_solid, check_triangles

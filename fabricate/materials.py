@@ -12,7 +12,7 @@ from typing import Annotated, Any, ClassVar
 from pydantic import BeforeValidator, Field, field_validator, model_validator
 from pydantic_core import PydanticCustomError
 
-from padforge.design.common.settings import Settings, as_tuple, null_as
+from padforge.common.settings import Settings, as_tuple, null_as
 
 PUBLISHED = "published"
 

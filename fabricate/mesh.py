@@ -12,8 +12,8 @@ import numpy as np
 from manifold3d import CrossSection, Manifold, OpType
 from numpy.typing import NDArray
 
-from padforge.design.common.files import check_file
-from padforge.design.common.validation import InputError, check_path
+from padforge.common.files import check_file
+from padforge.common.validation import InputError, check_path
 from padforge.design.morphology import Array
 from padforge.fabricate.mould import BODY_COLOURS, Body, Prism, mould_body
 from padforge.fabricate.plan import Plan, polygon_rings

@@ -14,7 +14,7 @@ import numpy as np
 import shapely
 from shapely.geometry.base import BaseGeometry
 
-from padforge.design.common.validation import InputError
+from padforge.common.validation import InputError
 from padforge.fabricate.plan import Plan, offset_box
 from padforge.fabricate.settings import WELL_MM, WELL_RIM_MM, WELL_SLOT_MM
 

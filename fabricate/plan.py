@@ -15,8 +15,8 @@ import shapely
 from shapely import affinity
 from shapely.geometry.base import BaseGeometry
 
-from padforge.design.common.plotting import HORIZONTAL, VERTICAL
-from padforge.design.common.validation import InputError, check_type
+from padforge.common.plotting import HORIZONTAL, VERTICAL
+from padforge.common.validation import InputError, check_type
 from padforge.design.morphology import Array, Morphology
 from padforge.design.paths.curves import (
     Crossing,

@@ -6,8 +6,8 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field, field_validator
 
-from padforge.design.common.settings import Settings, Spec, as_tuple
-from padforge.design.common.validation import InputError, check_type
+from padforge.common.settings import Settings, Spec, as_tuple
+from padforge.common.validation import InputError, check_type
 from padforge.design.settings import (
     SILICONE_MM,
     TRACK_DEPTHS_MM,

@@ -1,9 +1,10 @@
 from . import design as design
 from . import fabricate as fabricate
 from . import sense as sense
-from .design import InputError as InputError
+from .common.settings import Spec as Spec
+from .common.validation import Fault as Fault
+from .common.validation import InputError as InputError
 from .design import Morphology as Morphology
-from .design import Spec as Spec
 from .design import Twin as Twin
 from .design import check_rules as check_rules
 from .design import score as score

@@ -8,10 +8,10 @@ from typing import Any
 
 import click
 
+from padforge.common import command_line as common
+from padforge.common.validation import InputError
 from padforge.design.cli import design as design_group
 from padforge.design.cli import search_progress, time_budget_option
-from padforge.design.common import command_line as common
-from padforge.design.common.validation import InputError
 from padforge.fabricate.cli import fabricate as fabricate_group
 from padforge.fabricate.cli import formats_option, mould_costs
 from padforge.sense.cli.main import sense as sense_group
@@ -91,7 +91,7 @@ def _compare(
 
     Every variant of the settings is designed in its own folder, with its mould; morphologies are not changed.
     """
-    from padforge.design.common.files import locked_folder
+    from padforge.common.files import locked_folder
     from padforge.design.compare import compare, comparison_lines, read_variants
     from padforge.design.contact import describe_large_strain
     from padforge.design.optimize.search import SearchOptions
@@ -121,8 +121,8 @@ def _init(path: Path, preset: str | None) -> None:
     padforge init
     padforge init soft.toml --preset published
     """
-    from padforge.design.common.files import write_text
-    from padforge.design.common.settings import commented_toml
+    from padforge.common.files import write_text
+    from padforge.common.settings import commented_toml
 
     if path.exists():
         raise InputError(f"{path}: exists already; choose another name or move it away")
@@ -142,7 +142,7 @@ def _schema() -> None:
     """
     import json
 
-    from padforge.design.common.settings import settings_schema
+    from padforge.common.settings import settings_schema
 
     click.echo(json.dumps(settings_schema(section_models()), indent=1))
 
@@ -172,8 +172,8 @@ def _run(context: click.Context, spec: Path | None, formats: tuple[str, ...], ou
 
     Exit code 1 if the pad breaks a design rule or its mould fails a check; all files are written nevertheless.
     """
-    from padforge.design.common.files import locked_folder
-    from padforge.design.common.profiling import stage
+    from padforge.common.files import locked_folder
+    from padforge.common.profiling import stage
 
     run = Run(common.load_spec(spec), out, formats=formats, **options)
     check_run(run)
@@ -197,7 +197,7 @@ def _example(out: Path) -> None:
     The recording is simulated: 1500 presses on a pad like the published one. No setting changes it. The authors' own
     recording is not part of padforge; a line says where it is.
     """
-    from padforge.design.common.files import locked_folder
+    from padforge.common.files import locked_folder
     from padforge.sense.simulation.example import PUBLISHED_RECORDING, write_example
 
     with locked_folder(out):

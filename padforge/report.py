@@ -5,8 +5,8 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from padforge.design.common.files import find_unchanged, read_json, reraise_as_input_error, write_text
-from padforge.design.common.validation import Fault, InputError, check_path
+from padforge.common.files import find_unchanged, read_json, reraise_as_input_error, write_text
+from padforge.common.validation import Fault, InputError, check_path
 
 PAD = "morphology.json"
 
@@ -24,7 +24,7 @@ def write_report(folder: Path) -> Path:
         InputError: there are no results, or a file is damaged.
         Fault: some results are of another pad or recording; the first section of the page lists them.
     """
-    from padforge.design.common.page import PageSection, collapsible, page, paragraph, table
+    from padforge.common.page import PageSection, collapsible, page, paragraph, table
     from padforge.design.report import FORMAT as DESIGN_FORMAT
     from padforge.design.report import contact_sections, design_sections, press_sections
     from padforge.fabricate.outputs.report import fabrication_sections

@@ -17,15 +17,15 @@ from pathlib import Path
 from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from padforge.design.common.command_line import INTERRUPTED
-from padforge.design.common.files import read_json, reraise_as_input_error, sha256, write_json
-from padforge.design.common.validation import InputError
+from padforge.common.command_line import INTERRUPTED
+from padforge.common.files import read_json, reraise_as_input_error, sha256, write_json
+from padforge.common.validation import InputError
 
 from .settings import SECTIONS, check_settings
 
 if TYPE_CHECKING:
-    from padforge.design.common.progress import OnProgress
-    from padforge.design.common.settings import Settings, Spec
+    from padforge.common.progress import OnProgress
+    from padforge.common.settings import Settings, Spec
     from padforge.design.optimize.search import SearchResult
 
 _log = logging.getLogger(__name__)
@@ -224,7 +224,7 @@ def run_stages(
     Returns:
         The exit code: 0, 1 if a rule or a check of the mould fails, or 130 if the search was interrupted.
     """
-    from padforge.design.common.parallel import Checkpoints
+    from padforge.common.parallel import Checkpoints
     from padforge.design.contact_comparison import compare_contacts
     from padforge.design.design_run import load_result, run_design, summary_lines
     from padforge.design.optimize.search import SearchOptions

@@ -4,7 +4,7 @@ from pkgutil import resolve_name
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from padforge.design.common.settings import Settings, Spec
+    from padforge.common.settings import Settings, Spec
 
 SECTIONS = {
     "pad": "padforge.design.settings:PadSettings",

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from padforge.design.common.validation import MAX_VALUES, InputError, short_repr
+from padforge.common.validation import MAX_VALUES, InputError, short_repr
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.float32]

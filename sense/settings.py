@@ -6,8 +6,8 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, BeforeValidator, Field
 from pydantic_core import PydanticCustomError
 
-from padforge.design.common.settings import Settings, Spec, as_tuple, null_as
-from padforge.design.common.validation import InputError
+from padforge.common.settings import Settings, Spec, as_tuple, null_as
+from padforge.common.validation import InputError
 from padforge.design.settings import PRESS_DEPTH_MM, Contact, Scatter, read_contact
 
 Method = Literal["ensemble", "published"]

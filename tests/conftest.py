@@ -35,7 +35,7 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
 hypothesis.settings.register_profile("padforge", deadline=None, derandomize=True, max_examples=40)
 hypothesis.settings.load_profile("padforge")
 
-from padforge.design.common import compilation, plotting  # noqa: E402
+from padforge.common import compilation, plotting  # noqa: E402
 from tests.helpers import kernels  # noqa: E402
 from tests.helpers.once import Once  # noqa: E402
 

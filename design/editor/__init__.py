@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from padforge.design.common.files import check_replaceable, find_dependents, provenance
-from padforge.design.common.validation import InputError, check_float, check_int, short_repr
+from padforge.common.files import check_replaceable, find_dependents, provenance
+from padforge.common.validation import InputError, check_float, check_int, short_repr
 from padforge.design.morphology import MAX_COORDINATE, Array, Morphology
 from padforge.design.objectives.ambiguity import AMBIGUITY_NOISE, ambiguity_map, free_presses
 from padforge.design.objectives.rules import check_rules
@@ -21,7 +21,7 @@ from padforge.design.paths.curves import add_spare_knots, beziers, remove_spare_
 from padforge.design.settings import PadSettings, RulesSettings, SearchSettings, read_contact
 
 if TYPE_CHECKING:
-    from padforge.design.common.settings import Spec
+    from padforge.common.settings import Spec
 
 MIN_DISTANCE = 1e-3  # smallest distance of two knots along a fibre, grid units
 MAX_KNOTS = 64  # inner knots of a fibre, as for [search] knots

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from padforge.design.common.compilation import kernel
+from padforge.common.compilation import kernel
 
 
 @kernel

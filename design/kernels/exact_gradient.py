@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from padforge.design.common.compilation import inner_kernel, kernel
+from padforge.common.compilation import inner_kernel, kernel
 from padforge.design.kernels.exact_signals import (
     MAX_HALVINGS,
     centre_cubic,

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from padforge.design.common.compilation import inline_kernel, inner_kernel, kernel
+from padforge.common.compilation import inline_kernel, inner_kernel, kernel
 from padforge.design.kernels.pchip import piece_of
 from padforge.design.settings import profile_spline
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from padforge.design.common.compilation import inner_kernel, kernel
+from padforge.common.compilation import inner_kernel, kernel
 
 _FAST = {"reassoc", "contract"}
 """Sums may be taken in another order; NaN and infinities stay what they are."""

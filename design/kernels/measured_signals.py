@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from padforge.design.common.compilation import inline_kernel, inner_kernel, kernel
+from padforge.common.compilation import inline_kernel, inner_kernel, kernel
 from padforge.design.kernels.exact_gradient import differentiate_cubic
 from padforge.design.kernels.geometry import (
     DEGREE,

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from padforge.design.common.compilation import kernel
+from padforge.common.compilation import kernel
 from padforge.design.kernels.pchip import add_value_gradient, extremes, pchip_value
 
 STEEPNESS = 10.0

@@ -14,8 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from padforge.design.common.compilation import kernel
-from padforge.design.common.validation import InputError
+from padforge.common.compilation import kernel
+from padforge.common.validation import InputError
 from padforge.design.contact import grid_positions, quick_signals, relative_stretch
 from padforge.design.morphology import Array, Morphology
 from padforge.design.objectives.fibre_loss import failure_shares, failure_subsets

@@ -27,7 +27,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from padforge.design.common.compilation import kernel
+from padforge.common.compilation import kernel
 from padforge.design.contact import grid_positions, relative_stretch
 from padforge.design.kernels.error_bound import error_bound
 from padforge.design.kernels.leave_one_out import leave_one_out_errors

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 import shapely
 
-from padforge.design.common.validation import InputError
+from padforge.common.validation import InputError
 from padforge.design.kernels.geometry import sum_overlaps
 from padforge.design.kernels.pchip import (
     add_samples_gradient,

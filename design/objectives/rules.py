@@ -11,8 +11,8 @@ from functools import lru_cache
 import numpy as np
 import shapely
 
-from padforge.design.common.settings import or_default
-from padforge.design.common.validation import check_type
+from padforge.common.settings import or_default
+from padforge.common.validation import check_type
 from padforge.design.morphology import Array, Morphology
 from padforge.design.paths import curves
 from padforge.design.paths.curves import UNFOLDED, bend_radius, extreme_headings, fold_gap, rolled_turns, trace_curve

@@ -14,8 +14,8 @@ from functools import cached_property
 
 import numpy as np
 
-from padforge.design.common.settings import or_default
-from padforge.design.common.validation import check_type
+from padforge.common.settings import or_default
+from padforge.common.validation import check_type
 from padforge.design.contact import evaluated_signals, fibre_axes, serpentine_presses
 from padforge.design.morphology import Array, Morphology
 from padforge.design.objectives.ambiguity import AMBIGUITY_NOISE, ambiguities

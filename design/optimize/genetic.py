@@ -12,7 +12,7 @@ from pymoo.core.repair import Repair
 from pymoo.core.termination import NoTermination
 from pymoo.operators.sampling.rnd import FloatRandomSampling
 
-from padforge.design.common.parallel import State
+from padforge.common.parallel import State
 from padforge.design.morphology import MARGIN, Array, Morphology, assemble_knots
 from padforge.design.optimize.problem import SearchProblem
 from padforge.design.paths.curves import refine

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from padforge.design.common.parallel import State
+from padforge.common.parallel import State
 from padforge.design.morphology import MARGIN, Array, Morphology, assemble_knots, fibre_ends, split_axes
 from padforge.design.objectives import expected_error as objective
 from padforge.design.objectives.fibre_loss import failure_shares, sample_failures

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from padforge.design.common.validation import MAX_VALUES, InputError, check_type
+from padforge.common.validation import MAX_VALUES, InputError, check_type
 from padforge.design.contact_set import served_contacts
 from padforge.design.morphology import Array, Morphology
 from padforge.design.objectives.ambiguity import free_presses

@@ -19,11 +19,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from padforge.design.common import profiling
-from padforge.design.common.parallel import Checkpoints, State, run_tasks
-from padforge.design.common.progress import OnProgress, ignore_progress
-from padforge.design.common.settings import or_default
-from padforge.design.common.validation import InputError, check_float, check_path, check_type, short_repr
+from padforge.common import profiling
+from padforge.common.parallel import Checkpoints, State, run_tasks
+from padforge.common.progress import OnProgress, ignore_progress
+from padforge.common.settings import or_default
+from padforge.common.validation import InputError, check_float, check_path, check_type, short_repr
 from padforge.design.contact_comparison import errors_by_contact
 from padforge.design.morphology import Array, Morphology
 from padforge.design.objectives.expected_error import straight_full_scale
@@ -36,7 +36,7 @@ from padforge.design.settings import Contact, Layout, PadSettings, RulesSettings
 from padforge.design.twin import Twin
 
 if TYPE_CHECKING:
-    from padforge.design.common.settings import Spec
+    from padforge.common.settings import Spec
     from padforge.design.optimize.genetic import GeneticSearch
 
 SLICE = {"descent": 20, "genetic": 2}

@@ -11,7 +11,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from padforge.design.common.validation import check_float
+from padforge.common.validation import check_float
 from padforge.design.kernels.geometry import find_near_intervals
 from padforge.design.kernels.pchip import population_slopes
 from padforge.design.morphology import Array, Morphology, assemble_knots, split_axes

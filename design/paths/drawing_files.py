@@ -12,8 +12,8 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from padforge.design.common.files import check_file, read_bytes
-from padforge.design.common.validation import InputError, short_repr
+from padforge.common.files import check_file, read_bytes
+from padforge.common.validation import InputError, short_repr
 from padforge.design.morphology import Array
 
 if TYPE_CHECKING:

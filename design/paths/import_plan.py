@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import shapely
 
-from padforge.design.common.validation import InputError
+from padforge.common.validation import InputError
 from padforge.design.kernels.pchip import pchip_slopes
 from padforge.design.morphology import Array, Ints, Morphology
 from padforge.design.paths.curves import add_spare_knots, flatten

@@ -5,7 +5,7 @@ import shapely
 from numpy.typing import NDArray
 from shapely import Polygon
 
-from padforge.design.common.validation import InputError
+from padforge.common.validation import InputError
 from padforge.design.morphology import MARGIN, Array, Morphology, assemble_knots
 from padforge.design.paths.curves import refine
 from padforge.design.settings import PadSettings, RulesSettings

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from padforge.design.common.compilation import inner_kernel, kernel
+from padforge.common.compilation import inner_kernel, kernel
 from padforge.design.kernels.geometry import MANHATTAN, UNIFORM, select_frame, shell_sort, weigh_element
 from padforge.design.kernels.pchip import extremes, pchip_sample, piece_of
 

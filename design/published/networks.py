@@ -10,9 +10,9 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
 
-from padforge.design.common.parallel import one_torch_thread, run_tasks
-from padforge.design.common.settings import or_default
-from padforge.design.common.validation import InputError, check_int
+from padforge.common.parallel import one_torch_thread, run_tasks
+from padforge.common.settings import or_default
+from padforge.common.validation import InputError, check_int
 from padforge.design.contact import serpentine_presses, signals
 from padforge.design.morphology import Array, Morphology
 from padforge.design.objectives.fibre_loss import failure_subsets

@@ -7,9 +7,9 @@ from typing import get_args
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from padforge.design.common.parallel import map_chunks
-from padforge.design.common.settings import or_default
-from padforge.design.common.validation import InputError, check_array, check_int, check_type, short_repr
+from padforge.common.parallel import map_chunks
+from padforge.common.settings import or_default
+from padforge.common.validation import InputError, check_array, check_int, check_type, short_repr
 from padforge.design.contact import (
     check_presses,
     check_samples,

@@ -26,8 +26,8 @@ from OCP.TopoDS import TopoDS
 from shapely import affinity
 from shapely.geometry.base import BaseGeometry
 
-from padforge.design.common.plotting import HORIZONTAL, VERTICAL
-from padforge.design.common.validation import InputError
+from padforge.common.plotting import HORIZONTAL, VERTICAL
+from padforge.common.validation import InputError
 from padforge.design.morphology import Morphology
 from padforge.fabricate.mould import (
     BODY_COLOURS,

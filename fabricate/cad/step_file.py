@@ -33,7 +33,7 @@ from OCP.XCAFApp import XCAFApp_Application
 from OCP.XCAFDoc import XCAFDoc_ColorType, XCAFDoc_DocumentTool
 from OCP.XSControl import XSControl_WorkSession
 
-from padforge.design.common.files import temporary_folder
+from padforge.common.files import temporary_folder
 
 _TIMESTAMP = "2000-01-01T00:00:00"
 """STEP files must carry a time; this one makes their bytes reproducible."""

@@ -10,7 +10,7 @@ import shapely
 from numpy.typing import ArrayLike
 from shapely.geometry.base import BaseGeometry
 
-from padforge.design.common.validation import check_float, check_int, check_type
+from padforge.common.validation import check_float, check_int, check_type
 from padforge.design.morphology import Array
 from padforge.fabricate.checks import Finding, Status, check_result
 from padforge.fabricate.checks.surface import (

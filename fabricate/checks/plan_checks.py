@@ -11,7 +11,7 @@ import shapely
 from numpy.typing import NDArray
 from shapely import ops
 
-from padforge.design.common.validation import InputError
+from padforge.common.validation import InputError
 from padforge.design.morphology import Array, Morphology
 from padforge.design.paths.curves import bend_radius, beziers, flatten, slope_beziers, trace_curve
 from padforge.design.settings import CAST_SHARE, contact_designed_for

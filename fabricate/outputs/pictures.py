@@ -15,7 +15,7 @@ import numpy as np
 import shapely
 from numpy.typing import ArrayLike, NDArray
 
-from padforge.design.common.plotting import ALARM, FAINT, INK, PAPER
+from padforge.common.plotting import ALARM, FAINT, INK, PAPER
 from padforge.design.morphology import Array
 from padforge.fabricate.checks import Finding
 from padforge.fabricate.fibre_placement import Step, mirror_x
@@ -427,7 +427,7 @@ class _Picture:
 
     def save(self, path: Path, handles: list[Any]) -> None:
         """Write the picture with its legend and note as PNG."""
-        from padforge.design.common.plotting import save_figure
+        from padforge.common.plotting import save_figure
 
         width, height = self.size
         note_height = _LINE * len(self.note)

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from padforge.design.common.files import find_unchanged
-from padforge.design.common.page import (
+from padforge.common.files import find_unchanged
+from padforge.common.page import (
     PageSection,
     collapsible,
     figures,
@@ -22,7 +22,7 @@ from padforge.design.common.page import (
     render_markdown,
     table,
 )
-from padforge.design.common.validation import InputError
+from padforge.common.validation import InputError
 from padforge.fabricate.mesh import read_mesh
 from padforge.fabricate.outputs.drawings import ORIENTATION_CAPTION, ORIENTATION_FILE, ORIENTATION_LINK
 from padforge.fabricate.outputs.laying_page import laying_page

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from padforge.design.common.command_line import FiniteRange, echo, json_option, load_spec, spec_option
-from padforge.design.common.server import HOST
+from padforge.common.command_line import FiniteRange, echo, json_option, load_spec, spec_option
+from padforge.common.server import HOST
 from padforge.sense.cli.options import FOLDER, redrawn_lines
 from padforge.sense.cli.rig import check_rig, rig_option
 

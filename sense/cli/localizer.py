@@ -8,8 +8,8 @@ from typing import Any
 
 import click
 
-from padforge.design.common import command_line as common
-from padforge.design.common.validation import InputError
+from padforge.common import command_line as common
+from padforge.common.validation import InputError
 from padforge.sense.cli.options import (
     FILE,
     FOLDER,
@@ -72,7 +72,7 @@ def calibrate(
     --without leaves out: health most of all. A budget in which nothing can be learnt is refused, and a line says when
     the localizer is not trained out.
     """
-    from padforge.design.common.files import locked_folder
+    from padforge.common.files import locked_folder
     from padforge.sense.localizer.evaluation import calibration_lines, moment_lines
     from padforge.sense.report.calibration import calibrate_into
     from padforge.sense.settings import LocalizerSettings
@@ -218,7 +218,7 @@ def deploy(model: Path, files: tuple[Path, ...]) -> None:
     positions, standard deviations and radii. It is compared with the localizer in ONNX Runtime, on the presses of
     RECORDING or on synthetic ones, and not written if they differ.
     """
-    from padforge.design.common.files import check_writable, sha256
+    from padforge.common.files import check_writable, sha256
     from padforge.sense.deploy.onnx_export import export_onnx
     from padforge.sense.localizer.model import LocalizerModel
 
@@ -249,7 +249,7 @@ def recalibrate(model: Path, recording: Path, seed: int | None, out: Path | None
     Writes a model and recalibration.json. Changes are kept only if they reduce the error in cross-validation. The old
     model is replaced only if --out names its folder.
     """
-    from padforge.design.common.files import atomic_files, check_replaceable, check_writable, write_json
+    from padforge.common.files import atomic_files, check_replaceable, check_writable, write_json
     from padforge.sense.formats.import_export import open_recording
     from padforge.sense.health.fault_detector import HEALTH_FILES, FaultDetector, has_health
     from padforge.sense.localizer import recalibration
@@ -300,7 +300,7 @@ def fibre_loss(
     Writes fibre_loss.json and fibre_loss.png (figures 13 and 14 of the paper), with maps of the errors without the
     worst set of each size, and without the fibres of --failed.
     """
-    from padforge.design.common.files import check_writable
+    from padforge.common.files import check_writable
     from padforge.sense.formats.import_export import open_recording
     from padforge.sense.localizer.model import LocalizerModel
     from padforge.sense.settings import LocalizerSettings
@@ -322,7 +322,7 @@ def fibre_loss(
 
 def _write_study(path: Path, document: dict[str, Any], draw: Callable[[Path], None]) -> None:
     """Write a document and its figure, as `path` with .json and .png."""
-    from padforge.design.common.files import atomic_files, write_json
+    from padforge.common.files import atomic_files, write_json
 
     with atomic_files(path.parent) as folder:
         write_json(folder / f"{path.name}.json", document)
@@ -343,7 +343,7 @@ def learning_curve(recording: Path, seed: int | None, spec: Path | None, out: Pa
 
     Writes learning_curve.json and learning_curve.png.
     """
-    from padforge.design.common.files import check_writable
+    from padforge.common.files import check_writable
     from padforge.sense.formats.import_export import open_recording
     from padforge.sense.settings import LocalizerSettings
     from padforge.sense.studies import learning_curve as study
@@ -390,7 +390,7 @@ def identify(
     Writes twin.json, for padforge design --twin and padforge sense record --rig simulated --twin; identification.json,
     twin_plan.png and twin_responses.png.
     """
-    from padforge.design.common.files import locked_folder
+    from padforge.common.files import locked_folder
     from padforge.design.morphology import Morphology
     from padforge.design.settings import read_contact
     from padforge.sense.report.identification import identification_lines, identify_into

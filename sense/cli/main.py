@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from padforge.design.common.command_line import SectionedGroup, echo, out_option, pad_folder
+from padforge.common.command_line import SectionedGroup, echo, out_option, pad_folder
 from padforge.sense.cli import localizer, rig
 from padforge.sense.cli.live import live
 from padforge.sense.cli.options import (
@@ -67,7 +67,7 @@ def import_(file: Path, columns: str, out: Path | None) -> None:
                       std_msgs Float64 or another number
     A value holds until the next message.
     """
-    from padforge.design.common.files import provenance
+    from padforge.common.files import provenance
     from padforge.sense.formats.columns import PRESSES_DETECTED, join_names
     from padforge.sense.formats.import_export import find_reader
     from padforge.sense.recording.doubts import find_doubts

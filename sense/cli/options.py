@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import click
 
-from padforge.design.common.command_line import echo
-from padforge.design.common.validation import InputError
+from padforge.common.command_line import echo
+from padforge.common.validation import InputError
 
 if TYPE_CHECKING:
     from padforge.sense.arrays import Indices

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from padforge.design.common import command_line as common
-from padforge.design.common.validation import InputError
+from padforge.common import command_line as common
+from padforge.common.validation import InputError
 from padforge.sense.cli.options import FILE, FOLDER, recording_line, redrawn_lines, typed_keys
 
 if TYPE_CHECKING:

@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from padforge.design.common import command_line as common
-from padforge.design.common.validation import InputError
+from padforge.common import command_line as common
+from padforge.common.validation import InputError
 from padforge.sense.cli.options import fibre_indices, fibres_option, max_failures_option
 
 if TYPE_CHECKING:
-    from padforge.design.common.settings import Spec
+    from padforge.common.settings import Spec
     from padforge.design.morphology import Morphology
     from padforge.design.settings import Contact
     from padforge.sense.studies.press_model import PressModel
@@ -55,8 +55,8 @@ def _command(name: str, argument: str = "PAD") -> Callable[..., Any]:
             as_json: bool,
             **options: Any,
         ) -> None:
-            from padforge.design.common.files import check_writable
-            from padforge.design.common.parallel import cluster
+            from padforge.common.files import check_writable
+            from padforge.common.parallel import cluster
             from padforge.sense.studies.study import run, study_lines
 
             check_writable(out)

@@ -22,9 +22,9 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from padforge.design.common.files import atomic_file
-from padforge.design.common.parallel import one_torch_thread
-from padforge.design.common.validation import Fault, InputError
+from padforge.common.files import atomic_file
+from padforge.common.parallel import one_torch_thread
+from padforge.common.validation import Fault, InputError
 from padforge.sense.arrays import Array, Indices
 from padforge.sense.localizer import features, moments
 from padforge.sense.localizer.bayes import PREFIX, BayesianLocalizer

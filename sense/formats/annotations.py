@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from padforge.design.common.validation import check_path, check_type
+from padforge.common.validation import check_path, check_type
 from padforge.sense.arrays import Array
 from padforge.sense.recording.recording import Recording
 

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from padforge.design.common.validation import InputError, check_path, check_type, short_repr
+from padforge.common.validation import InputError, check_path, check_type, short_repr
 from padforge.sense.arrays import Array, Indices, Mask, check_numbers
 from padforge.sense.recording.csv_table import UNKNOWN
 from padforge.sense.recording.recording import FIBRE_NAMES, Recording

@@ -13,8 +13,8 @@ from pathlib import Path
 
 import numpy as np
 
-from padforge.design.common.files import atomic_file, reraise_write_error
-from padforge.design.common.validation import InputError, short_repr
+from padforge.common.files import atomic_file, reraise_write_error
+from padforge.common.validation import InputError, short_repr
 from padforge.sense.arrays import MAX_FIBRES, Array
 from padforge.sense.formats.annotations import check_export
 from padforge.sense.formats.columns import (

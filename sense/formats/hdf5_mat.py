@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from padforge.design.common.files import atomic_file, reraise_write_error
-from padforge.design.common.mat_files import load_mat, open_hdf5
-from padforge.design.common.validation import InputError
+from padforge.common.files import atomic_file, reraise_write_error
+from padforge.common.mat_files import load_mat, open_hdf5
+from padforge.common.validation import InputError
 from padforge.sense.arrays import Array
 from padforge.sense.formats.annotations import check_export
 from padforge.sense.formats.columns import (

@@ -5,8 +5,8 @@ from pathlib import Path
 
 import numpy as np
 
-from padforge.design.common.mat_files import load_mat
-from padforge.design.common.validation import InputError, check_path
+from padforge.common.mat_files import load_mat
+from padforge.common.validation import InputError, check_path
 from padforge.sense.arrays import Array
 from padforge.sense.formats.annotations import ModelAnnotations
 from padforge.sense.formats.csv_recording import export_csv, import_csv

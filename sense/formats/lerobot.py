@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from padforge.design.common.files import make_folder, reraise_write_error, sync, temporary_folder, write_json
-from padforge.design.common.validation import InputError
+from padforge.common.files import make_folder, reraise_write_error, sync, temporary_folder, write_json
+from padforge.common.validation import InputError
 from padforge.sense.arrays import Indices
 from padforge.sense.formats.annotations import ModelAnnotations, check_export
 from padforge.sense.recording.recording import Recording

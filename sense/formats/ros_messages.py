@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from padforge.design.common.validation import InputError, check_float
+from padforge.common.validation import InputError, check_float
 from padforge.sense.arrays import MAX_S, Array, Indices, Mask
 from padforge.sense.formats.annotations import ModelAnnotations
 from padforge.sense.recording.recording import Recording

@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from padforge.design.common.files import UNFINISHED, atomic_files, check_file, reraise_write_error
-from padforge.design.common.validation import InputError, short_repr
+from padforge.common.files import UNFINISHED, atomic_files, check_file, reraise_write_error
+from padforge.common.validation import InputError, short_repr
 from padforge.sense.arrays import MAX_BYTES, Array, Indices, check_numbers
 from padforge.sense.formats import ros_messages
 from padforge.sense.formats.annotations import ModelAnnotations, check_export

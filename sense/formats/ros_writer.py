@@ -5,7 +5,7 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from padforge.design.common.validation import InputError
+from padforge.common.validation import InputError
 from padforge.sense.formats.ros_messages import RECORDING, TOPICS
 
 if TYPE_CHECKING:

@@ -11,8 +11,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from padforge.design.common.parallel import one_torch_thread, run_tasks
-from padforge.design.common.validation import InputError, check_float, short_repr
+from padforge.common.parallel import one_torch_thread, run_tasks
+from padforge.common.validation import InputError, check_float, short_repr
 from padforge.sense.arrays import Array, Floats, Mask, check_numbers
 from padforge.sense.formats.columns import PRESSES_DETECTED
 from padforge.sense.health.domain_shift import rest_levels

@@ -8,9 +8,9 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import Field, JsonValue
 
-from padforge.design.common.files import read_json
-from padforge.design.common.settings import Settings, validate
-from padforge.design.common.validation import InputError
+from padforge.common.files import read_json
+from padforge.common.settings import Settings, validate
+from padforge.common.validation import InputError
 from padforge.sense.arrays import MAX_FIBRES, MAX_RATE_HZ, MIN_RATE_HZ, MIN_SCALE_V, Array, Indices
 from padforge.sense.health.fault_likelihoods import (
     HYPOTHESES,

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from padforge.design.common.parallel import one_torch_thread
+from padforge.common.parallel import one_torch_thread
 from padforge.sense.arrays import MIN_SCALE_V, Array, Floats, Indices, Mask
 
 Weights = Mapping[str, Floats]

@@ -16,7 +16,7 @@ from io import BytesIO
 from threading import Thread
 from urllib.parse import urlsplit
 
-from padforge.design.common.server import HOST, ConnectionServer, is_this_machine
+from padforge.common.server import HOST, ConnectionServer, is_this_machine
 
 APP_ORIGIN = "https://app.foxglove.dev"  # of the app in a browser; the one on the desktop is no page of the web
 MAX_HEAD = 2**14  # bytes of the request of a connection

@@ -15,8 +15,8 @@ from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, Protocol
 
-from padforge.design.common.server import HOST, ConnectionServer, LocalPage, page_text
-from padforge.design.common.validation import InputError, short_repr
+from padforge.common.server import HOST, ConnectionServer, LocalPage, page_text
+from padforge.common.validation import InputError, short_repr
 from padforge.sense.arrays import Array
 from padforge.sense.formats.ros_messages import FRAME, HEALTH, PRESSED, READINGS, TOPICS, TOUCHES, UNKNOWN_VARIANCE, Z90
 from padforge.sense.health.fault_detector import FibreFault

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from contextlib import closing
 from pathlib import Path
 
-from padforge.design.common.validation import InputError
+from padforge.common.validation import InputError
 from padforge.sense.arrays import Array
 from padforge.sense.health.fault_detector import FaultDetector, has_health
 from padforge.sense.health.health_model import HealthModel

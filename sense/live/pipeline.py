@@ -12,7 +12,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from padforge.design.common.validation import InputError
+from padforge.common.validation import InputError
 from padforge.sense.arrays import Array, Mask, check_stream
 from padforge.sense.health.fault_detector import FaultMonitor, FibreFault
 from padforge.sense.health.health_model import HealthModel

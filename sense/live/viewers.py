@@ -9,9 +9,9 @@ import math
 from pathlib import Path
 from typing import Any
 
-from padforge.design.common.files import atomic_file
-from padforge.design.common.server import HOST
-from padforge.design.common.validation import InputError, short_repr
+from padforge.common.files import atomic_file
+from padforge.common.server import HOST
+from padforge.common.validation import InputError, short_repr
 from padforge.sense.formats.ros_messages import FRAME, HEALTH, PRESSED, READINGS, TOPICS, TOUCHES
 from padforge.sense.live.outputs import Message
 

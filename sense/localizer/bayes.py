@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from padforge.design.common.progress import OnProgress, ignore_progress
+from padforge.common.progress import OnProgress, ignore_progress
 from padforge.sense.arrays import Array, Mask
 from padforge.sense.localizer.moments import NOW, STAGES
 from padforge.sense.localizer.response_model import grid_positions, interpolate_grid

@@ -10,12 +10,12 @@ from typing import Any
 
 import numpy as np
 
-from padforge.design.common.files import provenance
-from padforge.design.common.parallel import one_torch_thread
-from padforge.design.common.profiling import stage
-from padforge.design.common.progress import OnProgress, ignore_progress
-from padforge.design.common.settings import or_default
-from padforge.design.common.validation import InputError, check_float, check_type
+from padforge.common.files import provenance
+from padforge.common.parallel import one_torch_thread
+from padforge.common.profiling import stage
+from padforge.common.progress import OnProgress, ignore_progress
+from padforge.common.settings import or_default
+from padforge.common.validation import InputError, check_float, check_type
 from padforge.design.objectives.fibre_loss import failure_subsets
 from padforge.sense.arrays import Array, Indices
 from padforge.sense.localizer.bayes import N_SUMMARY

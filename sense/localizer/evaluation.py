@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from scipy.special import gammaincinv
 
-from padforge.design.common.progress import OnProgress, ignore_progress
-from padforge.design.common.validation import InputError, check_int, check_type
+from padforge.common.progress import OnProgress, ignore_progress
+from padforge.common.validation import InputError, check_int, check_type
 from padforge.design.objectives.fibre_loss import failure_subsets
 from padforge.sense.arrays import Array, Indices
 from padforge.sense.localizer.doubts import find_doubts

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from padforge.design.common.progress import OnProgress, ignore_progress
-from padforge.design.common.settings import validate
-from padforge.design.common.validation import InputError, check_float
+from padforge.common.progress import OnProgress, ignore_progress
+from padforge.common.settings import validate
+from padforge.common.validation import InputError, check_float
 from padforge.sense.arrays import MAX_MM, MAX_VOLTS, Array, check_magnitude, check_numbers
 from padforge.sense.localizer.calibration import MAX_TIME_BUDGET_S, CalibrationData, calibrate, fit_model
 from padforge.sense.localizer.evaluation import Evaluation, distances, evaluate

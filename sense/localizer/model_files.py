@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 from safetensors.numpy import load, save
 
-from padforge.design.common.files import atomic_files, read_bytes
-from padforge.design.common.validation import InputError, check_path
+from padforge.common.files import atomic_files, read_bytes
+from padforge.common.validation import InputError, check_path
 
 RATE_TOLERANCE = 0.25  # windows are counted in readings, so the rate must be about that of the training
 

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from padforge.design.common.validation import InputError
+from padforge.common.validation import InputError
 from padforge.sense.arrays import Floats, Mask
 from padforge.sense.localizer.bayes import BayesianLocalizer
 from padforge.sense.localizer.model_files import check_arrays

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 
-from padforge.design.common.compilation import inline_kernel, inner_kernel, kernel
+from padforge.common.compilation import inline_kernel, inner_kernel, kernel
 from padforge.sense.arrays import Array, Floats, Indices, Mask
 from padforge.sense.localizer.bayes import N_SUMMARY, BayesianLocalizer
 from padforge.sense.localizer.moments import DOWN, N_DOWN, NOW, Phase, stage_of

@@ -13,9 +13,9 @@ from typing import Any
 
 import numpy as np
 
-from padforge.design.common.files import provenance
-from padforge.design.common.progress import OnProgress, ignore_progress
-from padforge.design.common.validation import InputError, check_int, check_type
+from padforge.common.files import provenance
+from padforge.common.progress import OnProgress, ignore_progress
+from padforge.common.validation import InputError, check_int, check_type
 from padforge.design.objectives.fibre_loss import failure_subsets
 from padforge.sense.arrays import Array, Floats, Indices
 from padforge.sense.localizer.evaluation import Measures, conformal, distances, error_row

@@ -22,9 +22,9 @@ from scipy.linalg import eigh
 from torch import Tensor
 from torch.optim.adamw import adamw
 
-from padforge.design.common.parallel import makespan, one_torch_thread, run_tasks
-from padforge.design.common.progress import OnProgress, ignore_progress
-from padforge.design.common.validation import InputError
+from padforge.common.parallel import makespan, one_torch_thread, run_tasks
+from padforge.common.progress import OnProgress, ignore_progress
+from padforge.common.validation import InputError
 from padforge.design.published.networks import fit_batch
 from padforge.sense.arrays import Array, Floats, Indices
 from padforge.sense.localizer.bayes import BayesianLocalizer, fit_stages

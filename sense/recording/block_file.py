@@ -12,8 +12,8 @@ from typing import BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from padforge.design.common.files import check_file
-from padforge.design.common.validation import InputError
+from padforge.common.files import check_file
+from padforge.common.validation import InputError
 from padforge.sense.arrays import MAX_BYTES, Array, Mask
 
 _MAGIC = b"PFB1"

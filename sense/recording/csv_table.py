@@ -15,8 +15,8 @@ from typing import TextIO
 
 import numpy as np
 
-from padforge.design.common.files import check_file
-from padforge.design.common.validation import InputError
+from padforge.common.files import check_file
+from padforge.common.validation import InputError
 from padforge.sense.arrays import MAX_BYTES, Array
 
 UNKNOWN = -1.7e308

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from padforge.design.common.settings import or_default
-from padforge.design.common.validation import InputError
+from padforge.common.settings import or_default
+from padforge.common.validation import InputError
 from padforge.design.morphology import Morphology
 from padforge.design.paths.keep_outs import is_outside, keep_outs
 from padforge.design.settings import Contact, PadSettings

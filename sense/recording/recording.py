@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from padforge.design.common.files import (
+from padforge.common.files import (
     LOCK,
     locked,
     make_folder,
@@ -21,7 +21,7 @@ from padforge.design.common.files import (
     sync,
     temporary_folder,
 )
-from padforge.design.common.validation import InputError, check_path, check_type, short_repr
+from padforge.common.validation import InputError, check_path, check_type, short_repr
 from padforge.sense.arrays import (
     MAX_FIBRES,
     MAX_MM,

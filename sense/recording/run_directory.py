@@ -17,7 +17,7 @@ from typing import Any, BinaryIO, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from padforge.design.common.files import (
+from padforge.common.files import (
     LOCK,
     UNFINISHED,
     check_writable,
@@ -29,7 +29,7 @@ from padforge.design.common.files import (
     to_disk,
     write_json,
 )
-from padforge.design.common.validation import InputError, check_int, check_mapping, check_path, short_repr
+from padforge.common.validation import InputError, check_int, check_mapping, check_path, short_repr
 from padforge.sense.arrays import MAX_FIBRES, MAX_INDEX, Array, check_numbers
 from padforge.sense.recording.block_file import BlockWriter, read_blocks, write_at
 

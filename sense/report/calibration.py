@@ -11,11 +11,11 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 from matplotlib.ticker import LogLocator, NullFormatter
 
-from padforge.design.common.files import atomic_files, check_replaceable, check_writable, write_json
-from padforge.design.common.plotting import ALARM, CURVES, FAINT, INK, add_caption, new_figure, save_figure, style_axes
-from padforge.design.common.profiling import stage
-from padforge.design.common.progress import OnProgress, ignore_progress
-from padforge.design.common.validation import InputError
+from padforge.common.files import atomic_files, check_replaceable, check_writable, write_json
+from padforge.common.plotting import ALARM, CURVES, FAINT, INK, add_caption, new_figure, save_figure, style_axes
+from padforge.common.profiling import stage
+from padforge.common.progress import OnProgress, ignore_progress
+from padforge.common.validation import InputError
 from padforge.sense.health.fault_detector import HEALTH_FILES, FaultDetector
 from padforge.sense.localizer.calibration import calibrate, unlearnt_lines
 from padforge.sense.localizer.evaluation import Evaluation

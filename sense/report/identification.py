@@ -9,12 +9,12 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
-from padforge.design.common.command_line import text_table
-from padforge.design.common.files import atomic_files, check_replaceable, check_writable, provenance, write_json
-from padforge.design.common.page import PageSection, figures, paragraph, table
-from padforge.design.common.plotting import FAINT, HORIZONTAL, INK, PAPER, VERTICAL, add_title, save_figure, style_axes
-from padforge.design.common.profiling import stage
-from padforge.design.common.progress import OnProgress, ignore_progress
+from padforge.common.command_line import text_table
+from padforge.common.files import atomic_files, check_replaceable, check_writable, provenance, write_json
+from padforge.common.page import PageSection, figures, paragraph, table
+from padforge.common.plotting import FAINT, HORIZONTAL, INK, PAPER, VERTICAL, add_title, save_figure, style_axes
+from padforge.common.profiling import stage
+from padforge.common.progress import OnProgress, ignore_progress
 from padforge.design.morphology import Morphology
 from padforge.design.paths.curves import flatten
 from padforge.design.settings import Contact

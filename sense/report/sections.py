@@ -12,10 +12,10 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
-from padforge.design.common.files import read_bytes
-from padforge.design.common.page import PageSection, collapsible, columns, figures, heading, paragraph, table
-from padforge.design.common.plotting import ALARM, INK
-from padforge.design.common.validation import InputError
+from padforge.common.files import read_bytes
+from padforge.common.page import PageSection, collapsible, columns, figures, heading, paragraph, table
+from padforge.common.plotting import ALARM, INK
+from padforge.common.validation import InputError
 from padforge.sense.arrays import MAX_FIBRES
 from padforge.sense.localizer.evaluation import BUILT_PAD, untrained_lines
 from padforge.sense.recording.recording import Recording

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from padforge.design.common.validation import InputError
+from padforge.common.validation import InputError
 from padforge.design.morphology import Morphology
 from padforge.design.paths.curves import flatten
 from padforge.sense.arrays import Array

@@ -14,9 +14,9 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import BeforeValidator, Field
 
-from padforge.design.common.files import provenance, read_json, reraise_as_input_error
-from padforge.design.common.settings import Settings, as_tuple, validate
-from padforge.design.common.validation import InputError
+from padforge.common.files import provenance, read_json, reraise_as_input_error
+from padforge.common.settings import Settings, as_tuple, validate
+from padforge.common.validation import InputError
 from padforge.design.morphology import Morphology
 from padforge.design.settings import Contact, PadSettings
 from padforge.sense.arrays import Array

@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any, Literal, Protocol
 
 import padforge
-from padforge.design.common.validation import Fault, InputError
+from padforge.common.validation import Fault, InputError
 from padforge.sense.arrays import Array, Indices
 from padforge.sense.rig import clock
 

@@ -13,11 +13,11 @@ from typing import Any
 import numpy as np
 from scipy.spatial import KDTree
 
-from padforge.design.common.files import provenance, temporary_folder
-from padforge.design.common.profiling import stage
-from padforge.design.common.progress import OnProgress, ignore_progress
-from padforge.design.common.settings import Spec
-from padforge.design.common.validation import InputError
+from padforge.common.files import provenance, temporary_folder
+from padforge.common.profiling import stage
+from padforge.common.progress import OnProgress, ignore_progress
+from padforge.common.settings import Spec
+from padforge.common.validation import InputError
 from padforge.design.morphology import Morphology
 from padforge.design.settings import Contact, PadSettings, contact_designed_for, read_contact
 from padforge.design.twin import Twin

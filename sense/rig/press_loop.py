@@ -17,7 +17,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from padforge.design.common.progress import OnProgress, ignore_progress
+from padforge.common.progress import OnProgress, ignore_progress
 from padforge.sense.arrays import Array
 from padforge.sense.recording.press_plan import PressPlan
 from padforge.sense.recording.run_directory import STATE_COLUMNS, Recorder

@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
+from padforge.common.files import read_json
+from padforge.common.settings import validate
+from padforge.common.validation import InputError
 from padforge.design import Contact, Morphology
-from padforge.design.common.files import read_json
-from padforge.design.common.settings import validate
-from padforge.design.common.validation import InputError
 from padforge.design.settings import PadSettings
 from padforge.sense.arrays import Array
 from padforge.sense.recording.press_plan import make_plan

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from padforge.design.common.files import read_json
-from padforge.design.common.validation import check_float
+from padforge.common.files import read_json
+from padforge.common.validation import check_float
 from padforge.sense.arrays import Array
 from padforge.sense.localizer.features import REST, SLOW, interpolate_gaps
 from padforge.sense.recording.recording import Recording, is_mirrored

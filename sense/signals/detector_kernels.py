@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from padforge.design.common.compilation import inline_kernel, inner_kernel, kernel
+from padforge.common.compilation import inline_kernel, inner_kernel, kernel
 
 FIBRE = np.dtype(
     [

@@ -11,7 +11,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from padforge.design.common.validation import InputError, check_float, check_int, short_repr
+from padforge.common.validation import InputError, check_float, check_int, short_repr
 from padforge.sense.arrays import Array, check_numbers
 from padforge.sense.signals import filter_kernels
 

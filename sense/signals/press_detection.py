@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from padforge.design.common.validation import InputError, check_int
+from padforge.common.validation import InputError, check_int
 from padforge.sense.arrays import MAX_FIBRES, Array, Indices, check_stream
 from padforge.sense.signals.detector_kernels import detect, initial_state
 

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from padforge.design.common.files import provenance, sha256
+from padforge.common.files import provenance, sha256
 from padforge.design.morphology import Morphology
 from padforge.sense.recording.recording import Recording
 from padforge.sense.recording.run_directory import check_new_folder

@@ -14,9 +14,9 @@ import numpy as np
 from scipy.interpolate import RegularGridInterpolator
 from scipy.optimize import nnls
 
+from padforge.common.settings import or_default
+from padforge.common.validation import InputError, check_int
 from padforge.design import Contact, Morphology, Twin
-from padforge.design.common.settings import or_default
-from padforge.design.common.validation import InputError, check_int
 from padforge.design.contact import contact_press
 from padforge.design.settings import PadSettings
 from padforge.design.twin import PARTS, TwinChannel, TwinPart

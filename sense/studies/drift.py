@@ -15,9 +15,9 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from padforge.design.common.parallel import State
-from padforge.design.common.plotting import ALARM, CURVES, INK, add_title
-from padforge.design.common.validation import InputError
+from padforge.common.parallel import State
+from padforge.common.plotting import ALARM, CURVES, INK, add_title
+from padforge.common.validation import InputError
 from padforge.design.contact import signals
 from padforge.design.morphology import Morphology
 from padforge.design.published.networks import fit_batch, training_presses

@@ -13,13 +13,13 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from padforge.design.common.command_line import text_table
-from padforge.design.common.files import provenance
-from padforge.design.common.parallel import State
-from padforge.design.common.plotting import FAINT, HORIZONTAL, INK, VERTICAL, add_caption, save_figure, style_axes
-from padforge.design.common.progress import OnProgress, ignore_progress
-from padforge.design.common.settings import or_default
-from padforge.design.common.validation import InputError, check_int
+from padforge.common.command_line import text_table
+from padforge.common.files import provenance
+from padforge.common.parallel import State
+from padforge.common.plotting import FAINT, HORIZONTAL, INK, VERTICAL, add_caption, save_figure, style_axes
+from padforge.common.progress import OnProgress, ignore_progress
+from padforge.common.settings import or_default
+from padforge.common.validation import InputError, check_int
 from padforge.design.objectives.fibre_loss import failure_subsets
 from padforge.sense import settings
 from padforge.sense.arrays import Array, Indices

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from padforge.design.common.parallel import State
-from padforge.design.common.plotting import CURVES, INK, add_title
-from padforge.design.common.validation import InputError
+from padforge.common.parallel import State
+from padforge.common.plotting import CURVES, INK, add_title
+from padforge.common.validation import InputError
 from padforge.design.contact import indented_signals, press_forces_n, signals
 from padforge.design.layer import REDUCED_MODULUS_KPA, solve_press
 from padforge.design.morphology import Morphology

@@ -14,12 +14,12 @@ from typing import Any
 import numpy as np
 from scipy.optimize import nnls
 
-from padforge.design.common.files import provenance
-from padforge.design.common.parallel import one_torch_thread, run_tasks
-from padforge.design.common.plotting import ALARM, FAINT, INK, add_caption, new_figure, save_figure
-from padforge.design.common.progress import OnProgress, ignore_progress
-from padforge.design.common.settings import or_default
-from padforge.design.common.validation import InputError
+from padforge.common.files import provenance
+from padforge.common.parallel import one_torch_thread, run_tasks
+from padforge.common.plotting import ALARM, FAINT, INK, add_caption, new_figure, save_figure
+from padforge.common.progress import OnProgress, ignore_progress
+from padforge.common.settings import or_default
+from padforge.common.validation import InputError
 from padforge.sense import settings
 from padforge.sense.arrays import Array, Indices
 from padforge.sense.localizer.calibration import fit_recording, split_presses

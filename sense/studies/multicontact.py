@@ -14,8 +14,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from matplotlib.figure import Figure
 
-from padforge.design.common.parallel import State
-from padforge.design.common.plotting import CURVES, INK, add_title
+from padforge.common.parallel import State
+from padforge.common.plotting import CURVES, INK, add_title
 from padforge.design.morphology import Morphology
 from padforge.design.published.networks import fit_batch, fresh_presses
 from padforge.design.settings import between_fibres

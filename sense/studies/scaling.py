@@ -17,9 +17,9 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from padforge.design.common.parallel import State
-from padforge.design.common.plotting import CURVES, INK
-from padforge.design.common.validation import InputError
+from padforge.common.parallel import State
+from padforge.common.plotting import CURVES, INK
+from padforge.common.validation import InputError
 from padforge.design.morphology import Morphology
 from padforge.design.published.networks import fit_batch, fresh_presses, training_presses
 from padforge.design.settings import Rectangle, between_fibres

@@ -14,9 +14,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from matplotlib.figure import Figure
 
-from padforge.design.common.parallel import State
-from padforge.design.common.plotting import CURVES, INK
-from padforge.design.common.validation import InputError
+from padforge.common.parallel import State
+from padforge.common.plotting import CURVES, INK
+from padforge.common.validation import InputError
 from padforge.design.contact import relative_stretch, signals
 from padforge.design.morphology import Morphology
 from padforge.design.objectives.expected_error import scatter_of_full_scale, straight_full_scale

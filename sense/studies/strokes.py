@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from padforge.design.common.parallel import State
-from padforge.design.common.plotting import CURVES, add_title
+from padforge.common.parallel import State
+from padforge.common.plotting import CURVES, add_title
 from padforge.design.morphology import Morphology
 from padforge.design.settings import Contact
 from padforge.sense.arrays import Array, Indices

@@ -12,13 +12,13 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from padforge.design.common import files, plotting
-from padforge.design.common.command_line import text_table
-from padforge.design.common.parallel import State, one_torch_thread, run_tasks
-from padforge.design.common.plotting import FAINT, INK, save_figure, style_axes
-from padforge.design.common.progress import OnProgress, ignore_progress
-from padforge.design.common.settings import validate
-from padforge.design.common.validation import InputError
+from padforge.common import files, plotting
+from padforge.common.command_line import text_table
+from padforge.common.parallel import State, one_torch_thread, run_tasks
+from padforge.common.plotting import FAINT, INK, save_figure, style_axes
+from padforge.common.progress import OnProgress, ignore_progress
+from padforge.common.settings import validate
+from padforge.common.validation import InputError
 from padforge.design.morphology import Morphology
 from padforge.design.settings import PUBLISHED_PAD, Layout
 from padforge.sense.arrays import Array, Indices

@@ -14,8 +14,8 @@ from typing import Any
 
 import numpy as np
 
+from padforge.common.compilation import inner_kernel, kernel
 from padforge.design import Morphology
-from padforge.design.common.compilation import inner_kernel, kernel
 from padforge.design.paths.curves import flatten
 from padforge.design.settings import Layout, sensed_rectangle
 from padforge.design.twin import PlanTransform

@@ -14,10 +14,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from threadpoolctl import threadpool_limits
 
+from padforge.common.progress import OnProgress, ignore_progress
+from padforge.common.settings import or_default
+from padforge.common.validation import InputError
 from padforge.design import Morphology
-from padforge.design.common.progress import OnProgress, ignore_progress
-from padforge.design.common.settings import or_default
-from padforge.design.common.validation import InputError
 from padforge.design.paths.curves import lengths
 from padforge.design.settings import Contact, sensed_rectangle
 from padforge.design.twin import (

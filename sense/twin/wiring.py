@@ -11,7 +11,7 @@ from itertools import product
 import numpy as np
 from scipy.optimize import linear_sum_assignment, minimize
 
-from padforge.design.common.progress import OnProgress, ignore_progress
+from padforge.common.progress import OnProgress, ignore_progress
 from padforge.design.settings import Layout
 from padforge.design.twin import PlanTransform
 from padforge.sense.arrays import Array, Indices, Mask

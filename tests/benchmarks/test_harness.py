@@ -16,8 +16,8 @@ from padforge.benchmarks.harness import (
     read_earlier,
     run_benches,
 )
-from padforge.design.common.progress import ignore_progress
-from padforge.design.common.validation import InputError
+from padforge.common.progress import ignore_progress
+from padforge.common.validation import InputError
 from tests.helpers.less import blank_pictures
 
 

@@ -3,7 +3,7 @@
 import pytest
 
 from padforge.benchmarks import harness
-from padforge.design.common.progress import ignore_progress
+from padforge.common.progress import ignore_progress
 
 
 @pytest.fixture
@@ -22,7 +22,7 @@ def taken(monkeypatch):
 @pytest.fixture
 def one_thread():
     """Torch computes on one thread, as in a search: several that wait for a busy machine take many times as long."""
-    from padforge.design.common.parallel import one_torch_thread
+    from padforge.common.parallel import one_torch_thread
 
     with one_torch_thread():
         yield

@@ -10,11 +10,12 @@ import pytest
 from click.testing import CliRunner
 from matplotlib.patches import Circle, Polygon
 
-from padforge.design import Contact, InputError, Morphology, SearchOptions, Spec, Twin, draw_plan, score, search
+from padforge import InputError, Spec
+from padforge.common.files import sha256
+from padforge.common.plotting import HORIZONTAL, VERTICAL
+from padforge.common.settings import commented_toml
+from padforge.design import Contact, Morphology, SearchOptions, Twin, draw_plan, score, search
 from padforge.design.cli import design
-from padforge.design.common.files import sha256
-from padforge.design.common.plotting import HORIZONTAL, VERTICAL
-from padforge.design.common.settings import commented_toml
 from padforge.design.contact import half_width_mm
 from padforge.design.design_run import load_result, summary_lines
 from padforge.design.objectives.ambiguity import AMBIGUITY_NOISE, ambiguities

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from padforge.design import Contact, InputError, Morphology, indented_signals, press_forces_n, signals
+from padforge import InputError
+from padforge.design import Contact, Morphology, indented_signals, press_forces_n, signals
 from padforge.design.contact import evaluated_signals
 from padforge.design.layer import solve_press
 

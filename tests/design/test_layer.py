@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.integrate import quad
 
-from padforge.design import InputError
+from padforge import InputError
 from padforge.design.contact import FIBRE_BLUR_MM, contact_press, describe_large_strain, profile_weights
 from padforge.design.layer import MAX_CONTACT, solve_press
 from padforge.design.settings import Contact

@@ -5,7 +5,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from padforge.design import Contact, InputError, Morphology, signals
+from padforge import InputError
+from padforge.design import Contact, Morphology, signals
 from padforge.design.morphology import assemble_knots
 from padforge.design.settings import PUBLISHED_CONTACT
 from tests.design.wild_pads import SEEDS, wild_pads

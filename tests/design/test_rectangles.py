@@ -7,7 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from padforge.design import Contact, InputError, Morphology, signals, signals_quantized
+from padforge import InputError
+from padforge.design import Contact, Morphology, signals, signals_quantized
 from padforge.design.contact import signals_sparse
 from padforge.design.objectives.rules import check_rules
 from padforge.design.paths.curves import crossings, lengths

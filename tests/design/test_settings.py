@@ -6,9 +6,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from padforge import design
-from padforge.design import Contact, InputError, Morphology, PadSettings, RulesSettings, SearchSettings, Spec, signals
-from padforge.design.common.settings import commented_toml
+from padforge import InputError, Spec, design
+from padforge.common.settings import commented_toml
+from padforge.design import Contact, Morphology, PadSettings, RulesSettings, SearchSettings, signals
 from padforge.design.published.objective import information
 from padforge.design.settings import (
     BUILT_CONTACT,

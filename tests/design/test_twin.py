@@ -7,7 +7,8 @@ from functools import reduce
 import numpy as np
 import pytest
 
-from padforge.design import InputError, Morphology, Twin
+from padforge import InputError
+from padforge.design import Morphology, Twin
 from padforge.design.contact import relative_stretch
 from padforge.design.paths.curves import flatten
 from padforge.design.twin import PARTS, PlanTransform, TwinChannel, TwinPart, TwinReadings, TwinResidual, TwinScatter

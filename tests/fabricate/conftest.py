@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 def figures(monkeypatch) -> list[Figure]:
     """Figures that would have been written."""
     saved: list[Figure] = []
-    monkeypatch.setattr("padforge.design.common.plotting.save_figure", lambda figure, *_: saved.append(figure))
+    monkeypatch.setattr("padforge.common.plotting.save_figure", lambda figure, *_: saved.append(figure))
     return saved
 
 

@@ -14,8 +14,8 @@ import pytest
 import shapely
 import trimesh
 
-from padforge.design.common.files import sha256
-from padforge.design.common.validation import InputError
+from padforge.common.files import sha256
+from padforge.common.validation import InputError
 from padforge.design.morphology import Morphology
 from padforge.fabricate import export, mould
 from padforge.fabricate.cad import model, step_file

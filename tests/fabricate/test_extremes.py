@@ -6,7 +6,7 @@ from collections.abc import Mapping
 import numpy as np
 import pytest
 
-from padforge.design.common.validation import InputError
+from padforge.common.validation import InputError
 from padforge.design.morphology import Morphology
 from padforge.fabricate.checks.mesh_checks import check_solid
 from padforge.fabricate.checks.plan_checks import check

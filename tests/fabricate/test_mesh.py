@@ -10,7 +10,7 @@ import pytest
 import trimesh
 import trimesh.exchange.stl
 
-from padforge.design.common.validation import InputError
+from padforge.common.validation import InputError
 from padforge.fabricate.checks import Finding
 from padforge.fabricate.checks.mesh_checks import check_mesh, check_triangles
 from padforge.fabricate.mesh import read_mesh, write_3mf, write_stl

@@ -6,7 +6,7 @@ import shapely
 import trimesh
 from shapely import affinity
 
-from padforge.design.common.validation import InputError
+from padforge.common.validation import InputError
 from padforge.design.morphology import Morphology
 from padforge.fabricate.checks.plan_checks import check_plan
 from padforge.fabricate.mesh import build_mesh, mesh_arrays

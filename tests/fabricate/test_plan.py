@@ -8,9 +8,9 @@ import shapely
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from padforge.design.common.plotting import HORIZONTAL, VERTICAL
-from padforge.design.common.settings import Spec
-from padforge.design.common.validation import InputError
+from padforge.common.plotting import HORIZONTAL, VERTICAL
+from padforge.common.settings import Spec
+from padforge.common.validation import InputError
 from padforge.design.morphology import Morphology
 from padforge.design.paths.curves import Crossing
 from padforge.design.settings import FIBRE_MM, read_contact

@@ -7,8 +7,8 @@ import tomllib
 import numpy as np
 import pytest
 
-from padforge.design.common.settings import Spec, commented_toml
-from padforge.design.common.validation import InputError
+from padforge.common.settings import Spec, commented_toml
+from padforge.common.validation import InputError
 from padforge.design.morphology import Morphology
 from padforge.fabricate.materials import (
     FIBRES,

@@ -6,18 +6,15 @@
 import subprocess
 import sys
 from collections.abc import Callable, Mapping
-from pathlib import Path
 
 import numpy as np
 
-import padforge
-from padforge.design.common.compilation import ROOMS, cache_folder
+from padforge.common.compilation import SOURCES, cache_folder
 
 
 def missing() -> bool:
     """Whether of a file of kernels nothing is cached."""
-    folders = [Path(folder) / room for folder in padforge.__path__ for room in ROOMS]
-    sources = [path for folder in folders for path in folder.rglob("*.py") if b"\n@kernel" in path.read_bytes()]
+    sources = [path for folder in SOURCES for path in folder.rglob("*.py") if b"\n@kernel" in path.read_bytes()]
     return any(not any(cache_folder().glob(f"{path.parent.name}_*/{path.stem}.*.nbi")) for path in sources)
 
 

@@ -5,8 +5,8 @@ from typing import Any
 
 import pytest
 
-from padforge.design import InputError, Spec
-from padforge.design.common.settings import Settings
+from padforge import InputError, Spec
+from padforge.common.settings import Settings
 
 
 def require_ends(model: type[Settings], key: str, kept: Iterable[Any], refused: Iterable[Any]) -> None:

@@ -2,7 +2,7 @@
 
 import re
 
-from padforge.design.common.server import page_text
+from padforge.common.server import page_text
 
 
 def names_in_view(page: str) -> set[str]:

@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from padforge.design.common.settings import commented_toml
+from padforge.common.settings import commented_toml
 from padforge.design.settings import PadSettings
 from padforge.sense.settings import IDEAL_RIG, RigSettings
 

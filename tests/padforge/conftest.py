@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from padforge.design.common.page import PageSection
+from padforge.common.page import PageSection
 from padforge.design.report import press_sections
 from tests.helpers.door import called
 from tests.helpers.less import blank_pictures, compare_little, small_pictures

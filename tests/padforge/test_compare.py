@@ -6,9 +6,10 @@ from types import SimpleNamespace
 
 import pytest
 
-from padforge.design import Contact, Morphology, Spec
+from padforge import Spec
+from padforge.common.plotting import save_figure
+from padforge.design import Contact, Morphology
 from padforge.design import compare as comparison
-from padforge.design.common.plotting import save_figure
 from padforge.design.contact import half_width_mm
 from padforge.design.settings import read_contact
 from padforge.fabricate import FabricationSettings

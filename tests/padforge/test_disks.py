@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from padforge.design.common.files import find_unchanged, write_json
+from padforge.common.files import find_unchanged, write_json
 from padforge.design.morphology import Morphology
 from padforge.fabricate.mesh import read_mesh
 from tests.helpers.door import contents

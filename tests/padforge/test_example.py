@@ -4,8 +4,8 @@ from pathlib import Path
 
 import numpy as np
 
+from padforge.common.files import sha256
 from padforge.design import Morphology, RulesSettings, check_rules
-from padforge.design.common.files import sha256
 from padforge.sense import Recording
 from tests.helpers.door import called, refused
 

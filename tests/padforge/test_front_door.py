@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 
 import padforge
-from padforge import design, fabricate, sense
-from padforge.design import Contact, PadSettings, RulesSettings, SearchSettings, Spec
+from padforge import Spec, design, fabricate, sense
+from padforge.design import Contact, PadSettings, RulesSettings, SearchSettings
 from tests.helpers.door import called, refused
 
 
@@ -117,7 +117,7 @@ def test_only_the_genetic_search_needs_pymoo(tmp_path: Path, monkeypatch: pytest
             raise metadata.PackageNotFoundError(name)
         return metadata.version(name)
 
-    monkeypatch.setattr("padforge.design.common.files.installed_version", version_without_pymoo)
+    monkeypatch.setattr("padforge.common.files.installed_version", version_without_pymoo)
     smallest = "[pad]\ngrid = 1\n[search]\nknots = 1\nstarts = 1\nsteps = 1\nmax_failures = 1\n"
     (tmp_path / "pad.toml").write_text(smallest)
     said = refused("design", "--method", "genetic", cwd=tmp_path)
@@ -132,7 +132,7 @@ def test_package_exports_a_dozen_names_of_the_stages() -> None:
     assert len(names) == len(set(names))
     exported = set(dir(padforge)) - {"design", "fabricate", "sense"}
     assert 10 <= len(exported) <= 16
-    for name in exported:
+    for name in exported - {"Fault", "InputError", "Spec"}:  # of all stages
         package = next(package for package in (design, fabricate, sense) if name in package.__all__)
         assert getattr(padforge, name) is getattr(package, name), name
     with pytest.raises(AttributeError, match="nothing"):

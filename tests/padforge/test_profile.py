@@ -9,8 +9,8 @@ from importlib.machinery import PathFinder
 import numpy as np
 import pytest
 
+from padforge.common import profiling
 from padforge.design import Morphology, signals
-from padforge.design.common import profiling
 from padforge.design.optimize.search import SearchOptions, search
 from padforge.design.settings import PUBLISHED_CONTACT, PadSettings, RulesSettings, SearchSettings
 from padforge.fabricate import build
@@ -113,7 +113,7 @@ def test_press_visits_only_spans_below_it():
 def test_finished_starts_are_not_repeated(tmp_path, monkeypatch):
     settings = SearchSettings(knots=1, starts=2, steps=2, max_failures=0)
     asked = (PadSettings(grid=1), PUBLISHED_CONTACT, settings, RulesSettings(enforce=False))
-    monkeypatch.setattr("padforge.design.common.parallel.Checkpoints.clear", lambda self: None)
+    monkeypatch.setattr("padforge.common.parallel.Checkpoints.clear", lambda self: None)
     with profiling.profiled() as profile:
         first = search(*asked, run=SearchOptions(keep_in=tmp_path / "search"))
     assert profile.counts["starts"] == [2, 2]

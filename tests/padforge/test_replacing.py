@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from padforge.design.common.files import sha256, write_json
+from padforge.common.files import sha256, write_json
 from padforge.design.morphology import Morphology
 from padforge.sense.recording.run_directory import Recorder
 from tests.helpers.door import called, refused

@@ -13,10 +13,10 @@ import pytest
 import trimesh
 from safetensors.numpy import load_file
 
+from padforge.common.files import sha256
+from padforge.common.parallel import Checkpoints
+from padforge.common.settings import Spec
 from padforge.design import Contact, SearchSettings
-from padforge.design.common.files import sha256
-from padforge.design.common.parallel import Checkpoints
-from padforge.design.common.settings import Spec
 from padforge.design.contact_set import judged_contacts
 from padforge.design.report import press_sections
 from padforge.run import Run

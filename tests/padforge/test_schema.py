@@ -10,8 +10,8 @@ import jsonschema
 import pytest
 
 from padforge.cli import PRESETS
-from padforge.design.common.settings import Spec
-from padforge.design.common.validation import InputError
+from padforge.common.settings import Spec
+from padforge.common.validation import InputError
 from padforge.settings import SECTIONS, section_models
 from tests.docs.pages import BLOCK, PAGES, relative
 from tests.helpers.door import called

@@ -4,8 +4,9 @@ from pathlib import Path
 
 import pytest
 
-from padforge.design import Contact, InputError, Morphology
-from padforge.design.common.settings import Spec
+from padforge import InputError
+from padforge.common.settings import Spec
+from padforge.design import Contact, Morphology
 from padforge.fabricate import FabricationSettings
 from padforge.run import Run, check_run
 from padforge.settings import check_settings

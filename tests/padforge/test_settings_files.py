@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from padforge.design.common.settings import Settings, Spec, commented_toml
-from padforge.design.common.validation import InputError
+from padforge.common.settings import Settings, Spec, commented_toml
+from padforge.common.validation import InputError
 from padforge.design.morphology import Morphology
 from padforge.design.objectives.rules import check_rules
 from padforge.design.settings import PadSettings, RulesSettings

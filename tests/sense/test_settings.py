@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from padforge.design.common.validation import InputError
+from padforge.common.validation import InputError
 from padforge.sense.settings import LocalizerSettings, RigSettings
 from tests.helpers.limits import require_ends
 

@@ -10,8 +10,8 @@ from typing import Any
 import draccus  # pyright: ignore[reportMissingImports]
 from lerobot.robots import Robot, RobotConfig, make_robot_from_config  # pyright: ignore[reportMissingImports]
 
-from padforge.design.common.command_line import load_spec
-from padforge.design.common.validation import InputError
+from padforge.common.command_line import load_spec
+from padforge.common.validation import InputError
 from padforge.sense.live.pad_sensor import PadSensor
 from padforge.sense.settings import RigSettings
 

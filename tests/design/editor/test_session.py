@@ -5,8 +5,9 @@ import json
 import numpy as np
 import pytest
 
-from padforge.design import Contact, InputError, Morphology, PadSettings, RulesSettings, Spec, check_rules
-from padforge.design.common.files import sha256, write_json
+from padforge import InputError, Spec
+from padforge.common.files import sha256, write_json
+from padforge.design import Contact, Morphology, PadSettings, RulesSettings, check_rules
 from padforge.design.editor import EditSession
 from padforge.design.objectives.ambiguity import AMBIGUITY_NOISE, ambiguities
 

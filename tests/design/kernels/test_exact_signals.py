@@ -12,7 +12,8 @@ from scipy.integrate import quad
 from scipy.interpolate import PchipInterpolator
 from scipy.optimize import brentq
 
-from padforge.design import Contact, InputError, Morphology, signals, signals_quantized, signals_sparse
+from padforge import InputError
+from padforge.design import Contact, Morphology, signals, signals_quantized, signals_sparse
 from padforge.design.kernels.exact_signals import find_one_crossing
 from padforge.design.morphology import assemble_knots
 from padforge.design.settings import PUBLISHED_CONTACT, Layout

@@ -6,8 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.interpolate import CubicSpline
 
+from padforge.common.profiling import profiled
 from padforge.design import Contact, Morphology, signals, signals_quantized, signals_sparse
-from padforge.design.common.profiling import profiled
 from padforge.design.contact import fibre_axes
 from padforge.design.kernels.measured_signals import PRECISION
 from padforge.design.settings import DEFAULT_PITCH_MM

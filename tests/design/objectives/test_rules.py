@@ -5,7 +5,8 @@ import pytest
 from scipy.interpolate import PchipInterpolator
 from scipy.spatial import KDTree
 
-from padforge.design import InputError, Morphology, Spec, crossings
+from padforge import InputError, Spec
+from padforge.design import Morphology, crossings
 from padforge.design.contact import fibre_axes
 from padforge.design.objectives.penalties import penalties
 from padforge.design.objectives.rules import check_rules

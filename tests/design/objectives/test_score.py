@@ -5,7 +5,8 @@ import math
 import numpy as np
 import pytest
 
-from padforge.design import Contact, InputError, Morphology
+from padforge import InputError
+from padforge.design import Contact, Morphology
 from padforge.design.contact import fibre_axes
 from padforge.design.objectives.score import TERMS, score, sharpness
 from padforge.design.published.objective import published_terms

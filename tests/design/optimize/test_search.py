@@ -5,8 +5,9 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 
+from padforge import InputError
 from padforge.benchmarks import search as benchmark
-from padforge.design import Contact, InputError, Morphology
+from padforge.design import Contact, Morphology
 from padforge.design.objectives.expected_error import criterion_errors
 from padforge.design.objectives.rules import check_rules
 from padforge.design.objectives.score import describe_terms, score

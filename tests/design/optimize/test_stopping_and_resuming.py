@@ -15,11 +15,12 @@ import click
 import numpy as np
 import pytest
 
+from padforge import InputError
 from padforge.cli import cli
-from padforge.design import InputError, PadSettings, RulesSettings, SearchOptions, SearchSettings, search
-from padforge.design.common import parallel as computing
-from padforge.design.common.command_line import run_to_end
-from padforge.design.common.parallel import Checkpoints
+from padforge.common import parallel as computing
+from padforge.common.command_line import run_to_end
+from padforge.common.parallel import Checkpoints
+from padforge.design import PadSettings, RulesSettings, SearchOptions, SearchSettings, search
 from padforge.design.optimize import search as stopping
 
 PAD = PadSettings(grid=1)

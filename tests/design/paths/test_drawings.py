@@ -10,9 +10,10 @@ import shapely
 from click.testing import CliRunner
 from ezdxf import new, units  # pyright: ignore[reportPrivateImportUsage]
 
-from padforge.design import Contact, InputError, Morphology, PadSettings, draw_plan, flatten
+from padforge import InputError
+from padforge.common.plotting import save_figure
+from padforge.design import Contact, Morphology, PadSettings, draw_plan, flatten
 from padforge.design.cli import design
-from padforge.design.common.plotting import save_figure
 from padforge.design.paths.import_plan import import_plan
 from padforge.design.settings import Layout
 

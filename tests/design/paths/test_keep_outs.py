@@ -5,7 +5,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from padforge.design import InputError, Morphology
+from padforge import InputError
+from padforge.design import Morphology
 from padforge.design.contact import fibre_axes
 from padforge.design.objectives.ambiguity import free_presses
 from padforge.design.objectives.penalties import penalties

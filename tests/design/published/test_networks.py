@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 
+from padforge.common.validation import InputError
 from padforge.design import Contact, Morphology, signals
-from padforge.design.common.validation import InputError
 from padforge.design.published.networks import (
     SimulatedPresses,
     fresh_presses,

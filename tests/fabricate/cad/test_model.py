@@ -12,7 +12,7 @@ import pytest
 from OCP.Standard import Standard_Failure
 from scipy.spatial import KDTree
 
-from padforge.design.common.validation import InputError
+from padforge.common.validation import InputError
 from padforge.design.morphology import Morphology
 from padforge.design.paths.curves import lengths
 from padforge.fabricate.cad import model as of_model

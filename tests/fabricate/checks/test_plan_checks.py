@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from padforge.design.common.settings import Spec
+from padforge.common.settings import Spec
 from padforge.design.morphology import Morphology
 from padforge.design.settings import Contact, RulesSettings
 from padforge.fabricate.checks import Finding

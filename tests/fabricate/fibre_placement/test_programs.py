@@ -5,7 +5,7 @@ import re
 import numpy as np
 import pytest
 
-from padforge.design.common.plotting import ALARM
+from padforge.common.plotting import ALARM
 from padforge.design.morphology import Morphology
 from padforge.fabricate.export import Fabrication
 from padforge.fabricate.fibre_placement import gcode, plan_toolpath

@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from PIL import Image
 
-from padforge.design.common.plotting import ALARM, FAINT, HORIZONTAL, PAPER, VERTICAL
+from padforge.common.plotting import ALARM, FAINT, HORIZONTAL, PAPER, VERTICAL
 from padforge.design.morphology import Morphology
 from padforge.fabricate.checks import Finding
 from padforge.fabricate.mesh import mould_mesh

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from padforge.design.common.files import provenance
-from padforge.design.common.plotting import save_figure
+from padforge.common.files import provenance
+from padforge.common.plotting import save_figure
 from padforge.design.morphology import Morphology
 from padforge.design.report import draw_plan
 from padforge.design.settings import Contact, PadSettings, RulesSettings, SearchSettings

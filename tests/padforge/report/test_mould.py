@@ -11,8 +11,8 @@ import pytest
 import trimesh
 from matplotlib.colors import to_rgb
 
-from padforge.design.common.files import sha256
-from padforge.design.common.plotting import HORIZONTAL, VERTICAL
+from padforge.common.files import sha256
+from padforge.common.plotting import HORIZONTAL, VERTICAL
 from padforge.fabricate.outputs import report
 from padforge.fabricate.outputs.report import PackedMesh, fabrication_sections, pack_mesh
 from padforge.report import write_report

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 from markupsafe import escape
 
-from padforge.design.common.files import provenance
-from padforge.design.common.plotting import HORIZONTAL, VERTICAL
-from padforge.design.common.validation import Fault, InputError
+from padforge.common.files import provenance
+from padforge.common.plotting import HORIZONTAL, VERTICAL
+from padforge.common.validation import Fault, InputError
 from padforge.design.contact import FIBRE_BLUR_MM, contact_press, half_widths_mm, profile_weights
 from padforge.design.morphology import Morphology
 from padforge.design.report import contact_lines, contact_sections, design_sections, draw_press, press_sections

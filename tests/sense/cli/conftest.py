@@ -11,8 +11,8 @@ from unittest import mock
 import pytest
 
 from padforge.cli import main
+from padforge.common.settings import Spec
 from padforge.design import Morphology
-from padforge.design.common.settings import Spec
 from padforge.sense import Evaluation, calibrate
 from padforge.sense.health import trace_model
 from padforge.sense.localizer.model import LocalizerModel

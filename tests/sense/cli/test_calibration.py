@@ -86,7 +86,7 @@ def test_interrupted_calibrate_leaves_no_file(few, monkeypatch: pytest.MonkeyPat
 
         yield interrupt
 
-    monkeypatch.setattr("padforge.design.common.command_line.progress_bar", progress_bar)
+    monkeypatch.setattr("padforge.common.command_line.progress_bar", progress_bar)
     code, _, err = few("calibrate", "rec", "--out", "new")
     assert code == 130
     assert "interrupted" in err

@@ -9,7 +9,7 @@ import pytest
 import scipy.io
 from mcap.reader import make_reader
 
-from padforge.design.common.validation import InputError
+from padforge.common.validation import InputError
 from padforge.sense import Recording, export_csv, export_hdf5
 from padforge.sense.cli import options
 

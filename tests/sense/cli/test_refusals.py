@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from padforge.benchmarks.twin import printed_pad
+from padforge.common.files import sha256
 from padforge.design import Morphology
-from padforge.design.common.files import sha256
 from padforge.design.twin import TwinChannel
 from padforge.sense import Recording
 from padforge.sense.live.outputs import LivePage

@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 
 from padforge.benchmarks.twin import printed_pad
+from padforge.common.files import sha256
 from padforge.design import Contact, Morphology
-from padforge.design.common.files import sha256
 from padforge.fabricate import MouldSettings, build
 from padforge.fabricate.settings import DEFAULTS
 from padforge.sense import Recording

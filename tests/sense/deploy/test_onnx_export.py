@@ -11,7 +11,7 @@ import onnx
 import onnxruntime
 import pytest
 
-from padforge.design.common.validation import Fault, InputError
+from padforge.common.validation import Fault, InputError
 from padforge.sense import Recording, export_csv
 from padforge.sense.deploy import onnx_export
 from padforge.sense.deploy.onnx_export import FORMAT, MAX_DIFFERENCE_MM, OnnxReport, export_onnx

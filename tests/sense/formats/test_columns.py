@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from padforge.design.common.validation import InputError
+from padforge.common.validation import InputError
 from padforge.sense import Recording
 from padforge.sense.formats.columns import (
     PRESSES_DETECTED,

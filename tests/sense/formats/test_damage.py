@@ -8,7 +8,7 @@ import scipy.io
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from padforge.design.common.validation import InputError
+from padforge.common.validation import InputError
 from padforge.sense import Recorder, Recording, export_bag, export_csv, export_hdf5, import_bag
 from padforge.sense.formats.import_export import import_file
 

@@ -8,7 +8,7 @@ import h5py
 import numpy as np
 import pytest
 
-from padforge.design.common.validation import InputError
+from padforge.common.validation import InputError
 from padforge.sense import Recording, export_hdf5, import_hdf5, open_recording
 
 MAPPING = "time=times_s,fibres=readings_v,positions=presses_mm,down_command=down_command,up_command=up_command"

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from padforge.design.common.validation import InputError
+from padforge.common.validation import InputError
 from padforge.sense import (
     Recorder,
     Recording,

@@ -9,7 +9,7 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from padforge.design.common.validation import InputError
+from padforge.common.validation import InputError
 from padforge.sense import Recording
 from padforge.sense.formats import lerobot
 from padforge.sense.formats.annotations import ModelAnnotations

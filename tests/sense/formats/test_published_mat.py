@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import scipy.io
 
-from padforge.design.common.validation import InputError
+from padforge.common.validation import InputError
 from padforge.sense import import_mat
 
 MAT = "para5_long_first4500.mat"

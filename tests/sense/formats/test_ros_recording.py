@@ -18,7 +18,7 @@ from mcap_ros2.decoder import DecoderFactory
 from rosbags.interfaces import QosDurability
 from rosbags.rosbag2 import Reader
 
-from padforge.design.common.validation import InputError
+from padforge.common.validation import InputError
 from padforge.sense import Recording
 from padforge.sense.formats.annotations import FaultAnnotation, ModelAnnotations
 from padforge.sense.formats.import_export import export_file, import_file

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from padforge.design.common.validation import InputError
+from padforge.common.validation import InputError
 from padforge.sense import FaultDetector, HealthModel, Recording
 from padforge.sense.arrays import MIN_SCALE_V
 from padforge.sense.health import health_model

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from padforge.design.common.validation import InputError
+from padforge.common.validation import InputError
 from padforge.sense import Live, Recording, RigSettings
 from padforge.sense.live import pad_sensor
 from padforge.sense.live.pad_sensor import PadSensor

@@ -11,8 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from padforge.design.common import server as page_server
-from padforge.design.common.server import HOST
+from padforge.common import server as page_server
+from padforge.common.server import HOST
 from padforge.sense.live.outputs import LivePage
 from tests.helpers.chromium import CHROMIUM, Chromium
 

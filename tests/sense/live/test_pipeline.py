@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from padforge.design.common.validation import InputError
+from padforge.common.validation import InputError
 from padforge.sense import Recording, calibrate
 from padforge.sense.health.fault_detector import FibreFault
 from padforge.sense.live.pipeline import MAX_TRACK, RELEASE, Estimate, Live

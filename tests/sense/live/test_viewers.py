@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 
-from padforge.design.common.validation import InputError
+from padforge.common.validation import InputError
 from padforge.sense.formats.ros_messages import HEALTH, PRESSED, READINGS, TOUCHES
 from padforge.sense.live.viewers import SCENE, FoxgloveOutput, RerunOutput
 from tests.sense.live.test_outputs import DOWN, READING, STATES, TOUCH

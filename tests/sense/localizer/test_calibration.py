@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 from sklearn.base import clone
 from sklearn.model_selection import cross_val_score
 
-from padforge.design.common.progress import OnProgress, ignore_progress
-from padforge.design.common.validation import InputError
+from padforge.common.progress import OnProgress, ignore_progress
+from padforge.common.validation import InputError
 from padforge.sense import Evaluation, Localizer, Recording, calibrate, evaluate, import_mat
 from padforge.sense.health.fault_detector import FibreFault, mask_faults
 from padforge.sense.localizer import training

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from padforge.design.common.validation import InputError
+from padforge.common.validation import InputError
 from padforge.sense import Recording, calibrate, evaluate, recalibrate
 from padforge.sense.localizer import training
 from padforge.sense.localizer.model import LocalizerModel

@@ -9,7 +9,7 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from padforge.design.common.validation import InputError
+from padforge.common.validation import InputError
 from padforge.sense import Recording, evaluate
 from padforge.sense.localizer import training
 from padforge.sense.localizer.evaluation import distances

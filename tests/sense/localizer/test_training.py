@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from padforge.benchmarks import harness
 from padforge.benchmarks import localizer as bench
-from padforge.design.common.progress import ignore_progress
+from padforge.common.progress import ignore_progress
 from padforge.sense.localizer import network, torch_network, training
 from padforge.sense.localizer.features import N_FEATURES
 from padforge.sense.localizer.moments import CORRECTED, N_DOWN, N_TIMED, PHASES

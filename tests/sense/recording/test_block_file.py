@@ -10,7 +10,7 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from padforge.design.common.validation import InputError
+from padforge.common.validation import InputError
 from padforge.sense.recording.block_file import BlockWriter, block_dtype, read_blocks
 
 

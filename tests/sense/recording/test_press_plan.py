@@ -5,8 +5,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from padforge.design import InputError, Morphology
-from padforge.design.common.settings import validate
+from padforge import InputError
+from padforge.common.settings import validate
+from padforge.design import Morphology
 from padforge.design.settings import PadSettings
 from padforge.sense.recording.press_plan import PressPlan, make_plan, read_plan
 from padforge.sense.settings import RigSettings

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from padforge.design.common.validation import InputError
+from padforge.common.validation import InputError
 from padforge.sense import Recorder, Recording
 
 

@@ -14,8 +14,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from padforge.design.common.files import locked
-from padforge.design.common.validation import InputError
+from padforge.common.files import locked
+from padforge.common.validation import InputError
 from padforge.sense import Recorder, Recording
 from padforge.sense.recording.block_file import block_dtype
 from tests.helpers.kills import killed

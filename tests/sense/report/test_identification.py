@@ -9,7 +9,7 @@ from unittest.mock import Mock
 import numpy as np
 import pytest
 
-from padforge.design.common.plotting import FAINT, HORIZONTAL, VERTICAL
+from padforge.common.plotting import FAINT, HORIZONTAL, VERTICAL
 from padforge.design.paths.curves import flatten
 from padforge.sense.report import identification as report
 from padforge.sense.report.identification import identification_sections, identify_into

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 from numpy.typing import ArrayLike
 
+from padforge.common.validation import InputError
 from padforge.design import Contact, Morphology
-from padforge.design.common.validation import InputError
 from padforge.design.settings import PadSettings
 from padforge.sense import Recording
 from padforge.sense.localizer.calibration import calibrate

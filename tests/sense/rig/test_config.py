@@ -14,7 +14,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from padforge.design.common.validation import InputError
+from padforge.common.validation import InputError
 from padforge.design.morphology import Morphology
 from padforge.design.settings import PUBLISHED_CONTACT, PadSettings
 from padforge.design.twin import PlanTransform

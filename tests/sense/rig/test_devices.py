@@ -10,7 +10,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from padforge.design.common.validation import InputError
+from padforge.common.validation import InputError
 from padforge.sense.rig import devices
 from padforge.sense.rig.arms.ur5 import UR5
 from padforge.sense.rig.boards import due, line_board

@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from padforge.common.validation import InputError
 from padforge.design import Morphology
-from padforge.design.common.validation import InputError
 from padforge.design.settings import PUBLISHED_CONTACT, Contact
 from padforge.sense import Recording
 from padforge.sense.recording.run_directory import FORMAT, START

@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from padforge.common.files import UNFINISHED
+from padforge.common.progress import OnProgress, ignore_progress
 from padforge.design import Morphology
-from padforge.design.common.files import UNFINISHED
-from padforge.design.common.progress import OnProgress, ignore_progress
 from padforge.design.settings import PUBLISHED_CONTACT
 from padforge.sense.formats.ros_recording import import_bag
 from padforge.sense.recording.press_plan import PressPlan, make_plan

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from padforge.benchmarks.filter import admm, fibre, linear_program
-from padforge.design.common.validation import InputError
+from padforge.common.validation import InputError
 from padforge.sense import running_median, total_variation
 
 STEP_V = 3.3 / 1023

@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from padforge.common.validation import InputError
 from padforge.design import Morphology
-from padforge.design.common.validation import InputError
 from padforge.design.settings import Counts
 from padforge.sense import PressDetector, Recording, RigSettings, detect_presses, import_mat, simulate
 from padforge.sense.signals.press_detection import Presses, align_to_detected, estimate_commands

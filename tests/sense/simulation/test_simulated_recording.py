@@ -6,7 +6,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from padforge.design import Contact, InputError, Morphology, Twin
+from padforge import InputError
+from padforge.design import Contact, Morphology, Twin
 from padforge.design.contact import relative_stretch
 from padforge.design.settings import PadSettings
 from padforge.design.twin import PARTS, PlanTransform, TwinChannel, TwinPart, TwinReadings, TwinResidual, TwinScatter

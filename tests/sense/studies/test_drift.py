@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from padforge.design import InputError, Morphology
+from padforge import InputError
+from padforge.design import Morphology
 from padforge.sense import Recording, open_recording
 from padforge.sense.settings import RigSettings
 from padforge.sense.simulation.simulated_recording import simulate

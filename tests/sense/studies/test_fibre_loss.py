@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from padforge.design.common.validation import InputError
+from padforge.common.validation import InputError
 from padforge.sense import Recording, evaluate
 from padforge.sense.localizer.model import LocalizerModel
 from padforge.sense.studies import fibre_loss

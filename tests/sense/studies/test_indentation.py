@@ -6,7 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from padforge.design import Contact, InputError, Morphology, contact, press_forces_n
+from padforge import InputError
+from padforge.design import Contact, Morphology, contact, press_forces_n
 from padforge.sense.studies import indentation
 from padforge.sense.studies.indentation import FOOTPRINTS, SETS, circumradius, force_study, shape_study, tool_contacts
 from padforge.sense.studies.study import Sizes, Study, run

@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from matplotlib.figure import Figure
 
-from padforge.design.common.validation import InputError
+from padforge.common.validation import InputError
 from padforge.sense import Recording
 from padforge.sense.settings import LocalizerSettings as Options
 from padforge.sense.studies.learning_curve import (

@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from padforge.common.parallel import one_torch_thread
 from padforge.design import Morphology, signals
-from padforge.design.common.parallel import one_torch_thread
 from padforge.sense.studies.multicontact import (
     COUNTING,
     LABELLED,

@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from padforge.design import Contact, InputError, Morphology
+from padforge import InputError
+from padforge.design import Contact, Morphology
 from padforge.design.published.networks import SimulatedPresses
 from padforge.sense.studies import robustness
 from padforge.sense.studies.robustness import MIN_NETWORKS, robustness_study

@@ -5,7 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from padforge.design import InputError, Morphology, signals
+from padforge import InputError
+from padforge.design import Morphology, signals
 from padforge.design.settings import PUBLISHED_CONTACT
 from padforge.sense.studies import scaling
 from padforge.sense.studies.scaling import family_shares, scaling_study, spread_presses, tile_inputs

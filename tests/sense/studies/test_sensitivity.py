@@ -6,7 +6,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from padforge.design import Contact, InputError, Morphology
+from padforge import InputError
+from padforge.design import Contact, Morphology
 from padforge.design.settings import PUBLISHED_CONTACT
 from padforge.sense.studies import sensitivity
 from padforge.sense.studies.sensitivity import sensitivity_study

@@ -14,8 +14,9 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
+from padforge import InputError
 from padforge.cli import main
-from padforge.design import Contact, InputError, Morphology, PadSettings, SearchSettings, contact
+from padforge.design import Contact, Morphology, PadSettings, SearchSettings, contact
 from padforge.design.optimize.search import SearchResult
 from padforge.design.settings import PUBLISHED_CONTACT, Layout
 from padforge.sense.localizer import evaluation

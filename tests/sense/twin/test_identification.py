@@ -7,11 +7,12 @@ from unittest.mock import patch
 import numpy as np
 import pytest
 
+from padforge import InputError
 from padforge.benchmarks import harness
 from padforge.benchmarks import twin as bench
 from padforge.benchmarks.twin import printed_pad
-from padforge.design import InputError, Morphology
-from padforge.design.common.progress import ignore_progress
+from padforge.common.progress import ignore_progress
+from padforge.design import Morphology
 from padforge.design.settings import Contact, PadSettings
 from padforge.design.twin import Twin
 from padforge.sense import identify

@@ -19,8 +19,8 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from padforge.design.common import files
-from padforge.design.common.validation import Fault, InputError, short_repr
+from padforge.common import files
+from padforge.common.validation import Fault, InputError, short_repr
 
 State = dict[str, NDArray[Any]]
 Key = TypeVar("Key")

@@ -13,7 +13,7 @@ from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from padforge.design.common.files import read_bytes
+from padforge.common.files import read_bytes
 
 if TYPE_CHECKING:
     from jinja2 import Environment
@@ -24,7 +24,7 @@ def read_resource(package: str, name: str) -> str:
     return resources.files(package).joinpath(name).read_text(encoding="utf-8")
 
 
-TEMPLATES = "padforge.design.common.templates"
+TEMPLATES = "padforge.common.templates"
 _TYPES = {".png": "image/png", ".svg": "image/svg+xml"}
 _NUMBER = re.compile(r"[-+]?\d[\d.]*(e[-+]?\d+)?( ?%| mm| ml| g)?")  # right-aligned in a table
 _SHORT, _LONG = 16, 30  # characters: columns of cells up to the one are not wrapped, words beyond the other broken

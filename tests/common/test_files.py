@@ -11,11 +11,11 @@ from typing import Any
 
 import pytest
 
-from padforge.design.common import files
-from padforge.design.common.validation import InputError
+from padforge.common import files
+from padforge.common.validation import InputError
 from tests.helpers.power_cut import ON_LINUX, Disk
 
-LOCK = "import sys\nfrom pathlib import Path\nfrom padforge.design.common.files import locked_folder\n"
+LOCK = "import sys\nfrom pathlib import Path\nfrom padforge.common.files import locked_folder\n"
 ANOTHER = LOCK + "try:\n  with locked_folder(Path(sys.argv[1])): print('in')\nexcept ValueError as error: print(error)"
 
 

@@ -22,8 +22,10 @@ from numba import njit
 from numba.core import config
 from numba.core import event as events
 
+import padforge
+
 PATIENCE_S = 1.5  # time spent on compiling, s, after which the user is told why nothing happens
-ROOMS = ("design", "fabricate", "sense")  # packages whose sources are compiled
+SOURCES = [Path(base) / stage for base in padforge.__path__ for stage in ("design", "sense")]  # that have kernels
 MAX_CACHES = 4  # in a folder, of the latest versions of the sources
 _PREFIX = "padforge-kernels-"
 
@@ -60,8 +62,7 @@ def cache_folder() -> Path:
     Numba compares the source of a kernel alone, not those of the kernels and constants in it: a digest of all sources
     is part of the name.
     """
-    root = Path(__file__).parents[2]
-    sources = sorted(path for room in ROOMS for path in (root / room).rglob("*.py"))
+    sources = sorted(path for folder in SOURCES for path in folder.rglob("*.py"))
     name = _PREFIX + sha256(b"\0".join(source.read_bytes() for source in sources)).hexdigest()[:16]
     for base in cache_bases():
         folder = base / name

@@ -16,11 +16,10 @@ from types import ModuleType
 import pytest
 from numba.core import event as events
 
-import padforge
-from padforge.design.common import compilation
+from padforge.common import compilation
 
 KERNELS = """
-from padforge.design.common.compilation import inner_kernel, kernel
+from padforge.common.compilation import inner_kernel, kernel
 
 @inner_kernel
 def inner(x):
@@ -69,8 +68,10 @@ def test_compilation_is_announced_unless_it_is_short_or_cached(
 def root(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     """The root of other sources, which have a folder of compiled kernels of their own; no other folder is theirs."""
     root = tmp_path / "padforge"
-    (root / "design/common").mkdir(parents=True)
-    monkeypatch.setattr(compilation, "__file__", str(root / "design/common/compilation.py"))
+    for folder in ("design", "common"):
+        (root / folder).mkdir(parents=True)
+    monkeypatch.setattr(compilation, "SOURCES", [root / "design"])
+    monkeypatch.setattr(compilation, "__file__", str(root / "common/compilation.py"))
     for name in ("NUMBA_CACHE_DIR", "XDG_CACHE_HOME", "LOCALAPPDATA"):
         monkeypatch.delenv(name, raising=False)
     compilation.cache_folder.cache_clear()
@@ -101,13 +102,13 @@ def test_kernels_are_compiled_anew_when_what_they_call_has_changed(
     assert [compute(), compute()] == [(4, 1), (4, 0)]
     (root / "design/inner.py").write_text(inner.replace("x + 1", "x + 2"))
     assert [compute(), compute()] == [(6, 1), (6, 0)]
-    base = root / ("chosen" if is_chosen else "design/common/__pycache__")
+    base = root / ("chosen" if is_chosen else "common/__pycache__")
     assert len({path.parents[1] for path in root.rglob("*.nbc")}) == len(list(base.iterdir())) == 2
 
 
 def test_kernels_are_cached_where_the_user_can_write(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Files take the place of folders that cannot be written, one after the other."""
-    bases = [root / name for name in ("chosen", "design/common/__pycache__", "xdg", "home/.cache", "temporary")]
+    bases = [root / name for name in ("chosen", "common/__pycache__", "xdg", "home/.cache", "temporary")]
     variables = {"NUMBA_CACHE_DIR": "chosen", "XDG_CACHE_HOME": "xdg", "HOME": "home", "USERPROFILE": "home"}
     for variable, name in variables.items():
         monkeypatch.setenv(variable, str(root / name))
@@ -122,7 +123,7 @@ def test_kernels_are_cached_where_the_user_can_write(root: Path, monkeypatch: py
 
 
 def test_few_caches_of_other_sources_stay(root: Path) -> None:
-    base, mine = root / "design/common/__pycache__", "compilation.cpython-311.pyc"
+    base, mine = root / "common/__pycache__", "compilation.cpython-311.pyc"
     base.mkdir()
     (base / mine).touch()
     for number in range(6):
@@ -135,10 +136,9 @@ def test_few_caches_of_other_sources_stay(root: Path) -> None:
 
 def test_inner_kernels_are_called_by_kernels_alone() -> None:
     """Whichever name they are imported by: Python would crash."""
-    folders = [Path(folder) / package for folder in padforge.__path__ for package in compilation.ROOMS]
     sources, tests = (
         [path.read_text(encoding="utf-8") for folder in where for path in folder.rglob("*.py")]
-        for where in (folders, [Path(__file__).parents[2]])
+        for where in (compilation.SOURCES, [Path(__file__).parents[1]])
     )
 
     inner = {

@@ -18,8 +18,8 @@ from pydantic import (
     model_validator,
 )
 
-from padforge.design.common.files import read_bytes
-from padforge.design.common.validation import InputError, check_mapping, check_path, check_type, short_repr
+from padforge.common.files import read_bytes
+from padforge.common.validation import InputError, check_mapping, check_path, check_type, short_repr
 
 if TYPE_CHECKING:
     from pydantic import GetJsonSchemaHandler

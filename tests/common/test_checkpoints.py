@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from padforge.design.common.parallel import Checkpoints
-from padforge.design.common.validation import InputError
+from padforge.common.parallel import Checkpoints
+from padforge.common.validation import InputError
 from tests.helpers.kills import killed
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="kills and locks as POSIX has them")

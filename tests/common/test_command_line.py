@@ -9,8 +9,8 @@ from unittest.mock import Mock
 import click
 import pytest
 
-from padforge.design.common import command_line
-from padforge.design.common.validation import InputError
+from padforge.common import command_line
+from padforge.common.validation import InputError
 
 _log = logging.getLogger("padforge.sense.somewhere")
 

@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from padforge.design.common import validation as errors
-from padforge.design.common.validation import InputError, missing_extra
+from padforge.common import validation as errors
+from padforge.common.validation import InputError, missing_extra
 
 
 def test_checks_accept_values_at_their_bounds():

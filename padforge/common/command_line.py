@@ -18,13 +18,14 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import click
 
-from padforge.design.common.validation import Fault, InputError, missing_extra, printable
+from padforge.common.validation import Fault, InputError, missing_extra, printable
 
 if TYPE_CHECKING:
     from rich.progress import Progress
 
+    from padforge.common.settings import Spec
+
     from .progress import OnProgress
-    from .settings import Spec
 
 spec_option = click.option(
     "--spec",
@@ -152,7 +153,7 @@ class SettingsFile(NamedTuple):
 
 def load_spec(path: Path | None) -> "Spec":
     """Load and check `path`, else pad.toml of the current folder, else the defaults; see `SettingsFile`."""
-    from .settings import Spec
+    from padforge.common.settings import Spec
 
     default, context = Path("pad.toml"), click.get_current_context(silent=True)
     file: SettingsFile | None = context.find_root().obj if context else None

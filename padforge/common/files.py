@@ -24,7 +24,7 @@ from typing import Any
 
 from filelock import FileLock, Timeout
 
-from padforge.design.common.validation import InputError, short_repr
+from padforge.common.validation import InputError, short_repr
 
 UNFINISHED = ".unfinished-"  # prefix of the names of temporary files and folders
 LOCK = ".lock"  # name of the file by which a run has a folder for itself

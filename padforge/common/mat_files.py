@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from padforge.design.common.files import check_file
-from padforge.design.common.validation import InputError
+from padforge.common.files import check_file
+from padforge.common.validation import InputError
 
 MAX_BYTES = 2**33  # size limit of a file
 

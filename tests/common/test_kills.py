@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from padforge.design.common import files
-from padforge.design.common.validation import InputError
+from padforge.common import files
+from padforge.common.validation import InputError
 from tests.helpers.kills import killed
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="kills as POSIX has them")

@@ -9,10 +9,10 @@ from typing import Any
 
 import pytest
 
-from padforge.design.common.page import PageSection, render_markdown, table
-from padforge.design.common.page import page as whole_page
-from padforge.design.common.server import HOST, LocalPage
-from padforge.design.common.validation import InputError
+from padforge.common.page import PageSection, render_markdown, table
+from padforge.common.page import page as whole_page
+from padforge.common.server import HOST, LocalPage
+from padforge.common.validation import InputError
 
 PAGE = "<!doctype html><title>x</title><style>p { margin: 0 }</style><script>1</script>"
 

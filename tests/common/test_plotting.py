@@ -1,6 +1,6 @@
 """What figures share: the cells of a confusion matrix."""
 
-from padforge.design.common.plotting import draw_confusions, new_figure
+from padforge.common.plotting import draw_confusions, new_figure
 
 
 def test_confusions_are_in_per_cent_of_each_true_class():

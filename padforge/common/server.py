@@ -23,8 +23,8 @@ from http.server import BaseHTTPRequestHandler
 from typing import Any, Self
 from urllib.parse import parse_qs, urlencode, urlsplit
 
-from padforge.design.common.page import TEMPLATES, read_resource
-from padforge.design.common.validation import InputError
+from padforge.common.page import TEMPLATES, read_resource
+from padforge.common.validation import InputError
 
 HOST = "127.0.0.1"  # the loopback interface; other addresses are served only with a token
 MIN_TOKEN = 16  # characters

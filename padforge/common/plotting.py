@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from padforge.design.common.files import atomic_file
+from padforge.common.files import atomic_file
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -11,8 +11,8 @@ from functools import partial
 import pytest
 import torch
 
-from padforge.design.common.parallel import cluster, makespan, one_torch_thread, run_tasks
-from padforge.design.common.validation import Fault
+from padforge.common.parallel import cluster, makespan, one_torch_thread, run_tasks
+from padforge.common.validation import Fault
 
 
 @pytest.mark.parametrize("threads", [None, 1, 3])
@@ -115,8 +115,8 @@ def test_sigterm_during_torch_tasks_exits_130_without_a_crash() -> None:
     code = """
 import os, signal, sys, threading
 import click, torch
-from padforge.design.common.command_line import run_to_end
-from padforge.design.common.parallel import run_tasks
+from padforge.common.command_line import run_to_end
+from padforge.common.parallel import run_tasks
 sys.argv = ["padforge"]
 at_work = threading.Barrier(5, lambda: threading.Timer(0.3, os.kill, (os.getpid(), signal.SIGTERM)).start())
 def train():

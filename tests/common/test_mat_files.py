@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 import scipy.io
 
-from padforge.design import InputError, Morphology
-from padforge.design.common.mat_files import load_mat
+from padforge import InputError
+from padforge.common.mat_files import load_mat
+from padforge.design import Morphology
 
 
 def newer(path: Path, content: dict[str, Any]) -> Path:
