@@ -100,7 +100,7 @@ def live(
         else:
             recording = open_recording(replay)
             stream, mirrored = stream_recording(recording, speed), recording.mirrored
-        pipeline = Live(localizer, _load_health(model), stream.fibres, stream.rate_hz)
+        pipeline = Live(localizer, rate_hz=stream.rate_hz, fibres=stream.fibres, health=_load_health(model))
         page = stack.enter_context(LivePage(port, host=output["host"], token=output["token"]))
         if replay is None and rig == "simulated":
             echo("touches are simulated, at random positions; --rig shows those of a real pad", err=True)

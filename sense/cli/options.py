@@ -129,16 +129,18 @@ def predict_despite_faults(
 
 
 def _until(localizer: "LocalizerModel", recording: "Recording", since: str, time_s: float) -> "Indices":
-    """Return the first readings (Q,) of presses that are not known at a moment."""
+    """Return the first frames (Q,) of presses that are not known at a moment."""
     from padforge.sense.localizer.moments import Moment
+    from padforge.sense.recording.frames import framed
     from padforge.sense.signals.press_detection import first_readings
 
     if localizer.features != "windows":
         raise InputError(f"--at is given: the localizer is of method {localizer.method}, expected ensemble")
-    readings = round(time_s * recording.rate_hz)
-    moment = Moment("lift", readings) if since == "lift" else Moment("touch", max(readings, 1))
-    commands = recording.down_command, recording.up_command
-    return moment.until(first_readings(recording.readings, recording.times_s, *commands), recording.up_command)
+    frames = framed(recording)
+    count = round(time_s * frames.rate_hz)
+    moment = Moment("lift", count) if since == "lift" else Moment("touch", max(count, 1))
+    commands = frames.down_command, frames.up_command
+    return moment.until(first_readings(frames.readings, frames.times_s, *commands), frames.up_command)
 
 
 @contextmanager

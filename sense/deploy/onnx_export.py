@@ -34,6 +34,7 @@ from padforge.sense.localizer.moments import FOLLOWING, LEAST_SLIDE, N_DOWN, PHA
 from padforge.sense.localizer.network import MAX_LOG_ERROR, MIN_LOG_ERROR, Weights
 from padforge.sense.localizer.scaler import MAX_INPUT
 from padforge.sense.localizer.torch_network import EnsembleMlp, network_inputs
+from padforge.sense.recording.frames import frame_rate_hz, framed
 from padforge.sense.recording.recording import Recording
 
 FORMAT = "padforge-onnx/4"
@@ -286,7 +287,7 @@ def _build_graph(model: LocalizerModel, digest: str) -> onnx.ModelProto:
         "localizer_sha256": digest,
         "training_recording_sha256": model.training_recording_sha256,
         "features": model.features,
-        "rate_hz": f"{model.rate_hz:.9g}",
+        "rate_hz": f"{frame_rate_hz(model.rate_hz):.9g}",
         "fibres": json.dumps([f"fibre_{fibre}_v" for fibre in range(model.fibres)]),
         "inputs": json.dumps(INPUTS),
         "outputs": json.dumps({name: OUTPUTS[name] for name in names}),
@@ -328,7 +329,8 @@ def export_onnx(model: LocalizerModel, digest: str, path: Path, recording: Recor
         raise InputError(f"the localizer is of features {model.features}, expected windows: calibrate on a recording")
     if recording is not None:
         model.check_recording(recording)
-        trial = recording.readings, recording.down_command, recording.up_command
+        frames = framed(recording)
+        trial = frames.readings, frames.down_command, frames.up_command
     else:
         trial = _made_up_presses(model)
     content = _build_graph(model, digest).SerializeToString()

@@ -16,6 +16,7 @@ from padforge.sense.localizer.features import mean_at_rest
 from padforge.sense.localizer.model import LocalizerModel
 from padforge.sense.localizer.response_model import interpolate_grid
 from padforge.sense.localizer.scaler import ScaledFeatures
+from padforge.sense.recording.frames import framed
 from padforge.sense.recording.recording import Recording
 
 REST_MARGIN = 0.25  # of the range of rests in calibration, by which the median of a recording leaves it at most
@@ -63,7 +64,7 @@ def detect_shifts(
     Args:
         localizer: of the pad.
         health: of the pad.
-        recording: of a pad with the fibres and the rate of the training.
+        recording: of a pad with the fibres of the training, with about as many readings a second or more.
         fibre_mask: (Q, C), false where a fibre is masked in a press; nothing is said of one that always is.
 
     Raises:
@@ -77,8 +78,9 @@ def detect_shifts(
 
 def rest_levels(recording: Recording) -> Array:
     """Return the rests (Q, C) before the presses of a recording, V; NaN where a reading is missing."""
-    previous_end = np.concatenate([[0], recording.up_command[:-1]])
-    return mean_at_rest(recording.readings, recording.down_command, previous_end)
+    frames = framed(recording)
+    previous_end = np.concatenate([[0], frames.up_command[:-1]])
+    return mean_at_rest(frames.readings, frames.down_command, previous_end)
 
 
 def _rest_shifts(health: HealthModel, recording: Recording, fibre_mask: Mask) -> list[DomainShift]:

@@ -35,6 +35,7 @@ from padforge.sense.health.trace_model import (
     predict_fibres,
 )
 from padforge.sense.localizer.model_files import check_same_pad, files_of
+from padforge.sense.recording.frames import framed
 from padforge.sense.recording.recording import Recording
 from padforge.sense.signals.press_detection import align_to_detected
 
@@ -349,15 +350,15 @@ class FaultDetector:
         if indices.ndim != 1 or not ((indices >= 0) & (indices < len(mask))).all():
             raise InputError(f"held_back is {short_repr(held_back)}, allowed are presses from 0 to {len(mask) - 1}")
         mask[indices] = False
-        readings, times_s = recording.readings, recording.times_s
-        commanded = recording.down_command, recording.up_command
+        frames = framed(recording)
+        readings, times_s, commanded = frames.readings, frames.times_s, (frames.down_command, frames.up_command)
         presses = {COMMANDED: commanded, DETECTED: align_to_detected(readings, times_s, *commanded)}
         options = {"false_alarm_rate": self.false_alarm_rate, "provenance": dict(provenance or {})}
 
         def fit(name: str) -> HealthModel:
             down_command, up_command = (command[mask] for command in presses[name])
             rng = np.random.default_rng(self.seed)
-            return fit_health_model(readings, times_s, down_command, up_command, rng=rng, **options)
+            return fit_health_model(readings, recording.rate_hz, down_command, up_command, rng=rng, **options)
 
         with one_torch_thread():
             models = dict(run_tasks((name, partial(fit, name)) for name in presses))
@@ -370,18 +371,21 @@ class FaultDetector:
         A misfit takes the place of the faults that made it.
 
         Args:
-            recording: of a pad with the fibres and the rate of the training.
+            recording: of a pad with the fibres of the training, with about as many readings a second or more.
 
         Raises:
-            InputError: another number of fibres, or another rate, than trained on; or `fit` or `load` was not called.
+            InputError: another number of fibres, or fewer readings a second, than trained on; or `fit` or `load` was
+                not called.
         """
         self._check_fitted()
         is_detected = PRESSES_DETECTED.items() <= recording.source.items()
         monitor = FaultMonitor(self.live_model_ if is_detected else self.model_)
         check_same_pad(monitor.model, "health", recording.fibres, recording.rate_hz)
-        readings, firsts, ends = bound_presses(recording.readings, recording.down_command, recording.up_command)
+        frames = framed(recording)
+        commands = frames.down_command, frames.up_command
+        readings, firsts, ends = bound_presses(frames.readings, *commands)
         faults: list[FibreFault] = []
-        for down, up, low, high in zip(recording.down_command, recording.up_command, firsts, ends, strict=True):
+        for down, up, low, high in zip(*commands, firsts, ends, strict=True):
             first, last = min(max(low, down - REST), down - 1), min(up + RELEASED, high)
             faults += monitor.update(readings[first:last], int(down - first), int(up - first))
         is_fit = all(fault.is_masked for fault in faults)

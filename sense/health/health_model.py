@@ -28,7 +28,6 @@ from padforge.sense.health.trace_model import (
     train_networks,
 )
 from padforge.sense.localizer.model_files import files_of
-from padforge.sense.recording.recording import median_rate_hz
 
 FORMAT = "padforge-health/4"
 COMMANDED, DETECTED = "health", "health_live"
@@ -131,7 +130,7 @@ class HealthModel:
 
 def fit_health_model(
     readings: Array,
-    times_s: Array,
+    rate_hz: float,
     down_command: Indices,
     up_command: Indices,
     *,
@@ -199,7 +198,7 @@ def fit_health_model(
         rest_range_v=np.stack([rests.min(axis=0), rests.max(axis=0)]),
         fibres=readings.shape[1],
         dead=tuple(dead.tolist()),
-        rate_hz=median_rate_hz(times_s),
+        rate_hz=rate_hz,
         presses=len(traces),
         false_alarm_rate=false_alarm_rate,
         provenance=provenance,

@@ -11,6 +11,7 @@ from math import hypot
 from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from padforge.common.validation import InputError
 from padforge.sense.arrays import Array, Mask, check_stream
@@ -28,10 +29,12 @@ from padforge.sense.localizer.features import (
     valid_fibres,
     windows_from_rest,
 )
+from padforge.sense.localizer.localizer import Localizer
 from padforge.sense.localizer.model import MEASURE_COLUMNS, LocalizerModel
 from padforge.sense.localizer.model_files import check_same_pad
 from padforge.sense.localizer.moments import DOWN, MODULATED, REST, UP, complete_windows
 from padforge.sense.localizer.scaler import ScaledFeatures
+from padforge.sense.recording.frames import FrameStream
 from padforge.sense.rig.streams import HISTORY, SLACK, RingBuffer
 from padforge.sense.signals.press_detection import RELEASE_DELAY_S, TOUCH_DELAY_S, PressDetector
 
@@ -151,9 +154,9 @@ class Live:
 
     Args:
         localizer: of the pad.
-        health: of the pad; None to look for no faults.
-        fibres: number of fibres that are read.
         rate_hz: readings per second.
+        fibres: number of fibres that are read; None for those of the localizer.
+        health: of the pad; None to look for no faults.
 
     Attributes:
         presses: the latest estimate of each of the last presses, oldest first.
@@ -161,10 +164,20 @@ class Live:
         faults: all faults so far, oldest first.
 
     Raises:
-        InputError: a localizer that was fitted to arrays, or a model of a pad with other fibres or of another rate.
+        InputError: a localizer that was fitted to arrays, or a model that `check_same_pad` refuses.
     """
 
-    def __init__(self, localizer: LocalizerModel, health: HealthModel | None, fibres: int, rate_hz: float) -> None:
+    def __init__(
+        self,
+        localizer: Localizer | LocalizerModel,
+        *,
+        rate_hz: float,
+        fibres: int | None = None,
+        health: HealthModel | None = None,
+    ) -> None:
+        if isinstance(localizer, Localizer):
+            localizer = localizer.model_
+        fibres = localizer.fibres if fibres is None else fibres
         check_same_pad(localizer, "the localizer", fibres, rate_hz)
         if localizer.features == "array":
             raise InputError("the localizer was fitted to arrays of features, expected one that was fitted to readings")
@@ -176,7 +189,8 @@ class Live:
         response_v = (np.abs(scaler.mean_v) + 2 * scaler.scale_v)[:, :n_windows].max(axis=1)
         self._response_v = np.where(response_v > 0, response_v, 1.0)  # that a press goes up to
         self._detector = PressDetector(fibres)
-        self._buffer = RingBuffer(1 + fibres)  # times, then volts
+        self._frames, self._last_s = FrameStream(rate_hz, fibres), -np.inf  # time of the last reading
+        self._buffer = RingBuffer(1 + fibres)  # times of frames, then volts
         self._press: BufferedPress | None = None
         self._n_presses = self._previous_end = 0
         self.presses: deque[Estimate] = deque(maxlen=MAX_SHOWN)
@@ -193,12 +207,12 @@ class Live:
         """Indices of the fibres that are masked."""
         return () if self._monitor is None else self._monitor.failed
 
-    def feed(self, times_s: Array, readings: Array) -> list[Event]:
+    def feed(self, times_s: ArrayLike, readings: ArrayLike) -> list[Event]:
         """Process readings. The events do not depend on how readings are cut into blocks.
 
         Args:
-            times_s: (n,) ascending, s.
-            readings: (n, C) V, NaN where missing.
+            times_s: of one reading, or of several, ascending; s, scalar or of shape (n,).
+            readings: NaN where missing; V, shape (C,) or (n, C).
 
         Returns:
             Estimates and faults in the order in which they were made.
@@ -207,11 +221,11 @@ class Live:
             InputError: arrays that `check_stream` refuses, or times that do not follow those of the last block.
         """
         events: list[Event] = []
-        times, rows = check_stream(times_s, readings, len(self._response_v))
-        end = self._buffer.end
-        if len(times) and end and not times[0] > self._buffer.rows(end - 1, end)[0, 0]:
+        times, rows = check_stream(np.atleast_1d(times_s), np.atleast_2d(readings), len(self._response_v))
+        if len(times) and not times[0] > self._last_s:
             raise InputError(f"times begin at {times[0]:g} s, expected later than those of the last readings")
-        for row in np.column_stack([times, rows]):
+        self._last_s = float(times[-1]) if len(times) else self._last_s
+        for row in np.column_stack(self._frames.feed(times, rows)):
             self._buffer.append(row)
             for event in self._detector.update(row[:1], row[None, 1:]):
                 if event.down:

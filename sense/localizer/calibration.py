@@ -42,6 +42,7 @@ from padforge.sense.localizer.network import (
     predict_members,
 )
 from padforge.sense.localizer.scaler import FeatureScaler, ScaledFeatures
+from padforge.sense.recording.frames import frame_rate_hz, framed
 from padforge.sense.recording.recording import Recording
 from padforge.sense.settings import LocalizerSettings
 
@@ -140,10 +141,11 @@ def fit_recording(
     from padforge.sense.signals.press_detection import align_to_detected  # compiled kernels take long to import
 
     on_progress(0, 0, "features")
-    readings, commands = recording.readings, (recording.down_command, recording.up_command)
+    frames = framed(recording)
+    readings, commands = frames.readings, (frames.down_command, frames.up_command)
     detected, measures = None, {}
     if options.method == "ensemble":
-        again = align_to_detected(readings, recording.times_s, *commands)
+        again = align_to_detected(readings, frames.times_s, *commands)
         detected = compute_features(readings, *again)
         measures = known_measures(recording, training)
     is_published = options.method == "published"
@@ -186,7 +188,7 @@ def fit_model(
     positions_mm, measures = data.positions_mm[rows], {name: values[rows] for name, values in data.measures.items()}
     on_progress(0, 0, "response model")
     scaler, table = FeatureScaler.fit(features, positions_mm, measures, phases)
-    presses = scaler.training_presses(features, positions_mm, measures, data.rate_hz)
+    presses = scaler.training_presses(features, positions_mm, measures, frame_rate_hz(data.rate_hz))
     bayes, residual_network, trained_share = (), {}, 1.0
     if is_ensemble:
         trained = train_members(presses, table, options, rng, on_progress, time_budget)

@@ -16,6 +16,7 @@ from padforge.sense.localizer.doubts import find_doubts
 from padforge.sense.localizer.features import DOWN, compute_features, interpolate_gaps, window_means
 from padforge.sense.localizer.model import Localization, LocalizerModel
 from padforge.sense.localizer.moments import MOMENTS
+from padforge.sense.recording.frames import framed
 from padforge.sense.recording.recording import Recording
 
 FORMAT = "padforge-calibration/3"
@@ -91,7 +92,7 @@ def evaluate(
 
     Args:
         model: to evaluate.
-        recording: of a pad with the fibres and the rate of the training.
+        recording: of a pad with the fibres of the training, with about as many readings a second or more.
         levels: numbers of failed fibres.
         by_moment: whether presses are evaluated while they are read, too.
         on_progress: called with (steps done, total, what is evaluated).
@@ -210,20 +211,21 @@ def errors_by_moment(
         return NO_MOMENTS
     from padforge.sense.signals.press_detection import first_readings  # compiled kernels take long to import
 
-    commands = recording.down_command, recording.up_command
-    touched = first_readings(recording.readings, recording.times_s, *commands)
+    frames = framed(recording)
+    commands = frames.down_command, frames.up_command
+    touched = first_readings(frames.readings, frames.times_s, *commands)
     positions_mm = recording.presses_mm[presses]
     measures = {name: values[presses] for name, values in recording.measures.items()}
     history, rows, intact = model.raw_features(recording).history, [], []
     for moment in MOMENTS:
         on_progress(len(intact), len(MOMENTS), "moments of a press")
-        until = moment.until(touched, recording.up_command)
-        raw = compute_features(recording.readings, *commands, until, history=history)
+        until = moment.until(touched, frames.up_command)
+        raw = compute_features(frames.readings, *commands, until, history=history)
         features = model.scaler.transform(raw[presses])
         at = {
             "since": moment.since,
             "readings": moment.readings,
-            "time_s": round(moment.readings / recording.rate_hz, 3),
+            "time_s": round(moment.readings / frames.rate_hz, 3),
         }
         intact.append((at, model.predict_features(features)))
         for n_failed in levels:
@@ -368,8 +370,9 @@ def errors_by_position(predicted_mm: Array, pressed_mm: Array) -> list[dict[str,
 
 def idle_share(recording: Recording) -> Array:
     """Return the (C,) share of presses in which a fibre changes by less than `ACTIVE` of its range over all presses."""
-    readings, commands = interpolate_gaps(recording.readings), (recording.down_command, recording.up_command)
-    changes = window_means(readings, *commands, recording.up_command)[:, :, len(DOWN) - 1]
+    frames = framed(recording)
+    readings, commands = interpolate_gaps(frames.readings), (frames.down_command, frames.up_command)
+    changes = window_means(readings, *commands, frames.up_command)[:, :, len(DOWN) - 1]
     return (np.abs(changes) <= ACTIVE * np.ptp(changes, axis=0)).mean(axis=0)
 
 

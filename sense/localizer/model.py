@@ -24,6 +24,7 @@ from padforge.sense.localizer.model_files import check_same_pad, files_of
 from padforge.sense.localizer.moments import FOLLOWING, N_DOWN, N_TIMED, PHASES, RESIDUAL, STAGES, count_complete
 from padforge.sense.localizer.network import Networks, Sliding, Weights, predict
 from padforge.sense.localizer.scaler import DOCUMENT_CONFIG, FeatureScaler, ScaledFeatures, array_field
+from padforge.sense.recording.frames import framed
 from padforge.sense.recording.recording import Recording
 from padforge.sense.settings import Method, Split
 
@@ -98,7 +99,9 @@ class LocalizerDocument:
     __pydantic_config__: ClassVar[ConfigDict] = DOCUMENT_CONFIG
     method: Method
     features: FeatureSet
-    rate_hz: Annotated[float, Field(ge=MIN_RATE_HZ, le=MAX_RATE_HZ)]  # of the recording of the training
+    rate_hz: Annotated[
+        float, Field(ge=MIN_RATE_HZ, le=MAX_RATE_HZ)
+    ]  # readings a second of the recording of the training
     scaler: FeatureScaler
     # (K + 1, L, 3 + T) by numbers of complete windows and of failed fibres: factors from the expected error to the
     # standard deviation, to the radii of 50 and 90 %, and to the r90 of T measures, from presses never trained on
@@ -177,8 +180,8 @@ class LocalizerModel(LocalizerDocument):
         """Return the features of every press, V.
 
         Args:
-            recording: of a pad with the fibres and the rate of the training.
-            until: (Q,) first readings that are not looked at; None for all up to the next press.
+            recording: of a pad with the fibres of the training, with about as many readings a second or more.
+            until: (Q,) first frames (see `framed`) that are not looked at; None for all up to the next press.
 
         Raises:
             InputError: another pad, a localizer that was fitted to arrays, or `until` is no reading for each press.
@@ -186,11 +189,12 @@ class LocalizerModel(LocalizerDocument):
         if self.features == "array":
             raise InputError("the localizer was fitted to arrays of features, expected such arrays, not a recording")
         self.check_recording(recording)
-        commands = recording.down_command, recording.up_command
+        frames = framed(recording)
+        commands = frames.down_command, frames.up_command
         end = None if until is None else np.asarray(until)
         if end is not None and (end.dtype.kind not in "iu" or end.shape != commands[0].shape):
-            raise InputError(f"until is {short_repr(until)}, expected an index for each of {len(commands[0])} presses")
-        return compute_features(recording.readings, *commands, end, self.features == "published")
+            raise InputError(f"until is {short_repr(until)}, expected a frame for each of {len(commands[0])} presses")
+        return compute_features(frames.readings, *commands, end, self.features == "published")
 
     def scaled_features(self, recording: Recording, until: ArrayLike | None = None) -> ScaledFeatures:
         """Return the scaled features of every press.
@@ -211,7 +215,7 @@ class LocalizerModel(LocalizerDocument):
         """Predict the position of every press of a recording.
 
         Args:
-            recording: of a pad with the fibres and the rate of the training.
+            recording: of a pad with the fibres of the training, with about as many readings a second or more.
             failed: indices of fibres to mask in every press.
             fibre_mask: (Q, C), false where a fibre is masked in a press; see `health.fault_detector.mask_faults`.
             until: as in `raw_features`.

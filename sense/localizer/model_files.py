@@ -12,8 +12,9 @@ from safetensors.numpy import load, save
 
 from padforge.common.files import atomic_files, read_bytes
 from padforge.common.validation import InputError, check_path
+from padforge.sense.recording.frames import FRAME_S
 
-RATE_TOLERANCE = 0.25  # windows are counted in readings, so the rate must be about that of the training
+RATE_TOLERANCE = 0.25  # share by which there may be fewer readings a second than a model was learnt from
 
 
 class ModelFiles(NamedTuple):
@@ -62,14 +63,13 @@ def check_arrays(
 
 
 def check_same_pad(model: Any, what: str, fibres: int, rate_hz: float) -> None:
-    """Raise InputError if readings have another number of fibres, or another rate, than the training of a model.
+    """Raise InputError if readings are of another number of fibres than a model, or too few for it in a second.
 
-    `what` is the name of the model in messages; it has `fibres` and `rate_hz`, as the readings.
+    `what` is the name of the model in messages; it has `fibres` and `rate_hz`, as the readings. More readings than
+    there are frames (see `framed`) are averaged.
     """
     if fibres != model.fibres:
         raise InputError(f"readings are of {fibres} fibres, {what} was learnt from {model.fibres}")
-    if abs(rate_hz / model.rate_hz - 1) > RATE_TOLERANCE:
-        raise InputError(
-            f"there are {rate_hz:.3g} readings a second, allowed is {model.rate_hz:.3g}, at which {what} was learnt, "
-            f"within {RATE_TOLERANCE:.0%}"
-        )
+    least_hz = (1 - RATE_TOLERANCE) * min(model.rate_hz, 1 / FRAME_S)
+    if rate_hz < least_hz:
+        raise InputError(f"there are {rate_hz:.3g} readings a second, {what} needs {least_hz:.3g} or more")

@@ -1,8 +1,9 @@
 """Moments of a press: the windows of its readings, which of them are complete, and who answers then.
 
-Windows are counted in readings from a command of the probe; here of a press of 20 readings, up to its release::
+Windows are counted in frames (see `recording.frames`) from a command of the probe; here of a press of 20, up to its
+release::
 
-    reading  -10     0       4       8       12      16      20      24      28      32      36      40
+    frame    -10     0       4       8       12      16      20      24      28      32      36      40
     command          down_command                            up_command
     REST     |       |
     DOWN               |0|1|2|3|4| 5 |   6   |   7   |   8   |
@@ -31,7 +32,7 @@ from padforge.sense.arrays import Indices, Mask
 
 Window = tuple[int, int]
 
-REST: Window = (-10, 0)  # readings before the probe is sent down; the other windows are measured from their mean
+REST: Window = (-10, 0)  # frames before the probe is sent down; the other windows are measured from their mean
 DOWN: tuple[Window, ...] = ((1, 2), (2, 3), (3, 4), (4, 5), (5, 6), (6, 8), (8, 12), (12, 16), (16, 20))
 """Windows after the probe was sent down: fine while it sinks in, broad while it rests in the silicone."""
 UP: tuple[Window, ...] = ((0, 1), (1, 2), (2, 3), (3, 4), (4, 6), (6, 9), (9, 14), (14, 20))

@@ -24,6 +24,7 @@ from padforge.sense.localizer.model import Localization, LocalizerModel, concate
 from padforge.sense.localizer.moments import CORRECTED, PHASES
 from padforge.sense.localizer.network import Weights
 from padforge.sense.localizer.response_model import grid_positions
+from padforge.sense.recording.frames import frame_rate_hz
 from padforge.sense.recording.recording import Recording
 
 FORMAT = "padforge-recalibration/2"
@@ -171,7 +172,7 @@ def _fine_tuned(
     predicted = model.predict_features(model.scaler.transform(features)).measures
     # Where the depth of a press is unknown, its prediction is kept.
     known = {name: np.where(np.isnan(values), predicted[name].values, values) for name, values in measures.items()}
-    presses = model.scaler.training_presses(features, positions_mm, known, model.rate_hz)
+    presses = model.scaler.training_presses(features, positions_mm, known, frame_rate_hz(model.rate_hz))
     phases = PHASES[features.seen.shape[1]]
     networks = {
         name: fine_tune(weights, presses, model.table, model.max_failures, rng, phases[name])

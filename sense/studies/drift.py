@@ -29,6 +29,7 @@ from padforge.sense.localizer.evaluation import ACTIVE, distances
 from padforge.sense.localizer.evaluation import idle_share as recorded_idle_share
 from padforge.sense.localizer.features import compute_features, interpolate_gaps
 from padforge.sense.localizer.moments import N_TIMED
+from padforge.sense.recording.frames import framed
 from padforge.sense.recording.recording import Recording
 from padforge.sense.settings import RigSettings
 from padforge.sense.signals.filters import running_median, total_variation
@@ -152,7 +153,7 @@ def _evaluate(source: Callable[[], Recording], name: str, seed: int) -> State:
         Errors "test_K" and "last_K" (MEMBERS, T), mm, for compensation number K; "seconds" for 10 000 readings; "idle",
         the share of presses in which a fibre is idle; and the arrays of `_excerpt`.
     """
-    recording = source()
+    recording = framed(source())
     down_command, up_command, positions_mm = recording.down_command, recording.up_command, recording.presses_mm
     readings = interpolate_gaps(recording.readings)
     FILTERS[name](readings[:2])  # compiled before the clock runs

@@ -30,6 +30,7 @@ from padforge.design.twin import (
     TwinScatter,
 )
 from padforge.sense.arrays import Array, Indices, Mask
+from padforge.sense.recording.frames import framed
 from padforge.sense.recording.recording import Recording
 from padforge.sense.simulation.built_pad import PressParts
 from padforge.sense.simulation.simulated_recording import measure_rig_settings
@@ -224,7 +225,7 @@ def identify_pad(
     """Identify a printed pad as `identify`, and return the fit and its evaluation with the twin."""
     rng = np.random.default_rng(seed)
     contact = or_default("contact", contact, Contact)
-    recording = select_one_depth(recording)
+    recording = framed(select_one_depth(recording))
     positions_mm = recording.presses_mm[recording.has_position]
     _check_positions(positions_mm, pad)
 

@@ -21,7 +21,7 @@ def fit(readings: Array, pad: Recording, presses: int = TRAINED) -> HealthModel:
     with mock.patch.object(trace_model, "MAX_STEPS", 250), mock.patch.object(health_model, "MIN_GAIN_PRESSES", TRAINED):
         return health_model.fit_health_model(
             readings[:end],
-            pad.times_s[:end],
+            pad.rate_hz,
             pad.down_command[:presses],
             pad.up_command[:presses],
             rng=np.random.default_rng(0),

@@ -39,7 +39,7 @@ PROTOCOL = Path(__file__).parents[3] / "docs" / "live-protocol.md"
 
 
 def make_pipeline(localizer: LocalizerModel, recording: Recording) -> Live:
-    return Live(localizer, None, recording.fibres, recording.rate_hz)
+    return Live(localizer, rate_hz=recording.rate_hz)
 
 
 @pytest.fixture(scope="module")

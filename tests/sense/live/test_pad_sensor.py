@@ -71,7 +71,7 @@ def test_sensor_reads_what_the_pipeline_says(
         sensor.connect()
     values = sensor.read()
     assert tuple(values) == sensor.names
-    pipeline = Live(localizer, None, few.fibres, few.rate_hz)
+    pipeline = Live(localizer, rate_hz=few.rate_hz)
     pipeline.feed(few.times_s, few.readings)
     latest = pipeline.presses[-1]
     assert latest.press >= PRESSES - 1
@@ -89,7 +89,7 @@ def test_sensor_reads_where_the_press_under_way_is(
 ) -> None:
     end = boards[0].end = int(few.up_command[1]) - 1
     sensor.connect()
-    values, pipeline = sensor.read(), Live(localizer, None, few.fibres, few.rate_hz)
+    values, pipeline = sensor.read(), Live(localizer, rate_hz=few.rate_hz)
     pipeline.feed(few.times_s[:end], few.readings[:end])
     latest = pipeline.presses[-1]
     assert (pipeline.pressed, latest.press, latest.final) == (True, 1, False)

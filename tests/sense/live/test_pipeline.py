@@ -85,7 +85,7 @@ def replay(
 ) -> tuple[Live, list[Any]]:
     with pytest.MonkeyPatch.context() as monkeypatch:
         monkeypatch.setattr("padforge.sense.live.pipeline.PressDetector", ScriptedDetector(recording, delays))
-        live = Live(model, None, recording.fibres, recording.rate_hz)
+        live = Live(model, rate_hz=recording.rate_hz)
     events = []
     for times_s, readings in zip(np.split(recording.times_s, cuts), np.split(recording.readings, cuts), strict=True):
         events += live.feed(times_s, readings)
@@ -245,7 +245,7 @@ def test_live_masks_a_faulty_fibre_from_the_next_press_on(recording, hasty, monk
     part = replace(part, down_command=down_command, up_command=up_command)
     monkeypatch.setattr("padforge.sense.live.pipeline.FaultMonitor", lambda model: monitor)
     monkeypatch.setattr("padforge.sense.live.pipeline.PressDetector", ScriptedDetector(part))
-    live = Live(hasty, hasty, part.fibres, part.rate_hz)  # a stand-in for health, of the same pad
+    live = Live(hasty, rate_hz=part.rate_hz, health=hasty)  # a stand-in for health, of the same pad
     events = live.feed(part.times_s, part.readings)
     fault = next(index for index, event in enumerate(events) if isinstance(event, FibreFault))
     estimates = [event for event in events if isinstance(event, Estimate)]
@@ -284,7 +284,7 @@ def test_live_without_readings_says_anywhere(recording, hasty) -> None:
 def test_view_follows_the_pad(recording, hasty, monkeypatch) -> None:
     part = first_presses(recording, 3)
     monkeypatch.setattr("padforge.sense.live.pipeline.PressDetector", ScriptedDetector(part))
-    live = Live(hasty, None, part.fibres, part.rate_hz)
+    live = Live(hasty, rate_hz=part.rate_hz)
     missing = [{"swing": None, "state": "missing"}] * 4
     assert live.view() == {"pressed": False, "fibres": missing, "presses": [], "track": [], "faults": []}
     down, up = int(part.down_command[0]) + 15, int(part.up_command[0]) + 18
@@ -315,7 +315,7 @@ def test_track_has_the_places_that_a_finger_has_moved_to(recording, hasty, monke
     monkeypatch.setattr(LocalizerModel, "predict_features", predict_features)
     part = replace(part, up_command=up_command)
     monkeypatch.setattr("padforge.sense.live.pipeline.PressDetector", ScriptedDetector(part))
-    live, next_down = Live(hasty, None, part.fibres, part.rate_hz), int(part.down_command[1])
+    live, next_down = Live(hasty, rate_hz=part.rate_hz), int(part.down_command[1])
     live.feed(part.times_s[:next_down], part.readings[:next_down])
     track = live.view()["track"]
     assert 1 < len(track) <= MAX_TRACK
@@ -325,11 +325,13 @@ def test_track_has_the_places_that_a_finger_has_moved_to(recording, hasty, monke
 
 
 def test_live_refuses_what_does_not_fit(recording, hasty) -> None:
-    with pytest.raises(InputError, match="within 25%"):
-        Live(hasty, None, 4, 20.0)
+    with pytest.raises(InputError, match=r"9\.9 readings a second, the localizer needs 10 or"):
+        Live(hasty, rate_hz=9.9)
+    with pytest.raises(InputError, match="of 3 fibres"):
+        Live(hasty, rate_hz=20.0, fibres=3)
     with pytest.raises(InputError, match="fitted to arrays"):
-        Live(replace(hasty, features="array"), None, 4, hasty.rate_hz)
-    live = Live(hasty, None, 4, hasty.rate_hz)
+        Live(replace(hasty, features="array"), rate_hz=hasty.rate_hz)
+    live = Live(hasty, rate_hz=hasty.rate_hz)
     live.feed(recording.times_s[:9], recording.readings[:9])
     with pytest.raises(InputError, match=r"times begin at .* later than"):
         live.feed(recording.times_s[8:12], recording.readings[8:12])

@@ -185,7 +185,7 @@ def messages(deep_recording: Recording, deep_localizer: LocalizerModel) -> list[
     readings = six.readings.copy()
     readings[30, 1] = np.nan
     six = replace(six, readings=readings)
-    pipeline = Live(deep_localizer, None, six.fibres, six.rate_hz)
+    pipeline = Live(deep_localizer, rate_hz=six.rate_hz)
     fault = FibreFault(press=3, since=1, fibres=(2,), kind="stuck", score=8.0)
     builder, messages = MessageBuilder(pipeline), []
     for first in range(0, len(six.readings), 10):
