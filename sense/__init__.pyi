@@ -18,6 +18,7 @@ from .localizer.evaluation import evaluate as evaluate
 from .localizer.localizer import Localizer as Localizer
 from .localizer.model import Localization as Localization
 from .localizer.model import LocalizerModel as LocalizerModel
+from .localizer.press_windows import PressWindows as PressWindows
 from .localizer.recalibration import Recalibration as Recalibration
 from .localizer.recalibration import recalibrate as recalibrate
 from .recording.recording import Recording as Recording

@@ -11,12 +11,12 @@ from numpy.typing import ArrayLike
 from padforge.common.progress import OnProgress, ignore_progress
 from padforge.common.settings import validate
 from padforge.common.validation import InputError, check_float
-from padforge.sense.arrays import MAX_MM, MAX_VOLTS, Array, check_magnitude, check_numbers
-from padforge.sense.localizer.calibration import MAX_TIME_BUDGET_S, CalibrationData, calibrate, fit_model
+from padforge.sense.arrays import MAX_MM, MAX_VOLTS, Array, Indices, check_magnitude, check_numbers
+from padforge.sense.localizer.calibration import MAX_TIME_BUDGET_S, CalibrationData, calibrate, fit_model, fit_recording
 from padforge.sense.localizer.evaluation import Evaluation, distances, evaluate
 from padforge.sense.localizer.features import PressFeatures
 from padforge.sense.localizer.model import Localization, LocalizerModel
-from padforge.sense.recording.recording import Recording
+from padforge.sense.recording.recording import PressSelection, Recording
 from padforge.sense.settings import LocalizerSettings
 
 OPTIONS = tuple(name for name in LocalizerSettings.model_fields if name not in ("max_failures", "seed"))
@@ -75,6 +75,16 @@ class Localizer:
         self.__init__(**{**self.get_params(), **params})
         return self
 
+    def __repr__(self) -> str:
+        usual = Localizer().get_params()
+        changed = (f"{name}={value!r}" for name, value in self.get_params().items() if value != usual[name])
+        return f"Localizer({', '.join(changed)})"
+
+    @property
+    def test_presses_(self) -> Indices:
+        """Indices of the presses of the recording that `fit` held back for the test."""
+        return np.array(self._fitted.test, dtype=np.int64)
+
     def __sklearn_tags__(self) -> Any:
         from sklearn.utils import InputTags, RegressorTags, Tags, TargetTags  # only scikit-learn itself asks
 
@@ -87,17 +97,18 @@ class Localizer:
 
     def fit(
         self,
-        X: "Recording | ArrayLike",
+        X: "Recording | PressSelection | ArrayLike",
         y: ArrayLike | None = None,
         *,
         time_budget: float | None = None,
         on_progress: OnProgress = ignore_progress,
     ) -> "Localizer":
-        """Train on a recording, a share of whose presses is held back for a test; or on arrays, without a test.
+        """Train on a recording, a share of whose presses is held back for a test; or without a test.
 
         Args:
-            X: a recording; or (Q, C, F) features of presses, V, NaN where a fibre gave none.
-            y: (Q, 2) positions, mm, with arrays.
+            X: a recording; or, without a test, presses of one, `recording[presses]`, or (Q, C, F) features of presses,
+                V, NaN where a fibre gave none.
+            y: (Q, 2) positions, mm, with arrays; None for those of the recording.
             time_budget: seconds to train for, with as many members as that is good for.
             on_progress: as in `calibrate`.
 
@@ -107,9 +118,14 @@ class Localizer:
         """
         params = self.get_params()
         settings = validate(LocalizerSettings, {"seed": params.pop("random_state"), **params}, "[localizer]")
+        if isinstance(X, Recording | PressSelection) and y is not None:
+            raise InputError("y is given beside a recording, which holds the positions; expected None")
+        if isinstance(X, PressSelection):
+            known = X.presses[X.recording.has_position[X.presses]]
+            rng = np.random.default_rng(settings.seed)
+            self.model_ = fit_recording(X.recording, known, settings, rng, on_progress, time_budget)
+            return self
         if isinstance(X, Recording):
-            if y is not None:
-                raise InputError("y is given beside a recording, which holds the positions; expected None")
             self.model_, self.calibration_ = calibrate(X, settings, time_budget=time_budget, on_progress=on_progress)
             return self
         if settings.method != "ensemble":
@@ -125,11 +141,11 @@ class Localizer:
         self.model_ = replace(self.model_, split=settings.split)
         return self
 
-    def predict(self, X: "Recording | ArrayLike", failed: ArrayLike = ()) -> Localization:
+    def predict(self, X: "Recording | PressSelection | ArrayLike", failed: ArrayLike = ()) -> Localization:
         """Predict the position of every press.
 
         Args:
-            X: a recording; or (Q, C, F) features as those that were fitted, V.
+            X: a recording, or presses of one; or (Q, C, F) features as those that were fitted, V.
             failed: indices of fibres to mask in every press.
 
         Raises:
@@ -137,6 +153,8 @@ class Localizer:
         """
         if isinstance(X, Recording):
             return self._fitted.predict(X, failed)
+        if isinstance(X, PressSelection):
+            return self._fitted.predict_features(self._fitted.scaled_features(X.recording)[X.presses], failed)
         model, features = self._fitted, _array_features(X)
         if model.features != "array" or features.windows.shape[1:] != model.scaler.mean_v.shape:
             raise InputError(
@@ -145,7 +163,7 @@ class Localizer:
             )
         return model.predict_features(model.scaler.transform(features), failed)
 
-    def score(self, X: "Recording | ArrayLike", y: ArrayLike | None = None) -> float:
+    def score(self, X: "Recording | PressSelection | ArrayLike", y: ArrayLike | None = None) -> float:
         """Return the negative mean error, mm: greater is better.
 
         Args:
@@ -154,7 +172,7 @@ class Localizer:
                 out.
         """
         predicted = self.predict(X).positions_mm
-        true = X.presses_mm if isinstance(X, Recording) and y is None else _array_positions(y)
+        true = X.presses_mm if isinstance(X, Recording | PressSelection) and y is None else _array_positions(y)
         return -float(np.nanmean(distances(predicted, true)))
 
     def evaluate(self, recording: Recording, max_failures: int | None = None) -> list[dict[str, Any]]:

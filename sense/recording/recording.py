@@ -120,6 +120,17 @@ class Recording:
         return self.readings.shape[1]
 
     @property
+    def shape(self) -> tuple[int]:
+        """(Q,), as an array of presses has it."""
+        return (len(self),)
+
+    def __len__(self) -> int:
+        return len(self.presses_mm)
+
+    def __getitem__(self, presses: Any) -> "PressSelection":
+        return PressSelection(self, np.arange(len(self)))[presses]
+
+    @property
     def has_position(self) -> Mask:
         """(Q,) whether the position of each press is known."""
         return ~np.isnan(self.presses_mm[:, 0])  # of a checked recording, also of y
@@ -242,6 +253,38 @@ class Recording:
                 recorder.begin(position_mm, int(down), **({} if isnan(depth) else {"depth_mm": depth}))
                 at_mm = {} if isnan(reached) else {"at_mm": [None, None, reached]}
                 recorder.finish(int(up), **at_mm, **({} if isnan(force) else {"force_n": force}))
+
+
+@dataclass(frozen=True)
+class PressSelection:
+    """Some presses of a recording, `recording[presses]`, as cross-validation splits them.
+
+    The readings of all presses stay, as the history of these.
+
+    Attributes:
+        recording: with S or more presses.
+        presses: indices of the selected ones; shape (S,).
+    """
+
+    recording: Recording
+    presses: Indices
+
+    @property
+    def presses_mm(self) -> Array:
+        """(S, 2) positions of the selected presses, mm; NaN where unknown."""
+        return self.recording.presses_mm[self.presses]
+
+    @property
+    def shape(self) -> tuple[int]:
+        """(S,), as an array of presses has it."""
+        return (len(self),)
+
+    def __len__(self) -> int:
+        return len(self.presses)
+
+    def __getitem__(self, presses: Any) -> "PressSelection":
+        rows = presses[0] if isinstance(presses, tuple) else presses  # scikit-learn asks for [rows, ...]
+        return PressSelection(self.recording, np.atleast_1d(self.presses[rows]))
 
 
 def check_replaceable(path: Path) -> None:
