@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from padforge.common.files import read_json, write_json
 from padforge.common.mat_files import load_mat
-from padforge.common.validation import InputError, check_array, check_int, check_mapping, short_repr
+from padforge.common.validation import InputError, check_array, check_int, check_mapping
 from padforge.common.validation import check_path as as_path
 from padforge.design.kernels.geometry import INVERSE_SQUARE, MANHATTAN, UNIFORM, Ends, WeightLaw, frame_shape
 from padforge.design.published.kernels import quantized_signals

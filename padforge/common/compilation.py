@@ -106,7 +106,7 @@ def _cached_njit(function: Callable[..., Any] | None = None, **options: Any) -> 
 kernel: _Decorator = partial(_cached_njit, error_model="numpy", nogil=True)
 """Compiles a function when it is first called, without checks of divisions and without Python's lock.
 
-One that a single kernel calls is a `kernel(inline="always")`: it becomes a part of that one, and is not compiled itself.
+One that a single kernel calls is a `kernel(inline="always")`, which becomes a part of that one.
 """
 
 
