@@ -1,16 +1,15 @@
-"""How often presses lie within the radii that a localizer tells, on test presses of many simulated recordings.
+"""How often presses lie within their predicted radii, on test presses of many simulated recordings.
 
 `python -m padforge.benchmarks.radii_coverage RECORDINGS SEED` prints a line per recording, and at the end the means
-over all recordings with their standard errors: the share of presses within the radii of 50 and 90 %, by number of lost
-fibres.
+over all recordings with their standard errors: the shares of presses within the radii of 50 and 90 %, by number of
+failed fibres.
 """
 
 import math
 import sys
-from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from padforge.common.parallel import one_torch_thread
 from padforge.design import Morphology
@@ -18,72 +17,57 @@ from padforge.sense import LocalizerSettings, RigSettings, calibrate, simulate
 
 PRESSES = (300, 3000)
 GRIDS = (2, 3, 4, 5)
-"""The least has four fibres, of which three may be lost."""
-MOST_KNOTS = 6
+"""Grids of the pads; the smallest has four fibres, of which three may fail."""
+MAX_KNOTS = 6
 SPLITS = ("chronological", "random")
-LEARNT = LocalizerSettings(members=2, hidden=64, layers=3, epochs=240, max_failures=3)
-"""Enough to find places at all: the radii are to hold however good a localizer is."""
+SETTINGS = LocalizerSettings(members=2, hidden=64, layers=3, epochs=240, max_failures=3)
+"""Enough to localize at all: the radii are to hold however good a localizer is."""
 
 
-@dataclass(frozen=True)
-class Covered:
-    """What one recording has shown.
+def measure_coverage(number: int, seed: int) -> tuple[str, str, NDArray[np.float64]]:
+    """Simulate presses on a random pad, calibrate on a part and test on the others.
 
-    Attributes:
-        pad: in words. presses: of the recording. tested: how many of them. split: how these were chosen.
-        within: (4, 2) shares of test presses within the radii of 50 and 90 %, with 0 to 3 fibres lost.
+    Args:
+        number: of the recording.
+        seed: with the number, of the pad, the presses and the training.
+
+    Returns:
+        The pad in words; how test presses were chosen; the shares of test presses within the radii of 50 and 90 %,
+        with 0 to 3 failed fibres; shape (4, 2).
     """
-
-    pad: str
-    presses: int
-    tested: int
-    split: str
-    within: np.ndarray
-
-    def __str__(self) -> str:
-        radii = "  ".join(
-            f"r{share}" + "".join(f" {value:.3f}" for value in self.within[:, column])
-            for column, share in enumerate((50, 90))
-        )
-        return f"{self.pad:<22} {self.presses:>4} presses, {self.tested:>3} tested, {self.split:<13} {radii}"
-
-
-def covered(number: int, seed: int) -> Covered:
-    """Record presses on a pad, both drawn by `number` and `seed`, learn from a part and test on the rest."""
     rng = np.random.default_rng([seed, number])
-    grid, straight = int(rng.choice(GRIDS)), bool(rng.integers(2))
-    knots = int(rng.integers(1, MOST_KNOTS + 1))
-    pad = Morphology.straight(grid) if straight else Morphology.random(grid, knots, seed=rng)
+    grid, is_straight = int(rng.choice(GRIDS)), bool(rng.integers(2))
+    knots = int(rng.integers(1, MAX_KNOTS + 1))
+    pad = Morphology.straight(grid) if is_straight else Morphology.random(grid, knots, seed=rng)
     presses = round(math.exp(rng.uniform(*np.log(PRESSES))))
     recording = simulate(pad, RigSettings(presses=presses, seed=int(rng.integers(2**32))))
     split = SPLITS[number % 2]
-    _, evaluation = calibrate(recording, LEARNT.model_copy(update={"split": split, "seed": int(rng.integers(2**32))}))
-    within = np.array([[row["within_r50"], row["within_r90"]] for row in evaluation.errors])
-    name = f"grid {grid}, {'straight' if straight else f'random, {knots} knots'}"
-    return Covered(name, presses, evaluation.test_presses, split, within)
-
-
-def summary(found: Sequence[Covered]) -> list[str]:
-    """Means over recordings and their standard errors, a line for each split and one for all."""
-    lines = []
-    for name in (*SPLITS, "all"):
-        shares = np.array([each.within for each in found if name in (each.split, "all")])
-        if len(shares) < 2:
-            continue
-        mean, error = shares.mean(axis=0), shares.std(axis=0, ddof=1) / math.sqrt(len(shares))
-        for column, share in enumerate((50, 90)):
-            told = "  ".join(f"{mean[lost, column]:.4f} +- {error[lost, column]:.4f}" for lost in range(len(mean)))
-            lines.append(f"{name}, {len(shares)} recordings, within r{share} with 0.. fibres lost: {told}")
-    return lines
+    _, evaluation = calibrate(recording, SETTINGS.model_copy(update={"split": split, "seed": int(rng.integers(2**32))}))
+    name = f"grid {grid}, {'straight' if is_straight else f'random, {knots} knots'}, {presses} presses"
+    return name, split, np.array([[row["within_r50"], row["within_r90"]] for row in evaluation.errors])
 
 
 def main(recordings: int, seed: int) -> None:
-    """Print what each of so many recordings shows, as it is known, and what they show together."""
-    found = []
+    """Print the coverage of every recording, and the means of each split and of all.
+
+    Args:
+        recordings: number of recordings.
+        seed: of all of them.
+    """
+    results = []
     for number in range(recordings):
-        found.append(covered(number, seed))
-        print(f"{number:>4}  {found[-1]}", flush=True)
-    print("\n".join(summary(found)), flush=True)
+        name, split, shares = measure_coverage(number, seed)
+        results.append((split, shares))
+        print(
+            f"{number:>4}  {name:<36} {split:<13} r50 {shares[:, 0].round(3)}  r90 {shares[:, 1].round(3)}", flush=True
+        )
+    for name in (*SPLITS, "all"):
+        shares = np.array([shares for split, shares in results if name in (split, "all")])
+        if len(shares) > 1:
+            mean, error = shares.mean(axis=0), shares.std(axis=0, ddof=1) / math.sqrt(len(shares))
+            for column, share in enumerate((50, 90)):
+                cells = "  ".join(f"{m:.4f} +- {e:.4f}" for m, e in zip(mean[:, column], error[:, column], strict=True))
+                print(f"{name}, {len(shares)} recordings, within r{share} with 0.. failed fibres: {cells}")
 
 
 if __name__ == "__main__":

@@ -23,16 +23,15 @@ finger, a dome as soft as the pad. On a thick layer these are Hertz's and Sneddo
 import math
 from dataclasses import dataclass
 from functools import cache, lru_cache
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from padforge.common.validation import InputError
+from padforge.design.settings import Base, Tool
 
 Array = NDArray[np.float64]
-Tool = Literal["dome", "ball", "flat", "finger"]
-Base = Literal["bonded", "slipping"]
 
 REDUCED_MODULUS_KPA = 55 / (1 - 0.5**2)
 """E* of EcoFlex 00-20, kPa: modulus 55 kPa at 100 % strain (manufacturer's data sheet), incompressible."""

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from padforge.common.files import read_json, write_json
 from padforge.common.mat_files import load_mat
-from padforge.common.validation import InputError, check_array, check_int, check_mapping, short_repr
+from padforge.common.validation import InputError, check_array, check_int, check_mapping
 from padforge.common.validation import check_path as as_path
 from padforge.design.kernels.geometry import INVERSE_SQUARE, MANHATTAN, UNIFORM, Ends, WeightLaw, frame_shape
 from padforge.design.published.kernels import quantized_signals
@@ -25,7 +25,7 @@ from padforge.design.settings import DEFAULT_PITCH_MM, MAX_FIBRES, Contact, Coun
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-SQUARE_FORMAT, FORMAT = "padforge-morphology/1", "padforge-morphology/2"  # of a square pad of one pitch, of any other
+FORMAT = "padforge-morphology/1"
 MIN_SPAN = 1e-12  # smallest distance of knots along an axis, grid units: slopes remain numbers that can be squared
 MAX_COORDINATE = 1e6  # largest absolute coordinate of a position, grid units or mm
 MAX_KNOTS = 2**22  # knots of a pad, over all its fibres
@@ -236,7 +236,7 @@ class Morphology:
         kind = path.suffix.lower()
         if kind not in (".json", ".mat"):
             raise InputError(f"{path}: no morphology, allowed are a .json and a published .mat")
-        document = None if kind == ".mat" else read_json(path, SQUARE_FORMAT, FORMAT)
+        document = None if kind == ".mat" else read_json(path, FORMAT)
         try:
             return cls.from_dict(document) if document is not None else cls(_read_published_knots(path))
         except InputError as error:
@@ -254,13 +254,8 @@ class Morphology:
         """
         check_mapping("document", document)
         try:
-            knots = np.array(document["knots"], dtype=np.float64)
-            is_square = document.get("format", SQUARE_FORMAT) == SQUARE_FORMAT
-            half = len(knots) // 2
-            if is_square and (len(knots) % 2 or document.get("grid", half) != half):
-                raise InputError(f"grid is {short_repr(document.get('grid'))}, but there are {len(knots)} fibres")
-            layout = Layout.create((half, half) if is_square else document["fibres"], document["pitch_mm"])
-            knots = knots if is_square else knots * layout.spacing  # pitches to grid units
+            layout = Layout.create(document["fibres"], document["pitch_mm"])
+            knots = np.array(document["knots"], dtype=np.float64) * layout.spacing  # pitches to grid units
             return cls.from_layout(knots, layout, document.get("provenance", {}))
         except (KeyError, TypeError, OverflowError) as error:
             raise InputError(f"no valid morphology ({error!r})") from error
@@ -269,13 +264,13 @@ class Morphology:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the morphology as JSON; knots are in pitches, those along x for x and those along y for y."""
-        if self.layout.is_square:
-            kind, knots = {"format": SQUARE_FORMAT, "grid": self.grid, "pitch_mm": self.pitch_mm}, self.knots
-        else:
-            pitch = [self.layout.pitch_x_mm, self.layout.pitch_y_mm]
-            kind = {"format": FORMAT, "fibres": list(self.layout.counts), "pitch_mm": pitch}
-            knots = _to_pitches(self.knots, self.layout)
-        return {**kind, "knots": knots.tolist(), "provenance": dict(self.provenance)}
+        return {
+            "format": FORMAT,
+            "fibres": list(self.layout.counts),
+            "pitch_mm": [self.layout.pitch_x_mm, self.layout.pitch_y_mm],
+            "knots": _to_pitches(self.knots, self.layout).tolist(),
+            "provenance": dict(self.provenance),
+        }
 
     def save(self, path: str | Path) -> None:
         """Write the morphology atomically; reading it gives the same knots to the last bit.

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from padforge.design.objectives.rules import Violation
 
 FAMILIES = (("horizontal", HORIZONTAL), ("vertical", VERTICAL))
-FORMAT = "padforge-design/2"  # format of design.json
+FORMAT = "padforge-design/1"  # format of design.json
 TOLERANCE = 1e-3  # deviation of drawn curves from exact ones, grid units
 
 

@@ -22,6 +22,8 @@ DEFAULT_PITCH_MM = 11.25  # pitch of the built pad
 MAX_FIBRES = 1024  # fibres of one family, also of a pad made of tiles
 
 Pair = tuple[float, float]
+Tool = Literal["dome", "ball", "flat", "finger"]  # shapes of what presses a layer
+Base = Literal["bonded", "slipping"]  # what a layer does on what it lies on
 Counts = int | tuple[int, int]  # M horizontals and M verticals, or (horizontals, verticals)
 Pitch = float | Pair  # distance of neighbouring fibre ends, mm: in both directions, or along x and along y
 
@@ -211,11 +213,11 @@ class Contact(Settings, frozen=True):
     model: Literal["layer", "profile", "shape"] = Field(
         default="layer", description="layer: from the press in mm; profile: as measured; shape: as published"
     )
-    tool: Literal["dome", "ball", "flat", "finger"] = Field(default="dome", description="what presses, of a layer")
+    tool: Tool = Field(default="dome", description="what presses, of a layer")
     tool_radius_mm: float = Field(default=8.4, ge=0.1, le=1000, description="tip radius of the tool, mm")
     depth_mm: float = Field(default=PRESS_DEPTH_MM, ge=0.01, le=100, description="depth of the press, of a layer, mm")
     thickness_mm: float = Field(default=SILICONE_MM, ge=0.1, le=1000, description="thickness of the pad, mm")
-    base: Literal["bonded", "slipping"] = Field(default="slipping", description="what the pad does on what it lies on")
+    base: Base = Field(default="slipping", description="what the pad does on what it lies on")
     fibre_depths_mm: Annotated[FibreDepths, BeforeValidator(as_tuple)] = Field(
         default=FIBRE_DEPTHS_MM, description="depth of the [horizontal, vertical] fibres below the pressed face, mm"
     )

@@ -30,7 +30,7 @@ from padforge.design.morphology import Array, Morphology
 from padforge.design.paths.curves import lengths
 from padforge.design.settings import Contact
 
-FORMAT = "padforge-twin/4"
+FORMAT = "padforge-twin/1"
 MAX_VOLTS, MAX_MM = 1e3, 1e4
 PARTS = "held", "onset", "creep", "after"
 """Parts of a press."""

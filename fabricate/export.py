@@ -50,7 +50,7 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger(__name__)
 
-FORMAT = "padforge-fabrication/2"
+FORMAT = "padforge-fabrication/1"
 _CAD_VOLUME, _CAD_SURFACE, _CAD_TOLERANCE_MM = 5e-4, 5e-3, 0.01
 """Maximum relative differences of volume and surface between a CAD solid and its mesh, at the last tolerance.
 

@@ -41,11 +41,11 @@ def write_report(folder: Path) -> Path:
     mismatches: list[str] = []
     for format_, file, write_sections in (
         (DESIGN_FORMAT, "design.json", write_design),
-        ("padforge-fabrication/2", "fabrication.json", fabrication_sections),
-        ("padforge-recording/2", "recording/start.json", sense.recording_sections),
-        ("padforge-identification/4", "identification.json", identification_sections),
-        ("padforge-calibration/3", "calibration.json", sense.calibration_sections),
-        ("padforge-fibre-loss/3", "fibre_loss.json", sense.fibre_loss_sections),
+        ("padforge-fabrication/1", "fabrication.json", fabrication_sections),
+        ("padforge-recording/1", "recording/start.json", sense.recording_sections),
+        ("padforge-identification/1", "identification.json", identification_sections),
+        ("padforge-calibration/1", "calibration.json", sense.calibration_sections),
+        ("padforge-fibre-loss/1", "fibre_loss.json", sense.fibre_loss_sections),
         ("padforge-contacts/1", "contacts.json", contact_sections),
     ):
         if (path := folder / file).exists():
@@ -82,7 +82,7 @@ def _max_strain(folder: Path) -> float | None:
     if not path.exists():
         return None
     with reraise_as_input_error(path):
-        max_strain = read_json(path, "padforge-fabrication/2")["fibre"]["max_strain"]
+        max_strain = read_json(path, "padforge-fabrication/1")["fibre"]["max_strain"]
         return None if max_strain is None else float(max_strain)
 
 

@@ -43,7 +43,7 @@ SEARCH_SHARE = 0.5
 """Largest share of the time budget that the search may use."""
 RESERVE_S = 30.0
 """Part of the time budget reserved for radii, errors, fault detection, figures and report after the training, s."""
-FORMAT, NAME = "padforge-run/2", "run.json"
+FORMAT, NAME = "padforge-run/1", "run.json"
 PAD = "morphology.json"
 
 Result = TypeVar("Result")

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from padforge.common.compilation import inner_kernel, kernel
+from padforge.common.compilation import kernel
 from padforge.design.kernels.exact_signals import (
     MAX_HALVINGS,
     centre_cubic,
@@ -31,7 +31,7 @@ MIN_SINE = 0.02
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(12)
 
 
-@inner_kernel
+@kernel
 def differentiate_cubic(s: float, h: float, d0: float, d1: float, d_point: Any, d_tangent: Any) -> None:
     """Compute dp/dx and its derivative by s for x = t0, t1, v0, v1, d0, d1, into two arrays (6, 2).
 
@@ -49,7 +49,7 @@ def differentiate_cubic(s: float, h: float, d0: float, d1: float, d_point: Any, 
     d_point[5, 1], d_tangent[5, 1] = -h * s * s * r, -h * s * (2 - 3 * s)
 
 
-@inner_kernel
+@kernel
 def _boundary_normal(t: float, v: float, chains: Any, radius: float) -> tuple[float, float]:
     """Return a normal, of any length, of the boundary at (t, v) from the centre."""
     breaks, upper, lower = chains
@@ -67,7 +67,7 @@ def _boundary_normal(t: float, v: float, chains: Any, radius: float) -> tuple[fl
     return -(chain[k + 1] - chain[k]) / width, 1.0
 
 
-@inner_kernel
+@kernel
 def _differentiate_weight(square: float, law: Any) -> float:
     """Return the derivative of `weigh` by the squared distance, for every weight but a profile."""
     radius, weight = law.radius, law.weight
@@ -78,7 +78,7 @@ def _differentiate_weight(square: float, law: Any) -> float:
     return -1 / (radius + square) ** 2
 
 
-@inner_kernel
+@kernel
 def _add_boundary_term(s: float, s0: float, sign: float, d0: float, d1: float, shape: Any, work: Any, out: Any) -> None:
     """Add the boundary term at s of a stretch to out (6,); sign is 1 for its last end and -1 for its first."""
     (chains, _, law), (span, d_point, d_tangent) = shape, work
@@ -96,7 +96,7 @@ def _add_boundary_term(s: float, s0: float, sign: float, d0: float, d1: float, s
         out[x] -= value * (nt * d_point[x, 0] + nv * d_point[x, 1]) / normal_rate
 
 
-@inner_kernel
+@kernel
 def _add_inner_term(
     a: float, b: float, s0: float, d0: float, d1: float, shape: Any, work: Any, stack: Any, out: Any
 ) -> None:
@@ -139,7 +139,7 @@ def _add_inner_term(
                 )
 
 
-@inner_kernel
+@kernel
 def _differentiate_span(
     t: Any,
     v: Any,

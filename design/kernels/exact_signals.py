@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from padforge.common.compilation import inline_kernel, inner_kernel, kernel
+from padforge.common.compilation import kernel
 from padforge.design.kernels.geometry import (
     EPS,
     INVERSE,
@@ -63,19 +63,19 @@ PIECES, PATIENCE = 500, 100
 """Beyond PIECES the tolerance doubles with every PATIENCE more pieces: halving pure rounding errors would not end."""
 
 
-@inner_kernel
+@kernel
 def evaluate_cubic(span: Any, s: float) -> float:
     """Return v at s."""
     return span[2] + s * (span[3] + s * (span[4] + s * span[5]))
 
 
-@inner_kernel
+@kernel
 def _rise(span: Any, s: float) -> float:
     """Return dv/ds."""
     return span[3] + s * (2 * span[4] + 3 * s * span[5])
 
 
-@inline_kernel  # else counting references takes most of the time
+@kernel(inline="always")  # else counting references takes most of the time
 def _density(span: Any, s: float, law: Any) -> float:
     """Return the weighted length per unit of s."""
     rise = _rise(span, s)
@@ -86,7 +86,7 @@ def _density(span: Any, s: float, law: Any) -> float:
     return run * weigh_element(t, v, span[1], rise, law)
 
 
-@inner_kernel
+@kernel
 def integrate_kronrod(span: Any, a: float, b: float, law: Any) -> tuple[float, float]:
     """Integrate over [a, b] by the 15-point Kronrod rule and estimate the relative error by the 7-point Gauss rule.
 
@@ -109,14 +109,14 @@ def integrate_kronrod(span: Any, a: float, b: float, law: Any) -> tuple[float, f
     return fine * half, min(1.0, (200 * gap) ** 1.5)
 
 
-@inner_kernel
+@kernel
 def is_precise(error: float, pieces: int, law: Any) -> bool:
     """Whether the error of a piece, the `pieces`-th that was integrated, is acceptable."""
     least = PROFILE_PRECISION if law.weight == PROFILE else PRECISION
     return not error > least * 2.0 ** (max(pieces - PIECES, 0) / PATIENCE)  # that of a piece without length is NaN
 
 
-@inner_kernel
+@kernel
 def _has_turn(span: Any, a: float, b: float, law: Any) -> bool:
     """Whether a fibre turns from its axis to a steep rise within [a, b] so sharply that the quadrature may miss it.
 
@@ -133,14 +133,14 @@ def _has_turn(span: Any, a: float, b: float, law: Any) -> bool:
     return most > MAX_TURN * max(least, span[1]) and span[1] ** 2 * (b - a) > PRECISION * most
 
 
-@inner_kernel
+@kernel
 def _manhattan_length(span: Any, a: float, b: float) -> float:
     """Return the Manhattan length of [a, b], in closed form as spans are monotone."""
     mean_rise = span[3] + span[4] * (a + b) + span[5] * (a * a + a * b + b * b)
     return (b - a) * (span[1] + abs(mean_rise))
 
 
-@inner_kernel
+@kernel
 def _integrate_stretch(span: Any, a: float, b: float, law: Any, stack: Any) -> float:
     """Integrate the density over [a, b] by adaptive Gauss-Kronrod on a stack of intervals."""
     total, pieces = 0.0, 0
@@ -166,7 +166,7 @@ _PROBES = (0.5, 0.22, 0.78)
 _CLEAR = 1e6  # a value this many tolerances from zero has a certain sign
 
 
-@inner_kernel
+@kernel
 def _expand_square(span: Any, a: float, b: float, radius: float, p: Any) -> None:
     """Expand the squared distance less that of a circle in u, for s = a + (b - a) u, into the coefficients p (7,)."""
     w = b - a
@@ -182,7 +182,7 @@ def _expand_square(span: Any, a: float, b: float, radius: float, p: Any) -> None
     p[6] = v3 * v3
 
 
-@inner_kernel
+@kernel
 def find_circle_roots(span: Any, a: float, b: float, radius: float, out: Any, count: Any, work: Any, p: Any) -> int:
     """Append to out[count:] the s in (a, b) at which the span crosses the circle of `radius`; return the count."""
     w = b - a
@@ -193,7 +193,7 @@ def find_circle_roots(span: Any, a: float, b: float, radius: float, out: Any, co
     return end
 
 
-@inner_kernel
+@kernel
 def _find_line_roots(
     span: Any, a: float, b: float, at_a: float, at_b: float, tolerance: float, out: Any, count: Any, work: Any, p: Any
 ) -> int:
@@ -209,7 +209,7 @@ def _find_line_roots(
     return end
 
 
-@inner_kernel
+@kernel
 def _append_stretch(stretches: Any, count: Any, begin: float, end: float) -> int:
     """Append [begin, end] to stretches[:count], merged with the last one if they touch; return the new count."""
     if count > 0 and stretches[count - 1, 1] == begin:
@@ -219,7 +219,7 @@ def _append_stretch(stretches: Any, count: Any, begin: float, end: float) -> int
     return count + 1
 
 
-@inner_kernel
+@kernel
 def _find_inside_circle(
     span: Any, a: float, b: float, radius: float, tolerance: float, scratch: Any, stretches: Any
 ) -> Any:
@@ -245,7 +245,7 @@ def _find_inside_circle(
     return count_inside
 
 
-@inner_kernel
+@kernel
 def _find_between_lines(
     span: Any,
     start: float,
@@ -322,7 +322,7 @@ def find_one_crossing(
     return u
 
 
-@inline_kernel  # as `_density`
+@kernel(inline="always")  # as `_density`
 def find_stretches_inside(
     span: Any, a: float, b: float, chains: Any, extents: Any, radius: float, tolerance: float, scratch: Any, out: Any
 ) -> Any:
@@ -393,7 +393,7 @@ def find_stretches_inside(
     return count_inside
 
 
-@inner_kernel
+@kernel
 def _compute_profile_signal(span: Any, a: float, b: float, law: Any, scratch: Any) -> float:
     """Return the signal of a stretch inside a profile, split where the profile bends.
 
@@ -426,7 +426,7 @@ def _compute_profile_signal(span: Any, a: float, b: float, law: Any, scratch: An
     return total
 
 
-@inner_kernel
+@kernel
 def _compute_stretch_signal(span: Any, a: float, b: float, law: Any, scratch: Any) -> float:
     """Return the signal of a stretch inside the press, split where the weight bends."""
     roots, work, p, stack = scratch
@@ -442,7 +442,7 @@ def _compute_stretch_signal(span: Any, a: float, b: float, law: Any, scratch: An
     return total + _integrate_stretch(span, begin, b, law, stack)
 
 
-@inner_kernel
+@kernel
 def centre_cubic(
     t0: float, t1: float, v0: float, v1: float, d0: float, d1: float, ct: float, cv: float, out: Any
 ) -> float:
@@ -463,7 +463,7 @@ def centre_cubic(
     return s0
 
 
-@inline_kernel  # as `_density`
+@kernel(inline="always")  # as `_density`
 def _compute_fibre_signal(
     t: Any,
     v: Any,
@@ -497,7 +497,7 @@ def _compute_fibre_signal(
     return total, visited
 
 
-@inner_kernel
+@kernel
 def make_scratch(breaks: int) -> Any:
     """Allocate one thread's work arrays, for stretches inside, and for roots, their stack, a polynomial, a quadrature.
 
@@ -527,7 +527,7 @@ def exact_signals(
     )
 
 
-@inner_kernel(_nrt=False)  # else counting references takes most of the time
+@kernel(_nrt=False)  # else counting references takes most of the time
 def _compute_signals(
     curves: Any,
     max_offsets: Any,

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from padforge.common.compilation import inline_kernel, inner_kernel, kernel
+from padforge.common.compilation import kernel
 from padforge.design.kernels.pchip import piece_of
 from padforge.design.settings import profile_spline
 
@@ -63,7 +63,7 @@ def weigh(square: float, law: Any) -> float:
     return 1 / max(math.sqrt(square), radius / 100)
 
 
-@inline_kernel  # else counting references takes most of the time
+@kernel(inline="always")  # else counting references takes most of the time
 def find_row(square: float, profile: Any, law: Any) -> int:
     """Return the row of a family's profile that applies at a squared distance, below that of its end."""
     row = law.bins[int(square * law.bin_rate)]
@@ -72,7 +72,7 @@ def find_row(square: float, profile: Any, law: Any) -> int:
     return row
 
 
-@inline_kernel  # else counting references takes most of the time
+@kernel(inline="always")  # else counting references takes most of the time
 def evaluate_row(profile: Any, row: int, column: int, x: float) -> float:
     """Return a polynomial of a profile, PLAIN or DIRECTED, at the excess x over the squared distance of its row."""
     c, square = column, x * x
@@ -81,7 +81,7 @@ def evaluate_row(profile: Any, row: int, column: int, x: float) -> float:
     return low + square * square * high
 
 
-@inline_kernel  # else counting references takes most of the time
+@kernel(inline="always")  # else counting references takes most of the time
 def weigh_profile(dt: float, dv: float, ut: float, uv: float, profile: Any, law: Any) -> float:
     """Return the weight of an element at (dt, dv) from the press centre, of unit tangent (ut, uv), in a profile."""
     square = dt * dt + dv * dv
@@ -96,7 +96,7 @@ def weigh_profile(dt: float, dv: float, ut: float, uv: float, profile: Any, law:
     return weight
 
 
-@inner_kernel(_nrt=False)  # as above, and its callers compile sooner than with it inlined
+@kernel(_nrt=False)  # as above, and its callers compile sooner than with it inlined
 def weigh_element(t: float, v: float, run: float, rise: float, law: Any) -> float:
     """Return the weight of an element at (t, v) from the press centre that runs along (run, rise), by a framed law."""
     if law.weight != PROFILE:
@@ -175,7 +175,7 @@ def frame_shape(radius: float, sides: int | None) -> tuple[tuple[Array, Array], 
     return (chains[0], chains[1]), radius * np.array(extents)
 
 
-@inner_kernel
+@kernel
 def select_frame(shape: Any, family: int) -> Any:
     """Return a shape (chains and extents in both frames, law) in the frame of one family."""
     chains, extents, law = shape
@@ -198,7 +198,7 @@ def max_offsets(across: Any, ends: Any) -> Any:
     return out
 
 
-@inner_kernel
+@kernel
 def find_touched_range(cv: float, extents: Any, max_offset: float, ends: Any, family: int) -> tuple[int, int]:
     """Find the first fibre that a press at `cv` can touch, of all fibres, and the one to stop before.
 
@@ -228,7 +228,7 @@ _BOX_SEGMENTS = 8
 """Segments per bounding box, which is tested before they are."""
 
 
-@inner_kernel
+@kernel
 def _clip_to_slab(
     value: float, slope: float, least: float, most: float, low: float, high: float
 ) -> tuple[float, float]:
@@ -239,7 +239,7 @@ def _clip_to_slab(
     return max(low, min(first, last)), min(high, max(first, last))
 
 
-@inline_kernel
+@kernel(inline="always")
 def _clip_to_disc(x: float, y: float, dx: float, dy: float, radius: float) -> tuple[float, float]:
     """Clip 0..1 to where (x, y) + t (dx, dy) is within `radius` of 0; low > high where nowhere."""
     square, middle = dx * dx + dy * dy, x * dx + y * dy
@@ -250,7 +250,7 @@ def _clip_to_disc(x: float, y: float, dx: float, dy: float, radius: float) -> tu
     return max(0.0, (-middle - half) / square), min(1.0, (half - middle) / square)
 
 
-@inline_kernel
+@kernel(inline="always")
 def _clip_to_capsule(
     x: float, y: float, dx: float, dy: float, ex: float, ey: float, width: float
 ) -> tuple[float, float]:
@@ -272,7 +272,7 @@ def _clip_to_capsule(
     return low, high
 
 
-@inner_kernel
+@kernel
 def _bound_segments(points: Any, first: Any, margin: float) -> tuple[Any, Any, Any]:
     """Bound every few segments of polylines: boxes (n, 4), first and last segment (n, 2), polyline (n,)."""
     count = 0
@@ -344,7 +344,7 @@ SCRATCH = (_DEPTH + 2, _MAX_DEGREE + 3)
 """Shape of the work array of `find_unit_roots`."""
 
 
-@inner_kernel
+@kernel
 def shell_sort(values: Any, count: Any) -> None:
     """Sort values[:count] in place (Shell 1959): NumPy's sort takes a second to compile."""
     gap = count
@@ -358,7 +358,7 @@ def shell_sort(values: Any, count: Any) -> None:
             values[j] = value
 
 
-@inner_kernel
+@kernel
 def refine_root(p: Any, degree: int, low: float, high: float, rising: bool) -> float:
     """Find the one sign change of p in (low, high) by Newton's method, safeguarded by bisection."""
     u = 0.5 * (low + high)
@@ -382,7 +382,7 @@ def refine_root(p: Any, degree: int, low: float, high: float, rising: bool) -> f
     return u
 
 
-@inner_kernel
+@kernel
 def find_unit_roots(p: Any, degree: Any, tolerance: float, out: Any, count: Any, work: Any) -> int:
     """Append the sign changes of sum p[i] u^i on (0, 1), ascending, to out[count:]; return the new count.
 

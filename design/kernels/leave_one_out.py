@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from padforge.common.compilation import inner_kernel, kernel
+from padforge.common.compilation import kernel
 
 _FAST = {"reassoc", "contract"}
 """Sums may be taken in another order; NaN and infinities stay what they are."""
@@ -79,7 +79,7 @@ def leave_one_out_errors(responses: Any, positions: Any, masks: Any, count: int,
     return out
 
 
-@inner_kernel(fastmath=_FAST)
+@kernel(fastmath=_FAST)
 def _fill_kernel(responses: Any, mask: Any, out: Any) -> None:
     """Compute exp(-|x_a - x_b|^2 / 2) over the fibres of a mask into the lower triangle of out (N, N)."""
     for a in range(len(out)):
@@ -95,7 +95,7 @@ def _fill_kernel(responses: Any, mask: Any, out: Any) -> None:
             row[b] = math.exp(np.float32(-0.5) * row[b])
 
 
-@inner_kernel(fastmath=_FAST)
+@kernel(fastmath=_FAST)
 def _invert(matrix: Any, ridge: Any, out: Any, work: Any) -> None:
     """Compute the inverse of matrix + ridge 1 into `out`, from its lower triangle; all (N, N), `work` overwritten."""
     n = len(matrix)
@@ -128,7 +128,7 @@ def _invert(matrix: Any, ridge: Any, out: Any, work: Any) -> None:
             out[b, a] = out[a, b]
 
 
-@inner_kernel(fastmath=_FAST)
+@kernel(fastmath=_FAST)
 def _weigh(matrix: Any, weights: Any, out: Any) -> None:
     """Compute the lower triangle of matrix diag(weights) matrix into `out`, for a symmetric matrix (N, N)."""
     n = len(matrix)
@@ -141,7 +141,7 @@ def _weigh(matrix: Any, weights: Any, out: Any) -> None:
         _add_rows(factors, matrix, row, a + 1, n)
 
 
-@inner_kernel(fastmath=_FAST)
+@kernel(fastmath=_FAST)
 def _add_rows(factors: Any, rows: Any, out: Any, width: int, known: int) -> None:
     """Add factors (K,) times rows (K, N) to the first `width` columns of out (N,); row k is 0 from k + `known` on."""
     count = len(factors)
@@ -158,7 +158,7 @@ def _add_rows(factors: Any, rows: Any, out: Any, width: int, known: int) -> None
             out[j] += c0 * r0[j]
 
 
-@inner_kernel(fastmath=_FAST)
+@kernel(fastmath=_FAST)
 def _product(x: Any, y: Any) -> Any:
     """Compute the product of two rows in single precision."""
     total = np.float32(0)

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from padforge.common.compilation import inline_kernel, inner_kernel, kernel
+from padforge.common.compilation import kernel
 from padforge.design.kernels.exact_gradient import differentiate_cubic
 from padforge.design.kernels.geometry import (
     DEGREE,
@@ -149,7 +149,7 @@ def straight_weights(along: Any, distance: float, profile: Any, law: Any) -> Any
     return out
 
 
-@inline_kernel
+@kernel(inline="always")
 def _count_pieces(h: float, rise: float, d0: float, d1: float, longest: float) -> int:
     """Return the number of equal pieces of a span, at most `longest` on average."""
     # the slope at which a span rises is a quadratic, which keeps within its Bezier points
@@ -157,7 +157,7 @@ def _count_pieces(h: float, rise: float, d0: float, d1: float, longest: float) -
     return math.ceil(min(math.hypot(h, steepest) / longest, 1.0 * MAX_PIECES))
 
 
-@inner_kernel
+@kernel
 def _count_elements(
     along: Any, across: Any, slope: Any, horizontals: int, low: Any, high: Any, nodes: int, spacing: float, total: int
 ) -> Any:
@@ -180,7 +180,7 @@ def _count_elements(
     return pieces, starts
 
 
-@inner_kernel
+@kernel
 def _place_elements(
     along: Any, across: Any, slope: Any, pieces: Any, starts: Any, nodes: Any, weights: Any, length: int, out: Any
 ) -> None:
@@ -241,7 +241,7 @@ def weigh_elements(elements: Any, along: Any, sensitivity: Any) -> None:
                 elements.length[k] *= sensitivity[f, i] + (at - i) * (sensitivity[f, i + 1] - sensitivity[f, i])
 
 
-@inner_kernel
+@kernel
 def _is_near(t: Any, v: Any, j: int, ct: float, cv: float, end: float) -> bool:
     """Whether span j, which lies in the box of its ends, comes within `end` of (ct, cv) along both axes."""
     is_beside = t[j] < ct + end and t[j + 1] > ct - end
@@ -297,7 +297,7 @@ def sum_elements(points: Any, length: Any, tangents: Any, presses: Any, law: Any
     return out
 
 
-@inline_kernel
+@kernel(inline="always")
 def _differentiate_elements(
     along: Any, across: Any, elements: Any, presses: Any, upstream: Any, law: Any, table: Any, out: Any
 ) -> None:
@@ -365,7 +365,7 @@ def elements_gradient(
     return out
 
 
-@inline_kernel
+@kernel(inline="always")
 def _pass_to_knots(
     along: Any, across: Any, slope: Any, elements: Any, starts: Any, element_gradient: Any, law: Any, out: Any
 ) -> None:

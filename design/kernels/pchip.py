@@ -5,12 +5,12 @@ from typing import Any
 
 import numpy as np
 
-from padforge.common.compilation import inline_kernel, inner_kernel, kernel
+from padforge.common.compilation import kernel
 
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(8)
 
 
-@inner_kernel
+@kernel
 def piece_of(at: float, edges: Any, pieces: int) -> int:
     """Return the index of the piece that contains `at` by bisection of ascending `edges`; the first if none does."""
     low, high = 0, pieces
@@ -32,7 +32,7 @@ def extremes(values: Any) -> tuple[float, float]:
     return least, largest
 
 
-@inner_kernel
+@kernel
 def _end_slope(h0: float, h1: float, m0: float, m1: float) -> float:
     """Return the slope at an end knot: three-point rule, limited to preserve the shape."""
     d = ((2 * h0 + h1) * m0 - h0 * m1) / (h0 + h1)
@@ -64,7 +64,7 @@ def pchip_slopes(t: Any, v: Any, d: Any) -> None:
     d[n - 1] = _end_slope(h0, h1, (v[n - 1] - v[n - 2]) / h0, (v[n - 2] - v[n - 3]) / h1)
 
 
-@inline_kernel
+@kernel(inline="always")
 def _add_end_slope_gradient(h0: float, h1: float, m0: float, m1: float, upstream: float, out: Any) -> None:
     """Add the derivatives of `_end_slope` by its arguments, times `upstream`, to out (4,)."""
     d = ((2 * h0 + h1) * m0 - h0 * m1) / (h0 + h1)
@@ -80,7 +80,7 @@ def _add_end_slope_gradient(h0: float, h1: float, m0: float, m1: float, upstream
     out[3] -= share * h0
 
 
-@inline_kernel
+@kernel(inline="always")
 def add_slopes_gradient(t: Any, v: Any, d: Any, upstream: Any, by_t: Any, by_v: Any) -> None:
     """Add the gradient of sum(upstream * d) of `pchip_slopes`, by t and by v."""
     n = len(t)
@@ -119,7 +119,7 @@ def add_slopes_gradient(t: Any, v: Any, d: Any, upstream: Any, by_t: Any, by_v: 
         by_t[k + 1] += run
 
 
-@inner_kernel
+@kernel
 def pchip_value(t: Any, v: Any, d: Any, j: int, s: float) -> tuple[float, float]:
     """Return value and slope of the curve through (t, v) with slopes d at 0 <= s <= 1 of span j."""
     h, r = t[j + 1] - t[j], 1 - s
@@ -128,7 +128,7 @@ def pchip_value(t: Any, v: Any, d: Any, j: int, s: float) -> tuple[float, float]
     return value, 6 * m * s * r + d[j] * r * (1 - 3 * s) - d[j + 1] * s * (2 - 3 * s)
 
 
-@inner_kernel
+@kernel
 def add_value_gradient(
     t: Any, v: Any, d: Any, j: int, s: float, by_value: float, by_slope: float, by_t: Any, by_v: Any, by_d: Any
 ) -> None:

@@ -5,12 +5,12 @@ from typing import Any
 
 import numpy as np
 
-from padforge.common.compilation import inner_kernel, kernel
+from padforge.common.compilation import kernel
 from padforge.design.kernels.geometry import MANHATTAN, UNIFORM, select_frame, shell_sort, weigh_element
 from padforge.design.kernels.pchip import extremes, pchip_sample, piece_of
 
 
-@inner_kernel
+@kernel
 def _bisect_monotone(curve: Any, low: int, high: int, value: float, rising: bool) -> int:
     """Find the first index in [low, high) at which a monotone stretch of `curve` reaches `value`; high if none."""
     while low < high:
@@ -22,7 +22,7 @@ def _bisect_monotone(curve: Any, low: int, high: int, value: float, rising: bool
     return low
 
 
-@inner_kernel
+@kernel
 def _is_between_chains(dt: float, dv: float, chains: Any) -> bool:
     """Whether (dt, dv) from the centre lies between the lower and the upper chain of a polygon."""
     breaks, upper, lower = chains
@@ -33,7 +33,7 @@ def _is_between_chains(dt: float, dv: float, chains: Any) -> bool:
     return lower[k] + x * (lower[k + 1] - lower[k]) <= dv <= upper[k] + x * (upper[k + 1] - upper[k])
 
 
-@inner_kernel(fastmath={"reassoc", "nsz"})
+@kernel(fastmath={"reassoc", "nsz"})
 def _sum_uniform(
     curve: Any,
     segment_lengths: Any,
@@ -77,7 +77,7 @@ def _sum_uniform(
     return total
 
 
-@inner_kernel
+@kernel
 def _sum_stretch(
     curve: Any, segment_lengths: Any, low: int, high: int, step: float, ct: float, cv: float, shape: Any
 ) -> float:
@@ -95,7 +95,7 @@ def _sum_stretch(
     return total
 
 
-@inner_kernel
+@kernel
 def _sample_fibre_signals(
     t: Any, v: Any, curve: Any, step: float, presses: Any, family: int, shape: Any, out: Any
 ) -> None:
@@ -195,7 +195,7 @@ def compute_row_entropy(rows: Any, first: Any, end: int) -> float:
     return entropy / count
 
 
-@inner_kernel
+@kernel
 def sum_second_differences(levels: Any) -> float:
     """Sum |second difference| over the columns of (Q, C)."""
     total = 0.0
@@ -205,7 +205,7 @@ def sum_second_differences(levels: Any) -> float:
     return total
 
 
-@inner_kernel(fastmath={"reassoc", "nsz"})
+@kernel(fastmath={"reassoc", "nsz"})
 def _sum_disorder(curves: Any, horizontals: int) -> float:
     """Sum the negative parts of curve_j - curve_i over pairs i < j of each family; curves are (F, samples)."""
     total = 0.0

@@ -103,12 +103,11 @@ def _cached_njit(function: Callable[..., Any] | None = None, **options: Any) -> 
         return njit(function, cache=True, **options)
 
 
-kernel: _Decorator = partial(_cached_njit, error_model="numpy", nogil=True, no_cfunc_wrapper=True)
-"""Compiles a function when it is first called, for Python alone, without its checks of divisions and its lock."""
-inner_kernel: _Decorator = partial(kernel, no_cpython_wrapper=True)
-"""Compiles a function that only kernels call, in less time: Python, if it called it, would crash."""
-inline_kernel: _Decorator = partial(inner_kernel, inline="always")
-"""Makes a function that one kernel calls a part of that kernel: it is not compiled by itself."""
+kernel: _Decorator = partial(_cached_njit, error_model="numpy", nogil=True)
+"""Compiles a function when it is first called, without checks of divisions and without Python's lock.
+
+One that a single kernel calls is a `kernel(inline="always")`, which becomes a part of that one.
+"""
 
 
 class Compilations(events.Listener):

@@ -26,7 +26,7 @@ State = dict[str, NDArray[Any]]
 Key = TypeVar("Key")
 Result = TypeVar("Result")
 
-FORMAT = "padforge-search/2"
+FORMAT = "padforge-search/1"
 SCHEDULER_S = 10.0  # time limit for a cluster's scheduler to answer
 POLL_S = 0.1  # interval at which Ctrl-C is noticed on systems where it does not wake a waiting thread
 

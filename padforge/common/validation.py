@@ -65,7 +65,7 @@ def missing_extra(error: ModuleNotFoundError, wanted: str = "") -> str | None:
 
     module = (error.name or "").partition(".")[0]
     library = _DISTRIBUTIONS.get(module, module)
-    requirement = re.compile(r"""([\w-]+).*extra == ['"](?!(?:all|test|figures)\b)([\w-]+)""")
+    requirement = re.compile(r"""([\w-]+).*extra == ['"](?!(?:all|test)\b)([\w-]+)""")
     try:
         matches = [match for line in requires("padforge") or () if (match := requirement.match(line))]
     except PackageNotFoundError:

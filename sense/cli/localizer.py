@@ -193,7 +193,7 @@ def health(context: click.Context, model: Path, recording: Path, as_json: bool) 
     opened, dead = read_recording(recording), FaultDetector.load(model).model_.dead
     _, findings, shifts, _ = predict_despite_faults(model, opened)
     document = {
-        "format": "padforge-findings/4",
+        "format": "padforge-findings/1",
         "presses": len(opened.down_command),
         "dead": list(dead),
         "findings": [asdict(finding) | {"text": finding.text} for finding in findings],

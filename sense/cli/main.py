@@ -113,7 +113,7 @@ def export(recording: Path, file: Path, kind: str | None, model: Path | None) ->
       /pad/touches, /pad/health
                       with --model: PoseWithCovarianceStamped at the end of a press, and DiagnosticArray
       /arm/pose       PoseStamped, of a recording made by an arm
-    An .mcap needs the extra ros (pip install '.[ros]'), a LeRobot dataset the extra lerobot.
+    An .mcap or a LeRobot dataset needs the extra formats (pip install '.[formats]').
     """
     from padforge.sense.formats.import_export import arm_states, export_file
 

@@ -84,7 +84,7 @@ def record(
     profile, gain and noise are the twin's.
 
     An interrupted recording keeps every finished press; --resume records the others.
-    --mcap exports it once it is complete, beside the folder, which needs the extra ros (pip install '.[ros]').
+    --mcap exports it once it is complete, beside the folder (pip install '.[formats]').
     Software is not the emergency stop: keep the robot's own one within reach.
     """
     from padforge.design.contact import describe_large_strain

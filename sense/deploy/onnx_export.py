@@ -37,7 +37,7 @@ from padforge.sense.localizer.torch_network import EnsembleMlp, network_inputs
 from padforge.sense.recording.frames import frame_rate_hz, framed
 from padforge.sense.recording.recording import Recording
 
-FORMAT = "padforge-onnx/4"
+FORMAT = "padforge-onnx/1"
 OPSET = 18  # of the operators: ONNX 1.13, 2022
 MAX_DIFFERENCE_MM = 1e-4
 """A graph whose positions differ more from those of its localizer is not written."""

@@ -50,7 +50,7 @@ def export_lerobot(recording: Recording, path: Path, annotations: ModelAnnotatio
     try:
         import pyarrow  # noqa: F401
     except ImportError as error:
-        raise InputError(f"{path}: LeRobot needs pyarrow: pip install 'padforge[lerobot]'") from error
+        raise InputError(f"{path}: LeRobot needs pyarrow: pip install 'padforge[formats]'") from error
     check_new_folder(path)
     if not recording.has_position.any():
         raise InputError(f"{path}: no position of a press is known, and a dataset needs what was commanded")

@@ -23,7 +23,7 @@ from padforge.sense.recording.recording import Recording
 if TYPE_CHECKING:
     from rosbags.typesys.store import Typestore
 
-FORMAT = "padforge-ros/2"
+FORMAT = "padforge-ros/1"
 READINGS, PRESSED, PLACE = "/pad/readings", "/pad/pressed", "/pad/place"
 REACHED, FORCE, RECORDING = "/pad/reached", "/pad/force", "/pad/recording"
 TOUCHES, HEALTH, ARM = "/pad/touches", "/pad/health", "/arm/pose"

@@ -19,7 +19,7 @@ def load_typestore(purpose: str) -> "Typestore":
     try:
         import rosbags.typesys  # noqa: F401
     except ImportError as error:
-        raise InputError(f"{purpose} needs rosbags: pip install 'padforge[ros]'") from error
+        raise InputError(f"{purpose} needs rosbags: pip install 'padforge[formats]'") from error
     return _typestore()
 
 

@@ -29,7 +29,7 @@ from padforge.sense.health.trace_model import (
 )
 from padforge.sense.localizer.model_files import files_of
 
-FORMAT = "padforge-health/4"
+FORMAT = "padforge-health/1"
 COMMANDED, DETECTED = "health", "health_live"
 """Names of the files of a model: trained on presses as commanded, and as detected in the readings."""
 FALSE_ALARM_RATE, MAX_FALSE_ALARM_RATE = 1e-5, 0.1
@@ -45,7 +45,7 @@ SUBSETS = 4  # random sets of failed fibres of a size from which the heights of 
 class HealthDocument(Settings):
     """The JSON file of a `HealthModel`."""
 
-    format: Literal["padforge-health/4"] = FORMAT
+    format: Literal["padforge-health/1"] = FORMAT
     fibres: int = Field(ge=1, le=MAX_FIBRES)
     dead: list[Annotated[int, Field(ge=0, lt=MAX_FIBRES)]]
     rate_hz: float = Field(ge=MIN_RATE_HZ, le=MAX_RATE_HZ)

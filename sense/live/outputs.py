@@ -22,7 +22,7 @@ from padforge.sense.formats.ros_messages import FRAME, HEALTH, PRESSED, READINGS
 from padforge.sense.health.fault_detector import FibreFault
 from padforge.sense.live.pipeline import Estimate, Event, Live
 
-FORMAT = "padforge-live/3"
+FORMAT = "padforge-live/1"
 MAX_QUEUED = 4096  # lines that wait for a subscriber; one that is further behind is disconnected
 SEND_TIMEOUT_S = 10.0  # a subscriber that receives nothing for this time is disconnected
 _OK, _ERROR = 0, 2  # levels of a `DiagnosticStatus`

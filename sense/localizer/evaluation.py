@@ -19,7 +19,7 @@ from padforge.sense.localizer.moments import MOMENTS
 from padforge.sense.recording.frames import framed
 from padforge.sense.recording.recording import Recording
 
-FORMAT = "padforge-calibration/3"
+FORMAT = "padforge-calibration/1"
 BUILT_PAD = "simulated, by default with the scatter of a built pad, which itself errs 0.97 / 1.20 / 1.54 / 2.32 mm"
 """What a simulated error is, beside the errors of the published recording with 0 to 3 of its 6 fibres failed."""
 CELLS = 5  # cells along a side of the map of errors by position

@@ -28,7 +28,7 @@ from padforge.sense.recording.frames import framed
 from padforge.sense.recording.recording import Recording
 from padforge.sense.settings import Method, Split
 
-FORMAT = "padforge-localizer/5"
+FORMAT = "padforge-localizer/1"
 NAME = "localizer"  # of its files, `localizer.json` and `localizer.safetensors`
 TABLE = "table"  # name of the response table among the arrays
 UNIFORM = (3**-0.5, (2 / np.pi) ** 0.5, 1.1150)

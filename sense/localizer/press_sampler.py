@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 
-from padforge.common.compilation import inline_kernel, inner_kernel, kernel
+from padforge.common.compilation import kernel
 from padforge.sense.arrays import Array, Floats, Indices, Mask
 from padforge.sense.localizer.bayes import N_SUMMARY, BayesianLocalizer
 from padforge.sense.localizer.moments import DOWN, N_DOWN, NOW, Phase, stage_of
@@ -173,7 +173,7 @@ def _compute_inputs(
                     x[b, c * size + f] = features[f]
 
 
-@inline_kernel
+@kernel(inline="always")
 def _locate(x: float, y: float, side: int) -> tuple[int, int, float, float]:
     """Return the cell of the table in which a position lies, or the nearest one, and how far in it along both axes."""
     u = min(max((x + 1) * ((side - 1) / 2), 0.0), side - 1 - 1e-3)
@@ -181,14 +181,14 @@ def _locate(x: float, y: float, side: int) -> tuple[int, int, float, float]:
     return int(u), int(v), u - int(u), v - int(v)
 
 
-@inner_kernel
+@kernel
 def _respond(table: Any, i: int, j: int, u: float, v: float, c: int, f: int) -> float:
     """Interpolate a window of a fibre in the table."""
     near = (1 - v) * table[i, j, c, f] + v * table[i, j + 1, c, f]
     return (1 - u) * near + u * ((1 - v) * table[i + 1, j, c, f] + v * table[i + 1, j + 1, c, f])
 
 
-@inline_kernel
+@kernel(inline="always")
 def _trace(target: Any, velocity: Any, end: float, now: Any, reach: float, side: int) -> tuple[Any, Any, Any, Any]:
     """Trace a finger that slides to its target back to its touch, for the windows of `DOWN` and those of now.
 

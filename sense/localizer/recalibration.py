@@ -27,7 +27,7 @@ from padforge.sense.localizer.response_model import grid_positions
 from padforge.sense.recording.frames import frame_rate_hz
 from padforge.sense.recording.recording import Recording
 
-FORMAT = "padforge-recalibration/2"
+FORMAT = "padforge-recalibration/1"
 GAIN_STD, ROTATION_STD, SHIFT_STD = 0.2, 0.05, 0.1
 """Prior standard deviations: of the logarithm of a gain, of the angle (radians) and the logarithm of the scale, and of
 the shift (scaled position)."""

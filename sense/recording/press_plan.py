@@ -85,8 +85,7 @@ def fit_pad_settings(pad: Morphology, pad_settings: PadSettings | None = None) -
 def pad_source(pad: Morphology) -> dict[str, Any]:
     """Return the entry of a pad in the source of a recording, which `Morphology.from_dict` reads."""
     document = pad.to_dict()
-    keys = ("pitch_mm", "knots") if pad.layout.is_square else ("format", "fibres", "pitch_mm", "knots")
-    return {key: document[key] for key in keys}
+    return {key: document[key] for key in ("fibres", "pitch_mm", "knots")}
 
 
 def pressable_test(pad: Morphology, pad_settings: PadSettings) -> PositionTest:

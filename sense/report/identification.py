@@ -22,7 +22,7 @@ from padforge.sense.recording.recording import Recording
 from padforge.sense.twin.doubts import find_doubts, offset_mm
 from padforge.sense.twin.identification import Identification, MeasuredContact, identify_pad
 
-FORMAT = "padforge-identification/4"
+FORMAT = "padforge-identification/1"
 CHANNEL_HEAD = ["channel", "fibre", "or", "gain (mV/%)", "noise (mV)", "explained", "lateral offset (mm)"]
 COMMAND, TWIN = "padforge sense identify", "twin.json"
 

@@ -33,7 +33,7 @@ from padforge.sense.recording.run_directory import FORMAT, START, Recorder
 from padforge.sense.rig.devices import Pose, RigFault
 from padforge.sense.settings import SIMULATED, Millimetres, RigSettings
 
-FABRICATION_FILE, FABRICATION_FORMAT = "fabrication.json", "padforge-fabrication/2"
+FABRICATION_FILE, FABRICATION_FORMAT = "fabrication.json", "padforge-fabrication/1"
 _ROUNDING_MM = 1e-6
 
 KIND = "rig"  # of the source of a recording that an arm pressed

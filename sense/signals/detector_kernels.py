@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from padforge.common.compilation import inline_kernel, inner_kernel, kernel
+from padforge.common.compilation import kernel
 
 FIBRE = np.dtype(
     [
@@ -125,7 +125,7 @@ def initial_state(n_fibres: int) -> tuple[Any, Any]:
     return fibres, pad[0]
 
 
-@inline_kernel
+@kernel(inline="always")
 def ingest(fibres: Any, pad: Any, row: Any, time_s: float) -> bool:
     """Add a reading (C,) to the present block; return whether that completes it with some fibre in it."""
     if pad.block_count == 0:
@@ -158,7 +158,7 @@ def ingest(fibres: Any, pad: Any, row: Any, time_s: float) -> bool:
     return complete and present
 
 
-@inline_kernel
+@kernel(inline="always")
 def kalman_predict(fibres: Any, pad: Any, time_s: float) -> None:
     """Predict all levels for `time_s`; forget fibres that were missing for long."""
     floor = max(MIN_SHARE * pad.typical_v, MIN_V, pad.resolution_v / 2 if pad.resolution_v < np.inf else 0.0)
@@ -178,7 +178,7 @@ def kalman_predict(fibres: Any, pad: Any, time_s: float) -> None:
         fibre.slope_var = fade**2 * fibre.slope_var + dt**2 / SLOPE_S**4
 
 
-@inner_kernel
+@kernel
 def _start_track(fibre: Any, time_s: float, step: float) -> None:
     """Start the filter of a fibre at the present block, after a whitened step."""
     fibre.level, fibre.slope, fibre.innovation, fibre.updated_s = fibre.mean, 0.0, 0.0, time_s
@@ -187,7 +187,7 @@ def _start_track(fibre: Any, time_s: float, step: float) -> None:
     fibre.slope_var = 1 + (SLOPE_ERROR * step) ** 2
 
 
-@inner_kernel
+@kernel
 def kalman_update(fibres: Any, pad: Any, time_s: float) -> None:
     """Correct levels, slopes and noise by the present block, robustly."""
     share = max(1 / (pad.n_blocks + 1), 1 - math.exp(-min(time_s - pad.block_s, GAP_S) / NOISE_S))
@@ -216,7 +216,7 @@ def kalman_update(fibres: Any, pad: Any, time_s: float) -> None:
     pad.n_blocks += 1
 
 
-@inner_kernel
+@kernel
 def _learn_run_noise(fibres: Any, pad: Any, time_s: float) -> None:
     """Learn the noise of a run that was no change."""
     if pad.run > 0:
@@ -226,7 +226,7 @@ def _learn_run_noise(fibres: Any, pad: Any, time_s: float) -> None:
             fibre.noise += share * (std - fibre.noise)
 
 
-@inner_kernel
+@kernel
 def _start_run(fibres: Any, pad: Any, time_s: float) -> None:
     """Start a run at the present block, or at the one block before: a touch may have two paces."""
     if pad.run != 2:
@@ -237,7 +237,7 @@ def _start_run(fibres: Any, pad: Any, time_s: float) -> None:
         fibre.run_square_sum = fibre.run_sum**2
 
 
-@inline_kernel
+@kernel(inline="always")
 def _extend_run(fibres: Any, pad: Any) -> tuple[float, float]:
     """Extend the run; return its common signal (mean product of two blocks: no spike), and the distance of the last."""
     common, distance = 0.0, 0.0
@@ -255,7 +255,7 @@ def _extend_run(fibres: Any, pad: Any) -> tuple[float, float]:
     return common, distance
 
 
-@inline_kernel
+@kernel(inline="always")
 def has_changed(fibres: Any, pad: Any, time_s: float, reject_limit: Any, accept_limit: Any) -> bool:
     """Test the present block; return whether the levels have changed since reading `pad.run_first`."""
     n_present, chi_square = 0, 0.0
@@ -286,7 +286,7 @@ def has_changed(fibres: Any, pad: Any, time_s: float, reject_limit: Any, accept_
     return False
 
 
-@inner_kernel
+@kernel
 def _whiten(fibres: Any, f: int, volts: float, limit: float) -> float:
     """Whiten a step of fibre f, clipped to the limit; 0 if the largest of as many fibres has it by chance, or NaN."""
     z = volts / fibres[f].scale
@@ -302,7 +302,7 @@ def _size(fibres: Any, steps: Any, limit: float) -> float:
     return total
 
 
-@inner_kernel
+@kernel
 def _projection(fibres: Any, steps: Any) -> float:
     """Project the residual on steps (C,), as a share of them; 0 if they are none."""
     product, total = 0.0, 0.0
@@ -313,7 +313,7 @@ def _projection(fibres: Any, steps: Any) -> float:
     return product / total if total > 0 else 0.0
 
 
-@inner_kernel
+@kernel
 def _agreement(fibres: Any) -> float:
     """Return how far the residual has the direction of touches: 1 if all of it does, -1 if it is opposite."""
     product, total = 0.0, 0.0
@@ -324,7 +324,7 @@ def _agreement(fibres: Any) -> float:
     return product / total if total > 0 else 0.0
 
 
-@inner_kernel
+@kernel
 def _confirmed_step(fibre: Any) -> float:
     """Return the part of the step, V, that the present block and the one before have in common."""
     now, before = fibre.residual, fibre.previous_mean - fibre.start_level
@@ -333,7 +333,7 @@ def _confirmed_step(fibre: Any) -> float:
     return max(now, before) if now < 0 and before < 0 else 0.0
 
 
-@inline_kernel
+@kernel(inline="always")
 def track_peak(fibres: Any, pad: Any, time_s: float) -> None:
     """Store where a change is farthest in two blocks in a row: a single one may be a spike."""
     size = 0.0
@@ -347,7 +347,7 @@ def track_peak(fibres: Any, pad: Any, time_s: float) -> None:
         pad.after_peak = pad.block_first
 
 
-@inline_kernel
+@kernel(inline="always")
 def _has_settled(fibres: Any, pad: Any, time_s: float, reject_limit: Any) -> bool:
     """Return whether a change has ended."""
     n_present, chi_square = 0, 0.0
@@ -367,7 +367,7 @@ def _has_settled(fibres: Any, pad: Any, time_s: float, reject_limit: Any) -> boo
     return True
 
 
-@inline_kernel
+@kernel(inline="always")
 def _learn_touch(fibres: Any, pad: Any) -> None:
     """Learn direction and size from a touch that has settled."""
     pad.n_presses += 1
@@ -384,7 +384,7 @@ def _learn_touch(fibres: Any, pad: Any) -> None:
     pad.typical_size += share * (_size(fibres, fibres.residual, MAX_STEP) - pad.typical_size)
 
 
-@inner_kernel
+@kernel
 def _replace_levels(fibres: Any, levels: Any) -> float:
     """Set the last levels (C,) of a kind to the present block; return the clipped size of that step."""
     total = 0.0
@@ -395,14 +395,14 @@ def _replace_levels(fibres: Any, levels: Any) -> float:
     return total
 
 
-@inline_kernel
+@kernel(inline="always")
 def emit(events: Any, count: Any, down: bool, reading: int) -> int:
     """Append an event; return their number."""
     events[count, 0], events[count, 1] = down, reading
     return count + 1
 
 
-@inline_kernel
+@kernel(inline="always")
 def classify_change(fibres: Any, pad: Any, time_s: float, settled: bool, events: Any, count: Any) -> int:
     """Classify a change under way, as soon as it is clear what it is; return the number of events."""
     has_direction = pad.n_presses >= MIN_PRESSES and pad.agreement > MIN_AGREEMENT
@@ -426,14 +426,14 @@ def classify_change(fibres: Any, pad: Any, time_s: float, settled: bool, events:
     return count
 
 
-@inline_kernel
+@kernel(inline="always")
 def _set_press_step(fibres: Any, keep: float) -> None:
     """Add the residual to a share of the step of the press."""
     for fibre in fibres:
         fibre.press_step = keep * fibre.press_step + (0.0 if np.isnan(fibre.residual) else fibre.residual)
 
 
-@inline_kernel
+@kernel(inline="always")
 def commit_change(fibres: Any, pad: Any, time_s: float, events: Any, count: Any) -> int:
     """Change the state by a change that has settled; return the number of events."""
     if pad.change == Change.TOUCH and _projection(fibres, fibres.peak_step) < 0.5:  # a tap, released meanwhile
@@ -460,7 +460,7 @@ def commit_change(fibres: Any, pad: Any, time_s: float, events: Any, count: Any)
     return count
 
 
-@inline_kernel
+@kernel(inline="always")
 def _process_block(
     fibres: Any, pad: Any, time_s: float, reject_limit: Any, accept_limit: Any, events: Any, count: Any
 ) -> int:

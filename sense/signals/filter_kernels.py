@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from padforge.common.compilation import inner_kernel, kernel
+from padforge.common.compilation import kernel
 
 
 @kernel
@@ -107,7 +107,7 @@ def forward_pass_l1(readings: Any, lam: float, low: Any, high: Any) -> float:
 POSITION, SUM, LAMS, COUNT = range(4)
 
 
-@inner_kernel
+@kernel
 def _cut_l2(step: int, reading: float, lams: float, lam: float, knots: Any, k: int, stop: int) -> int:
     """Cut the derivative, with a reading added, at -lam (step 1, inwards from knot k) or at lam (-1); return the knot.
 

@@ -29,7 +29,7 @@ from padforge.sense.localizer.model import Localization, LocalizerModel
 from padforge.sense.recording.recording import Recording
 from padforge.sense.studies.study import Task, compute_states, draw_error_map, failed_label
 
-FORMAT = "padforge-fibre-loss/3"
+FORMAT = "padforge-fibre-loss/1"
 ONE, RETRAINED = "one network", "retrained"  # the two methods, as the document calls them
 BAR_WIDTH = 0.36
 

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from dataclasses import asdict
 from functools import partial
 from itertools import product
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -16,7 +16,7 @@ from padforge.design.contact import indented_signals, press_forces_n, signals
 from padforge.design.layer import REDUCED_MODULUS_KPA, solve_press
 from padforge.design.morphology import Morphology
 from padforge.design.published.networks import fresh_presses
-from padforge.design.settings import Contact, between_fibres
+from padforge.design.settings import Contact, Tool, between_fibres
 from padforge.sense.arrays import Array, Indices
 from padforge.sense.studies.study import (
     Sizes,
@@ -43,7 +43,7 @@ FORCE_SIZES = Sizes(2048, 1024)
 FORCE_NOISES = (1.0, 4.0)  # standard deviations of the readings' noise, counts of a 12-bit converter
 BINS = 7  # depths by which the error of the position is drawn
 COLUMNS = 4  # pads side by side in the figure of the force
-TOOLS = ("dome", "ball", "flat", "finger")
+TOOLS: tuple[Tool, ...] = get_args(Tool)
 FOOTPRINTS = {"circle": None, "square": 4, "triangle": 3}  # sides of each polygon; None for a circle
 SIZES = np.linspace(0.5, 0.9, 17)
 """Radii of circles of the same area as a footprint, grid units; one is drawn for every press."""

@@ -26,7 +26,7 @@ from padforge.sense.localizer.calibration import fit_recording, split_presses
 from padforge.sense.localizer.evaluation import distances
 from padforge.sense.recording.recording import Recording
 
-FORMAT = "padforge-learning-curve/3"
+FORMAT = "padforge-learning-curve/1"
 SHARES = (1 / 16, 1 / 8, 1 / 4, 1 / 2, 1.0)  # of the training presses
 MIN_PRESSES = 10  # training presses of the smallest localizer
 EXPONENTS = np.linspace(0.1, 1.5, 57)  # exponents b that are tried

@@ -98,7 +98,7 @@ def run(
     files.check_writable(out)
     result = study.conclude(compute_states(study.tasks, on_progress, jobs=jobs, executor=executor))
     document = {
-        "format": f"padforge-study-{study.name}/2",
+        "format": f"padforge-study-{study.name}/1",
         "title": study.title,
         "text": result.text,
         "rows": result.rows,

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from padforge.common.compilation import inner_kernel, kernel
+from padforge.common.compilation import kernel
 from padforge.design import Morphology
 from padforge.design.paths.curves import flatten
 from padforge.design.settings import Layout, sensed_rectangle
@@ -36,7 +36,7 @@ OFFSET, SENSITIVITY = slice(2, 2 + 2 * N_OFFSET), slice(2 + 2 * N_OFFSET, N_CHAN
 """Among the parameters of a channel, those of its lateral offset, x before y, and of its log-sensitivity."""
 
 
-@inner_kernel
+@kernel
 def spline_weights(f: float, out: Any) -> None:
     """Write values and derivatives at f in [0, 1) of the B-splines centred at -1, 0, 1 and 2 into out (2, 4)."""
     g = 1 - f

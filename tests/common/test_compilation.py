@@ -1,9 +1,7 @@
 """Kernels are compiled once for the sources that there are, and a note says so where it takes long."""
 
-import ast
 import logging
 import os
-import re
 import shutil
 import sys
 import tempfile
@@ -19,9 +17,9 @@ from numba.core import event as events
 from padforge.common import compilation
 
 KERNELS = """
-from padforge.common.compilation import inner_kernel, kernel
+from padforge.common.compilation import kernel
 
-@inner_kernel
+@kernel
 def inner(x):
     return x + 1
 
@@ -29,8 +27,6 @@ def inner(x):
 def outer(x):
     return inner(x) * 2
 """
-
-COMPILED = ("kernel", "inner_kernel", "inline_kernel", "njit")
 
 
 def loaded(path: Path) -> ModuleType:
@@ -86,7 +82,7 @@ def test_kernels_are_compiled_anew_when_what_they_call_has_changed(
     """In the folder of the user's choice, too."""
     if is_chosen:
         monkeypatch.setenv("NUMBA_CACHE_DIR", str(root / "chosen"))
-    inner, outer = KERNELS.split("@kernel")
+    inner, _, outer = KERNELS.rpartition("@kernel")
     (root / "design/inner.py").write_text(inner)
     (root / "design/outer.py").write_text(
         inner.partition("@")[0] + "from inner_of_a_test import inner\n@kernel" + outer
@@ -132,30 +128,3 @@ def test_few_caches_of_other_sources_stay(root: Path) -> None:
     latest = compilation.cache_folder().name
     numbers = range(7 - compilation.MAX_CACHES, 6)
     assert {path.name for path in base.iterdir()} == {mine, latest, *(f"padforge-kernels-{n:016x}" for n in numbers)}
-
-
-def test_inner_kernels_are_called_by_kernels_alone() -> None:
-    """Whichever name they are imported by: Python would crash."""
-    sources, tests = (
-        [path.read_text(encoding="utf-8") for folder in where for path in folder.rglob("*.py")]
-        for where in (compilation.SOURCES, [Path(__file__).parents[1]])
-    )
-
-    inner = {
-        name for source in sources for name in re.findall(r"^@in(?:ner|line)_kernel.*\ndef (\w+)", source, re.MULTILINE)
-    }
-    assert {"piece_of", "select_frame"} <= inner
-    named = re.compile(rf"\b({'|'.join(inner)})\b")
-
-    def look_at(node: ast.AST) -> None:
-        """Assert of a node and all below it, but for what is compiled."""
-        decorators = node.decorator_list if isinstance(node, ast.FunctionDef) else []
-        if any(ast.unparse(decorator).split("(")[0] in COMPILED for decorator in decorators):
-            return
-        assert not (isinstance(node, ast.alias) and node.name in inner and node.asname)
-        assert getattr(node, "attr", getattr(node, "id", "")) not in inner
-        for child in ast.iter_child_nodes(node):
-            look_at(child)
-
-    for source in filter(named.search, sources + tests):
-        look_at(ast.parse(source))

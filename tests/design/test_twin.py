@@ -58,7 +58,7 @@ def test_twin_file_round_trip(twin, tmp_path):
     assert (back.residual.middle_mm, back.residual.half_mm) == ((1.0, -2.0), 11.0)
     assert back.residual.volts == pytest.approx(whole.residual.volts, abs=1e-6)
     assert np.abs(back.as_built_stretch(PLACES, "after")).sum() < np.abs(back.as_built_stretch(PLACES)).sum()
-    assert json.loads((tmp_path / "twin.json").read_text())["format"] == "padforge-twin/4"
+    assert json.loads((tmp_path / "twin.json").read_text())["format"] == "padforge-twin/1"
 
 
 def test_as_built_stretch_matches_the_contact_model(twin):
@@ -113,7 +113,7 @@ def test_twin_refuses_inconsistent_values(twin, change, message):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"format": "padforge-design/1"}, "padforge-twin/4"),
+        ({"format": "padforge-design/1"}, "padforge-twin/1"),
         ({"channels": [{"gain": 1}]}, "no valid twin"),
         ({"frame__scale": -1}, "scale"),
         ({"readings__noise_mv": "much"}, "noise_mv"),

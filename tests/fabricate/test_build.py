@@ -138,7 +138,7 @@ def test_step_reads_back_as_a_valid_solid_of_the_meshes_volume(built):
 
 def test_document_has_sizes_frame_findings_and_crossings(built, tmp_path):
     _, result = built
-    assert result.to_dict()["format"] == "padforge-fabrication/2"
+    assert result.to_dict()["format"] == "padforge-fabrication/1"
     side = 22.5 + 2 * (2 + 2 + 6 * math.tan(math.radians(2)))
     assert result.size_mm == pytest.approx([side, side, 8.0 + 2.0], abs=1e-4)  # pins stand above the walls
     assert result.sizes["tray_mm"] == pytest.approx(side)
@@ -272,7 +272,7 @@ def test_build_deletes_earlier_files_unless_they_were_changed(tmp_path, caplog):
 
 def test_build_deletes_nothing_without_digests(tmp_path, caplog):
     caplog.set_level(logging.INFO, "padforge")
-    (tmp_path / "fabrication.json").write_text('{"format": "padforge-fabrication/2", "sha256": ["mould.step"]}')
+    (tmp_path / "fabrication.json").write_text('{"format": "padforge-fabrication/1", "sha256": ["mould.step"]}')
     (tmp_path / "mould.step").write_text("somebody's own")
     build(PAD, tmp_path, [])
     assert not caplog.messages

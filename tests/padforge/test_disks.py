@@ -75,7 +75,7 @@ def room(made: Path, tmp_path: Path) -> Path:
     for name in ("made", "pad"):
         (tmp_path / name).mkdir()
         (tmp_path / name / "morphology.json").write_bytes((made / "made" / "morphology.json").read_bytes())
-    write_json(tmp_path / "pad" / "fabrication.json", {"format": "padforge-fabrication/2"})
+    write_json(tmp_path / "pad" / "fabrication.json", {"format": "padforge-fabrication/1"})
     return tmp_path
 
 

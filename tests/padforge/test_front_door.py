@@ -121,7 +121,7 @@ def test_only_the_genetic_search_needs_pymoo(tmp_path: Path, monkeypatch: pytest
     smallest = "[pad]\ngrid = 1\n[search]\nknots = 1\nstarts = 1\nsteps = 1\nmax_failures = 1\n"
     (tmp_path / "pad.toml").write_text(smallest)
     said = refused("design", "--method", "genetic", cwd=tmp_path)
-    assert said == "padforge: this needs pymoo, which is not installed: pip install 'padforge[genetic]'\n"
+    assert said == "padforge: this needs pymoo, which is not installed: pip install 'padforge[design]'\n"
     ended = called("design", cwd=tmp_path)
     assert ended.code in (0, 1), ended
     assert (tmp_path / "out" / "pad" / "morphology.json").is_file()

@@ -142,7 +142,7 @@ def test_profile_option_prints_to_stderr(tmp_path):
     command = [sys.executable, "-m", "padforge", "design", "--profile", "--json"]
     result = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
     assert result.returncode in (0, 1), result.stderr
-    assert json.loads(result.stdout)["format"] == "padforge-design/2"
+    assert json.loads(result.stdout)["format"] == "padforge-design/1"
     told = dict(line.split(maxsplit=1) for line in result.stderr.splitlines() if line.startswith("  "))
     assert told["starts"] == "0 of 1"
     skipped = told["imports"].split(" (not ")[0]

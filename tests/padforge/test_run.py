@@ -263,7 +263,7 @@ def test_remaining_time_counts_from_the_start_of_the_run(monkeypatch: pytest.Mon
 @pytest.mark.parametrize("stages", ["", ', "stages": {"sense": {"files": 3}}'])
 def test_damaged_note_is_refused(folder: Path, stages: str) -> None:
     """Before a stage is done again, whichever stage's entry is damaged."""
-    (folder / "out" / "pad" / "run.json").write_text(f'{{"format": "padforge-run/2"{stages}}}')
+    (folder / "out" / "pad" / "run.json").write_text(f'{{"format": "padforge-run/1"{stages}}}')
     assert "run.json: " in refused("run", "--resume", cwd=folder)
 
 

@@ -1,4 +1,4 @@
-"""Settings files of any content: read, or refused in one line; and what is allowed can be checked ahead of a run."""
+"""Settings at the ends of their ranges can be checked ahead of a run; broken files are refused in one line."""
 
 import json
 import math
@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from padforge.common.settings import Settings, Spec, commented_toml
+from padforge.common.settings import Spec
 from padforge.common.validation import InputError
 from padforge.design.morphology import Morphology
 from padforge.design.objectives.rules import check_rules
@@ -21,14 +21,7 @@ from padforge.run import Run, check_run
 from padforge.settings import section_models
 
 MODELS = section_models()
-DEFAULTS = commented_toml(MODELS).encode()
 KEYS = [(name, key) for name, model in MODELS.items() for key in model.model_fields]
-VALUES = (
-    *("0", "-1", "2", "0.5", "1e308", "5e-324", "nan", "-inf", "true", "9223372036854775807", "9" * 30, "1e400"),
-    *("0x7fffffffffffffff", '""', '"any"', '"circle"', '"\\u0000"', '"\\ud800"', "'''\n'''", "[]", "[[]]", "[1, 2, 3]"),
-    *("[nan]", '["a"]', "{}", "{a = 1}", "{radius = 0.5}", "1979-05-27", ""),
-)
-"""Values as TOML has them, or has them not."""
 
 
 def one_line(error: InputError) -> str:
@@ -37,54 +30,21 @@ def one_line(error: InputError) -> str:
     return str(error)
 
 
-def read(path: Path, content: bytes) -> dict[str, Settings] | str:
-    """All sections of a settings file of that content, which read back as they are written; or one line why none."""
-    path.write_bytes(content)
-    try:
-        spec = Spec.load(path, MODELS)
-        found = {name: spec.section(model) for name, model in MODELS.items()}
-    except InputError as error:
-        return one_line(error)
-    for name, section in found.items():
-        json.dumps(section.model_dump(mode="json"), allow_nan=False)
-        assert type(section).model_validate(section.model_dump()) == section, name
-    return found
-
-
 @pytest.fixture(scope="module")
 def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return tmp_path_factory.mktemp("settings") / "pad.toml"
 
 
-@settings(max_examples=50)
-@given(st.lists(st.tuples(st.sampled_from(KEYS), st.sampled_from(VALUES) | st.floats().map(repr)), min_size=1))
-def test_settings_of_any_value_are_valid_or_refused(path: Path, lines: list[tuple[tuple[str, str], str]]) -> None:
-    tables: dict[str, list[str]] = {}
-    for (section, key), value in lines:
-        tables.setdefault(section, []).append(f"{key} = {value}")
-    text = "\n".join(part for section, rows in tables.items() for part in (f"[{section}]", *rows))
-    read(path, text.encode())
-
-
-@settings(max_examples=25)
-@given(st.integers(0, len(DEFAULTS)), st.integers(0, 200), st.binary(max_size=8))
-def test_damaged_settings_are_refused_in_one_line(path: Path, at: int, less: int, more: bytes) -> None:
-    read(path, DEFAULTS[:at] + more + DEFAULTS[at + less :])
-
-
 @pytest.mark.parametrize(
     "content",
-    [
-        b"pad = 1\n",
-        b"[pad]\n[pad]\n",
-        "[pad]\ndeep_family = 'é'\n".encode("latin-1"),
-        "[pad]\ngrid = 2\n".encode("utf-16"),
-        b"\0" * 1000,
-    ],
-    ids=range(5),
+    [b"pad = 1\n", b"[pad]\n[pad]\n", "[pad]\ndeep_family = 'é'\n".encode("latin-1"), "[pad]\n".encode("utf-16")],
+    ids=range(4),
 )
-def test_broken_settings_are_refused(path: Path, content: bytes) -> None:
-    assert isinstance(read(path, content), str)
+def test_broken_settings_are_refused_in_one_line(path: Path, content: bytes) -> None:
+    path.write_bytes(content)
+    with pytest.raises(InputError, match=r"pad\.toml: ") as refused:
+        Spec.load(path, MODELS)
+    one_line(refused.value)
 
 
 def limits(section: str, key: str) -> list[float]:

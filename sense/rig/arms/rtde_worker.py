@@ -7,7 +7,7 @@ powers or starts an arm.
 """
 
 import contextlib
-import fcntl
+import errno
 import json
 import os
 import queue
@@ -16,7 +16,6 @@ import socket
 import sys
 import threading
 import time
-from pathlib import Path
 from typing import Any, NoReturn
 
 from padforge.sense.rig.arms import rtde
@@ -30,7 +29,6 @@ FIRST_STATE_S = 0.05  # wait for the first state after a stop, so that nobody ta
 HALT_S = 0.15  # wait for the arm, and then for the parent, when this process has to end
 ANSWER_S = 1.0  # wait for an answer of the arm while connecting
 SESSION_END_S = 1.0  # wait for another session that is about to end: its watchdog needs a quarter of a second
-LOCK_FOLDER = Path("/tmp")  # that of all users; a user may have another TMPDIR
 UNLOCK_ADVICE = "look at the arm, unlock it at the pendant, then connect again"
 
 
@@ -59,43 +57,27 @@ def _wait_until_idle(reader: RtdeReader, state: RtdeState) -> RtdeState:
     return state
 
 
-def lock_arm(host: str) -> int:
-    """Keep other programs on this computer off the arm until the descriptor is closed or this process ends."""
+def lock_arm(host: str) -> socket.socket:
+    """Keep other programs on this computer, whoever started them, off the arm until this process ends.
+
+    The name of a local socket is a lock that leaves nothing behind; Linux alone has such names, and ur-rtde wheels.
+    """
     address = socket.getaddrinfo(host, None)[0][4][0]
-    path = LOCK_FOLDER / f"padforge-arm-{address}.lock"
+    lock = socket.socket(socket.AF_UNIX)
     deadline = time.monotonic() + SESSION_END_S
     while True:
         try:
-            if (lock := _try_lock(path)) is not None:
-                return lock
-            message = f"another program on this computer uses the arm {host}: it has locked {path}"
-            advice = "wait for its end, or end it"
-        except OSError as error:  # which may pass: another user's program is just creating the file
-            message = f"{path}: cannot be locked ({error.strerror})"
-            advice = "remove it, or let the user who created it or an administrator do so"
-        if time.monotonic() > deadline:
-            raise CommandRejected("refused", message, advice)
-        time.sleep(KICK_S)
-
-
-def _try_lock(path: Path) -> int | None:
-    """Lock a file in a folder where any user may have created it, or put a link in its place.
-
-    Returns:
-        The descriptor; None if another program has locked the file, or it was removed meanwhile.
-    """
-    try:
-        lock = os.open(path, os.O_CREAT | os.O_EXCL | os.O_RDONLY, 0o644)
-        os.fchmod(lock, 0o644)  # whatever the umask: other users must be able to open it
-    except FileExistsError:
-        lock = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
-    with contextlib.suppress(BlockingIOError, FileNotFoundError):
-        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        # What cleans temporary files locks them, too, and removes them then: a lock on such a file keeps nobody out.
-        if os.path.samestat(os.fstat(lock), path.lstat()):
+            lock.bind(f"\0padforge-arm-{address}")
             return lock
-    os.close(lock)
-    return None
+        except OSError as error:
+            if error.errno == errno.EADDRINUSE and time.monotonic() < deadline:
+                time.sleep(KICK_S)
+                continue
+            lock.close()
+            if error.errno != errno.EADDRINUSE:
+                raise
+            message = f"another program on this computer uses the arm {host}"
+            raise CommandRejected("refused", message, "wait for its end, or end it") from None
 
 
 class WorkerProcess:
@@ -109,7 +91,7 @@ class WorkerProcess:
         self._write_lock = threading.Lock()
         self._commands: queue.Queue[dict[str, Any]] = queue.Queue()
         self._control: UrRtdeControl | None = None
-        self._arm_lock: int | None = None
+        self._arm_lock: socket.socket | None = None
         self._latest: RtdeState | None = None
         self._new_state = threading.Event()
         self._program_running = threading.Event()

@@ -29,7 +29,7 @@ def design_document() -> dict:
     used = {"pad": PadSettings(grid=2), "contact": Contact(), "search": SearchSettings(), "rules": RulesSettings()}
     settings = {name: section.model_dump(mode="json") for name, section in used.items()}
     return {
-        "format": "padforge-design/2",
+        "format": "padforge-design/1",
         "terms": {
             "expected_error_mm_0": 0.675,
             "expected_error_mm_1": 0.9,
@@ -63,7 +63,7 @@ def calibration_document() -> dict:
     found = {(): 1.0, (0,): 1.5, (1,): 4.25, (2,): 1.25, (3,): 2.0}
     pairs = {(one, two): found[one,] + found[two,] for two in range(4) for one in range(two)}
     return {
-        "format": "padforge-calibration/3",
+        "format": "padforge-calibration/1",
         **errors(found | pairs),
         "split": "random",
         "test_presses": 12,
@@ -83,7 +83,7 @@ def contacts_document() -> dict:
 
 def study_document() -> dict:
     return {
-        "format": "padforge-study-drift/2",
+        "format": "padforge-study-drift/1",
         "title": "Drift",
         "text": ["First.", "Second."],
         "rows": [{"pad": "square", "error": 1.25, "kept": True}, {"pad": "ours", "error": None, "kept": False}],
@@ -105,7 +105,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     written(folder / "contacts.json", contacts_document())
     source = {"kind": "simulated", "rig": {"rate_hz": 13.3, "depth_mm": 5.0}}
     made_by = provenance("padforge sense record")
-    start = {"format": "padforge-recording/2", "fibres": 4, "source": source, "provenance": made_by}
+    start = {"format": "padforge-recording/1", "fibres": 4, "source": source, "provenance": made_by}
     written(folder / "recording" / "start.json", start)
     written(folder / "studies" / "drift.json", study_document())
     shutil.copy(folder / "tracks.png", folder / "studies" / "drift.png")

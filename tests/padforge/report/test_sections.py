@@ -94,7 +94,7 @@ def test_fibre_loss_study_replaces_errors_of_calibration(pad: Path) -> None:
         "one network": errors({(): 1.0, (0,): 7.5, (1,): 3.0}),
         "retrained": errors({(): 1.0, (0,): 2, (1,): 8.5}),
     }
-    document = {"format": "padforge-fibre-loss/3", "methods": methods, "test_presses": 9, "provenance": provenance("x")}
+    document = {"format": "padforge-fibre-loss/1", "methods": methods, "test_presses": 9, "provenance": provenance("x")}
     written(pad / "fibre_loss.json", document)
     text = write_report(pad).read_text()
     assert "of one fibre, 1 (7.50 mm)" in text
@@ -167,13 +167,13 @@ def test_report_refuses_folder_without_results(tmp_path: Path) -> None:
 
 
 DAMAGED = {
-    "design.json": ['{"format": "padforge-design/2", "terms": {}}', '{"format": "padforge-design/3"}'],
-    "fabrication.json": ['{"format": "padforge-fabrication/2", "findings": []}'],
-    "calibration.json": ['{"format": "padforge-calibration/3", "errors": []}'],
-    "fibre_loss.json": ['{"format": "padforge-fibre-loss/3", "methods": {"x": {"by_subset": [{"failed": [1]}]}}}'],
+    "design.json": ['{"format": "padforge-design/1", "terms": {}}', '{"format": "padforge-design/0"}'],
+    "fabrication.json": ['{"format": "padforge-fabrication/1", "findings": []}'],
+    "calibration.json": ['{"format": "padforge-calibration/1", "errors": []}'],
+    "fibre_loss.json": ['{"format": "padforge-fibre-loss/1", "methods": {"x": {"by_subset": [{"failed": [1]}]}}}'],
     "mould.stl": ["solid nothing"],
     "studies/drift.json": [
-        '{"format": "padforge-study-drift/2", "title": "a", "text": [], "rows": [{"a": 1}, {"b": 1}]}'
+        '{"format": "padforge-study-drift/1", "title": "a", "text": [], "rows": [{"a": 1}, {"b": 1}]}'
     ],
 }
 

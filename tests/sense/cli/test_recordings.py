@@ -21,7 +21,7 @@ def test_import_reads_csv(padforge_sense, brief: Recording) -> None:
     assert out.endswith(" -> out/r/recording\n")
     assert Recording.open("out/r/recording") == brief
     start = json.loads(Path("out/r/recording/start.json").read_text())
-    assert start["format"] == "padforge-recording/2"
+    assert start["format"] == "padforge-recording/1"
     assert set(start["provenance"]["inputs"]) == {"r.csv"}
 
 

@@ -62,7 +62,6 @@ doctor --rig ur5 --spec 3.toml {five}           | [rig] channels: got 3 inputs, 
 doctor --rig crane                              | --rig is 'crane', allowed are hand, printer, ur5
 doctor --rig simulated                          | --rig is 'simulated', allowed are hand, printer, ur5
 record --rig crane                              | --rig is 'crane', allowed are simulated, hand, printer, ur5
-record --rig crane                              | --rig is 'crane', allowed are simulated, hand, printer, ur5
 {live} --model model --rig crane                | --rig is 'crane', allowed are simulated, hand, printer, ur5
 calibrate rec --time-budget 0                   | Invalid value for '--time-budget': 0.0 is not in the range x>0
 calibrate rec --without radii                   | Invalid value for '--without': 'radii' is not one of 'health'

@@ -75,7 +75,7 @@ def test_record_writes_an_mcap_file_as_export_does(padforge_sense, monkeypatch: 
     assert Path("same/rec.mcap").read_bytes() == Path("rec.mcap").read_bytes()
     monkeypatch.setitem(sys.modules, "rosbags.typesys", None)
     code, _, err = padforge_sense("record", "--presses", "4", "--mcap", "--out", "other")
-    assert (code, err) == (2, "padforge: other.mcap: MCAP needs rosbags: pip install 'padforge[ros]'\n")
+    assert (code, err) == (2, "padforge: other.mcap: MCAP needs rosbags: pip install 'padforge[formats]'\n")
     assert not Path("other").exists()
 
 

@@ -78,7 +78,7 @@ def test_export_bag_is_read_by_mcap(eight: Recording, bag: Path) -> None:
     forces = [content.wrench.force.z for _, content in topics["/pad/force"]]
     np.testing.assert_array_equal(forces, np.delete(eight.forces_n, 4))
     about = json.loads(topics["/pad/recording"][0][1].data)
-    assert about["format"] == "padforge-ros/2"
+    assert about["format"] == "padforge-ros/1"
     assert about["digest"] == eight.digest
     assert about["topics"]["/pad/readings"].startswith("V, ")
     assert set(about["topics"]) | {"/pad/recording"} == set(types)
@@ -195,7 +195,7 @@ def test_import_bag_from_messages_alone(eight: Recording, bag: Path, tmp_path: P
 
     def unfit(topic: str, _: float, message: Any) -> bool:
         if topic == "/pad/recording":
-            message.data = '{"format": "padforge-ros/2"}'
+            message.data = '{"format": "padforge-ros/1"}'
         return True
 
     assert "was changed" in import_bag(changed(bag, tmp_path / "unfit", unfit)).source["note"]

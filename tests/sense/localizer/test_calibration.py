@@ -78,7 +78,7 @@ def test_calibrate_is_blind_to_test_presses_and_repeats_by_seed(brief: Recording
 
 def test_calibrate_documents_its_errors(calibrated: tuple[LocalizerModel, Evaluation], recording: Recording) -> None:
     localizer, evaluation = calibrated
-    assert evaluation.to_dict()["format"] == "padforge-calibration/3"
+    assert evaluation.to_dict()["format"] == "padforge-calibration/1"
     assert (evaluation.split, evaluation.test_presses, evaluation.training_presses) == ("random", 45, 255)
     assert [(row["n_failed"], row["subsets"]) for row in evaluation.errors] == [(0, 1), (1, 4), (2, 6), (3, 4)]
     assert localizer.errors == evaluation.errors

@@ -197,11 +197,11 @@ def test_save_keeps_every_bit(
         assert (tmp_path / "again" / name).read_bytes() == (tmp_path / name).read_bytes()
 
 
-def test_load_refuses_files_of_before(localizer: LocalizerModel, tmp_path: Path) -> None:
+def test_load_refuses_another_format(localizer: LocalizerModel, tmp_path: Path) -> None:
     localizer.save(tmp_path)
     text = (tmp_path / "localizer.json").read_text()
-    (tmp_path / "localizer.json").write_text(text.replace("padforge-localizer/5", "padforge-localizer/4"))
-    with pytest.raises(InputError, match="padforge-localizer/4"):
+    (tmp_path / "localizer.json").write_text(text.replace("padforge-localizer/1", "padforge-localizer/0"))
+    with pytest.raises(InputError, match="padforge-localizer/0"):
         LocalizerModel.load(tmp_path)
 
 

@@ -49,7 +49,7 @@ def test_save_refuses_existing_and_unwritable_paths(recording: Recording, folder
     assert {entry.name for entry in tmp_path.iterdir()} == {"run", "empty", "file"}
 
 
-@pytest.mark.parametrize("change", [{"fibres": 513}, {"source": [1]}, {"format": "padforge-recording/1"}])
+@pytest.mark.parametrize("change", [{"fibres": 513}, {"source": [1]}, {"format": "padforge-recording/0"}])
 def test_open_refuses_other_values_in_the_start_document(folder: Path, change: dict[str, object]) -> None:
     document = json.loads((folder / "start.json").read_text())
     (folder / "start.json").write_text(json.dumps(document | change))

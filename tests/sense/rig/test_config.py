@@ -218,7 +218,7 @@ def test_resume_refuses_another_arm_tool_or_board(run, tmp_path, device, key, va
 
 
 def test_resume_refuses_a_recording_without_a_plan(tmp_path):
-    text = '{"format": "padforge-recording/2", "fibres": 4, "source": {"plan": 5}}'
+    text = '{"format": "padforge-recording/1", "fibres": 4, "source": {"plan": 5}}'
     (tmp_path / "start.json").write_text(text, encoding="utf-8")
     with pytest.raises(InputError, match="has no plan"):
         resumed_plan(tmp_path)

@@ -43,7 +43,8 @@ def test_recording_describes_its_pad(recording: Recording, tmp_path: Path) -> No
     recording.save(tmp_path / "recording", {})
     assert simulated_board_of(tmp_path).connect()["channels"] == 5
     square = Morphology.straight(2)
-    assert json.dumps(pad_source(square)) == json.dumps({"pitch_mm": 11.25, "knots": square.knots.tolist()})
+    expected = {"fibres": [2, 2], "pitch_mm": [11.25, 11.25], "knots": square.knots.tolist()}
+    assert json.dumps(pad_source(square)) == json.dumps(expected)
 
 
 def test_localization_of_a_rectangular_pad_is_in_mm(

@@ -75,7 +75,7 @@ def test_every_study_writes_table_figure_and_text(name: str, tmp_path: Path, mon
         for size, value in sizes.items():
             monkeypatch.setattr(module, size, value)
     document = run(SMALLEST[name](), tmp_path, jobs=1)
-    assert document["format"] == f"padforge-study-{name}/2"
+    assert document["format"] == f"padforge-study-{name}/1"
     assert sorted(path.name for path in tmp_path.iterdir()) == [f"{name}.{end}" for end in ("csv", "json", "md", "png")]
     assert json.loads((tmp_path / f"{name}.json").read_text()) == json.loads(json.dumps(document, allow_nan=False))
     with (tmp_path / f"{name}.csv").open() as file:
