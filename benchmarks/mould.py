@@ -15,10 +15,9 @@ from numpy.typing import NDArray
 from padforge.benchmarks.harness import Bench, BenchTrial
 from padforge.design.morphology import Morphology
 from padforge.design.paths.curves import flatten
-from padforge.fabricate.cad.model import FIT_TOLERANCES_MM, body_solid, build_mould_model
-from padforge.fabricate.cad.step_file import CadPart, write_step
+from padforge.fabricate.cad.model import FIT_TOLERANCES_MM, assemble, body_solid, mould_parts, write_step
 from padforge.fabricate.mesh import mould_mesh
-from padforge.fabricate.mould import mould_body
+from padforge.fabricate.mould import INTO_FLOOR_MM, mould_body
 from padforge.fabricate.plan import Plan, offset_box
 from padforge.fabricate.settings import DEFAULTS, MouldSettings
 
@@ -51,12 +50,17 @@ def trials() -> Iterator[BenchTrial]:
                         f"N={knots}", way, 1000 * tolerance_mm, partial(work, plan), partial(evaluate, plan)
                     )
         plan = partial(_plan, pad)
-        work = partial(lambda plan: build_mould_model(plan(), "mould").shape, plan)
+        work = partial(_build_curved, plan)
         yield BenchTrial(f"N={knots}", "curved CAD", 1000 * FIT_TOLERANCES_MM[0], work, partial(_evaluate_solid, plan))
 
 
 def _plan(pad: Morphology, tolerance_mm: float = DEFAULTS.mould.tolerance_mm) -> Plan:
     return Plan(pad, replace(DEFAULTS, mould=MouldSettings(tolerance_mm=tolerance_mm, number_mm=0)))
+
+
+def _build_curved(new_plan: Callable[[], Plan]) -> Any:
+    plan = new_plan()
+    return assemble({"mould": mould_parts(plan, "mould")}, plan)
 
 
 def _evaluate_mesh(new_plan: Callable[[], Plan], mesh: Any) -> Mapping[str, float]:
@@ -70,10 +74,11 @@ def _evaluate_mesh(new_plan: Callable[[], Plan], mesh: Any) -> Mapping[str, floa
 
 def _evaluate_solid(new_plan: Callable[[], Plan], solid: Any) -> Mapping[str, float]:
     plan = new_plan()
-    points = np.vstack(list(_horizontal_edges(solid, plan.settings.mould.floor_mm)))
+    floor_mm = plan.settings.mould.floor_mm  # where ridges meet it in one solid, and where they begin as solids
+    points = np.vstack([*_horizontal_edges(solid, floor_mm), *_horizontal_edges(solid, floor_mm - INTO_FLOOR_MM)])
     with TemporaryDirectory() as folder:
         path = Path(folder) / "mould.step"
-        write_step(path, CadPart("mould", solids=tuple(part.wrapped for part in solid.solids())))
+        write_step(path, solid)
         size = path.stat().st_size
     return {"error": _max_deviation_mm(plan, points), "faces": len(solid.faces()), "file_bytes": size}
 

@@ -90,21 +90,49 @@ def mould_body(plan: Plan, wells: Sequence[BaseGeometry] = ()) -> Body:
     Raises:
         InputError: pins that do not fit on the walls.
     """
-    mould = plan.settings.mould
-    floor = mould.floor_mm
+    ridges = []
+    for layer, top in enumerate(plan.ridges):
+        ridges += ridge_prisms(plan, plan.layer_fibres(layer), top | wells[layer] if wells else top)
+    tray = tray_body(plan)
+    return replace(tray, adds=(*ridges, *(number for number in number_prisms(plan) if number), *tray.adds))
+
+
+def tray_body(plan: Plan) -> Body:
+    """Build the tray of a mould with exits, pillars and pins, without ridges.
+
+    Raises:
+        InputError: pins that do not fit on the walls.
+    """
+    floor, rim = plan.settings.mould.floor_mm, plan.settings.mould.floor_mm + plan.silicone_mm
     tray = _tray(plan.tray, [plan.cavity, *plan.exits], floor, plan.silicone_mm, plan.flare_mm)
-    adds = []
-    for layer, height in enumerate(plan.heights_mm):
-        for below in terraces(height, plan.settings.terrace_mm):  # a printer makes terraces of a taper
-            outline = plan.outline(layer, below) if below else plan.ridges[layer]
-            if wells and not below:
-                outline = outline | wells[layer]
-            adds.append(Prism(outline, floor - INTO_FLOOR_MM, floor + height - below))
-    top = floor + mould.shallow_ridge_height_mm
-    adds += [Prism(number, floor - INTO_FLOOR_MM, top) for number in plan.numbers if number is not None]
-    if plan.pillars.area:
-        adds.append(Prism(plan.pillars, floor - INTO_FLOOR_MM, floor + plan.silicone_mm))
-    return replace(tray, adds=(*adds, *(registration_pins(plan) if mould.pins else ())))
+    pillars = [Prism(plan.pillars, floor - INTO_FLOOR_MM, rim)] if plan.pillars.area else []
+    return replace(tray, adds=(*pillars, *(registration_pins(plan) if plan.settings.mould.pins else ())))
+
+
+def ridge_prisms(
+    plan: Plan, fibres: Sequence[int], top: BaseGeometry, tolerance_mm: float | None = None
+) -> list[Prism]:
+    """Build the terraces of the ridges of some fibres of a layer, the upper first; a ridge without taper has one.
+
+    Args:
+        plan: of the mould.
+        fibres: their indices.
+        top: outline of the uppermost terrace.
+        tolerance_mm: greatest deviation of the outlines of the others; None for that of the settings.
+    """
+    floor, height = plan.settings.mould.floor_mm, plan.heights_mm[plan.layer_indices[fibres[0]]]
+    prisms = []
+    for below in terraces(height, plan.settings.terrace_mm):  # a printer makes terraces of a taper
+        outline = plan.outline(fibres, below, tolerance_mm) if below else top
+        prisms.append(Prism(outline, floor - INTO_FLOOR_MM, floor + height - below))
+    return prisms
+
+
+def number_prisms(plan: Plan) -> list[Prism | None]:
+    """Build the number of every fibre; None without room, an empty list if unwanted."""
+    floor = plan.settings.mould.floor_mm
+    top = floor + plan.settings.mould.shallow_ridge_height_mm
+    return [number and Prism(number, floor - INTO_FLOOR_MM, top) for number in plan.numbers]
 
 
 def registration_pins(plan: Plan) -> list[Prism]:
@@ -151,13 +179,19 @@ def conductive_body(plan: Plan) -> Body:
 
 def well_outlines(plan: Plan, sides: int = 64) -> list[BaseGeometry]:
     """Return the outlines of the wells at the ends of the ridges of every layer, as regular polygons, mm."""
-    discs: list[list[BaseGeometry]] = [[] for _ in plan.heights_mm]
-    for layer, pair in zip(plan.layer_indices, plan.leads.pairs, strict=True):
-        for lead in pair:
-            position, out = lead.turned_mm.copy(), lead.outward[lead.axis]
-            position[lead.axis] = plan.leads.edge_mm(lead) + out * WELL_RIM_MM + out * WELL_MM / 2
-            discs[layer].append(cylinder(*position.tolist(), WELL_MM, sides))
-    return [shapely.union_all(wells) for wells in discs]
+    wells = [fibre_wells(plan, fibre, sides) for fibre in range(plan.pad.layout.fibres)]
+    layers = [plan.layer_fibres(layer) for layer in range(len(plan.heights_mm))]
+    return [shapely.union_all([wells[fibre] for fibre in fibres]) for fibres in layers]
+
+
+def fibre_wells(plan: Plan, fibre: int, sides: int) -> BaseGeometry:
+    """Return the outlines of the two wells of a fibre, as regular polygons, mm."""
+    discs = []
+    for lead in plan.leads.pairs[fibre]:
+        position, out = lead.turned_mm.copy(), lead.outward[lead.axis]
+        position[lead.axis] = plan.leads.edge_mm(lead) + out * WELL_RIM_MM + out * WELL_MM / 2
+        discs.append(cylinder(*position.tolist(), WELL_MM, sides))
+    return shapely.union_all(discs)
 
 
 def lid_body(plan: Plan) -> Body:

@@ -8,7 +8,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import shapely
@@ -76,24 +76,46 @@ def assign_layers(counts: tuple[int, int], clashes: Sequence[Crossing], deep_hor
     return tuple(layers[fibre] for fibre in range(sum(counts)))
 
 
-_SEGMENTS = {
-    **{"a": ((0.0, 1.0), (0.5, 1.0)), "b": ((0.5, 1.0), (0.5, 0.5)), "c": ((0.5, 0.5), (0.5, 0.0))},
-    **{"d": ((0.0, 0.0), (0.5, 0.0)), "e": ((0.0, 0.5), (0.0, 0.0)), "f": ((0.0, 1.0), (0.0, 0.5))},
-    **{"g": ((0.0, 0.5), (0.5, 0.5))},
-}
-_DIGITS = ("abcdef", "bc", "abged", "abgcd", "fgbc", "afgcd", "afgedc", "abc", "abcdefg", "abcdfg")
-"""Digits of a seven-segment display, each 1 high and 0.5 wide."""
+_TOP = ((0.0, 0.82), (0.13, 1.0), (0.37, 1.0), (0.5, 0.82))
+_BOTTOM = ((0.5, 0.18), (0.37, 0.0), (0.13, 0.0), (0.0, 0.18))
+_MIDDLE = ((0.5, 0.66), (0.36, 0.53), (0.5, 0.4))
+_DIGITS = (
+    ((*_TOP, *_BOTTOM, (0.0, 0.82)),),
+    (((0.02, 0.78), (0.28, 1.0), (0.28, 0.0)),),
+    ((*_TOP, (0.5, 0.66), (0.0, 0.0), (0.5, 0.0)),),
+    ((*_TOP, *_MIDDLE, *_BOTTOM), ((0.2, 0.53), (0.36, 0.53))),
+    (((0.36, 0.0), (0.36, 1.0), (0.0, 0.3), (0.5, 0.3)),),
+    (((0.46, 1.0), (0.04, 1.0), (0.0, 0.55), (0.14, 0.63), (0.36, 0.63), (0.5, 0.46), *_BOTTOM),),
+    (((0.36, 1.0), (0.0, 0.42), (0.0, 0.18), *_BOTTOM[2:0:-1], (0.5, 0.18), (0.5, 0.42), (0.37, 0.56), (0.18, 0.56)),),
+    (((0.0, 1.0), (0.5, 1.0), (0.16, 0.0)),),
+    ((*_TOP, *_MIDDLE, *_BOTTOM, (0.0, 0.4), (0.14, 0.53), (0.0, 0.66), (0.0, 0.82)), ((0.14, 0.53), (0.36, 0.53))),
+    (((0.5, 0.0), *_TOP[::-1], (0.0, 0.6), (0.13, 0.44), (0.35, 0.44), (0.43, 0.52)),),
+)
+"""Strokes of digits 1 high and 0.5 wide: turned over or upside down, none of them is another digit."""
 
 
 def draw_number(number: int, height_mm: float, width_mm: float) -> BaseGeometry:
-    """Draw a number, centred, from the height and stroke width of its digits; mirrored, to be read on the casting."""
-    advance = 0.5 + (width_mm + max(width_mm, 0.25 * height_mm)) / height_mm
+    """Draw a number, centred; mirrored, to be read on the casting.
+
+    Its digits stand on a bar, which tells a 6 from a 9 and makes one piece of them.
+
+    Args:
+        number: non-negative.
+        height_mm: between the middles of its uppermost strokes and of the bar.
+        width_mm: of its strokes.
+    """
+    digit_mm = max(height_mm - width_mm, height_mm / 2)
+    advance_mm = digit_mm / 2 + width_mm + max(width_mm, 0.25 * digit_mm)
+    digits = str(number)
     strokes = [
-        np.add(_SEGMENTS[segment], (position * advance, 0)) * height_mm
-        for position, digit in enumerate(str(number))
-        for segment in _DIGITS[int(digit)]
+        digit_mm * np.array(stroke) + [position * advance_mm, 0]
+        for position, digit in enumerate(digits)
+        for stroke in _DIGITS[int(digit)]
     ]
-    outline = shapely.union_all(shapely.buffer(shapely.linestrings(strokes), width_mm / 2, cap_style="square"))
+    bar = np.array([(0, -width_mm), ((len(digits) - 1) * advance_mm + digit_mm / 2, -width_mm)])
+    lines = list(map(shapely.LineString, [*strokes, bar]))
+    style: dict[str, Any] = {"cap_style": "square", "join_style": "mitre", "mitre_limit": 1.5}
+    outline = shapely.union_all(shapely.buffer(lines, width_mm / 2, **style))
     x_min, y_min, x_max, y_max = outline.bounds
     centred = affinity.translate(outline, -(x_min + x_max) / 2, -(y_min + y_max) / 2)
     return affinity.scale(centred, xfact=-1, origin=(0, 0))
@@ -319,7 +341,7 @@ class Plan:
         """Stretches where tracks of different depths lie over each other, leads included."""
         stretches = []
         for layer in range(max(self.layer_indices)):
-            shallow = [fibre for fibre, index in enumerate(self.layer_indices) if index == layer]
+            shallow = self.layer_fibres(layer)
             deep = [fibre for fibre, index in enumerate(self.layer_indices) if index > layer]
             lines = [[shapely.get_coordinates(self.lines[fibre]) for fibre in fibres] for fibres in (shallow, deep)]
             shared = common_stretches(*lines, self.settings.mould.ridge_width_mm)
@@ -347,11 +369,11 @@ class Plan:
         mould, highest_mm = self.settings.mould, self.heights_mm[-1]
         return max(mould.silicone_mm, highest_mm + COVER_MM if highest_mm > mould.deep_ridge_height_mm else 0)
 
-    def outline(self, layer: int, below_mm: float = 0.0, tolerance_mm: float | None = None) -> BaseGeometry:
-        """Draw the outline of a layer's ridges, mm, their ends inside the walls.
+    def outline(self, fibres: Sequence[int], below_mm: float = 0.0, tolerance_mm: float | None = None) -> BaseGeometry:
+        """Draw the outline of the ridges of some fibres, mm, their ends inside the walls.
 
         Args:
-            layer: layer index.
+            fibres: their indices.
             below_mm: distance below the ridges' tops.
             tolerance_mm: greatest deviation; None for that of the settings.
         """
@@ -362,14 +384,18 @@ class Plan:
         lines = self.lines
         if tolerance_mm is not None:
             lines = [shapely.LineString(path) for path in self.paths(_CENTRE_SHARE * tolerance_mm, INTO_WALL_MM)]
-        lines = [line for line, index in zip(lines, self.layer_indices, strict=True) if index == layer]
+        lines = [lines[fibre] for fibre in fibres]
         bands = shapely.buffer(lines, half, quad_segs=math.ceil(math.pi / 2 / chord), cap_style="flat")
         return shapely.union_all(bands).simplify(_OUTLINE_SHARE * tolerance)
+
+    def layer_fibres(self, layer: int) -> list[int]:
+        """Return the indices of the fibres of a layer, ascending."""
+        return [fibre for fibre, index in enumerate(self.layer_indices) if index == layer]
 
     @cached_property
     def ridges(self) -> tuple[BaseGeometry, ...]:
         """Outlines of the tops of the ridges of every layer, mm."""
-        return tuple(map(self.outline, range(len(self.heights_mm))))
+        return tuple(self.outline(self.layer_fibres(layer)) for layer in range(len(self.heights_mm)))
 
     @cached_property
     def numbers(self) -> list[BaseGeometry | None]:
@@ -501,7 +527,7 @@ class FibreLayer:
 def fibre_layers(plan: Plan) -> list[FibreLayer]:
     """Return the layers of a plan in the order of fibre placement, the deepest first."""
     indices = range(len(plan.heights_mm))
-    fibres = [tuple(fibre for fibre, index in enumerate(plan.layer_indices) if index == layer) for layer in indices]
+    fibres = [tuple(plan.layer_fibres(layer)) for layer in indices]
     families = [plan.family(members[0]) for members in fibres]
     layers = []
     for index, family in enumerate(families):

@@ -4,11 +4,8 @@ A ring is cut at corners, at the ends of straight edges and where the curvature 
 is an arc if one fits, else a cubic spline whose ends are exact and tangent to what follows smoothly. Lengths are mm.
 """
 
-import math
-from bisect import bisect_right
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field, replace
-from functools import cached_property
+from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
@@ -46,77 +43,27 @@ _ALONG = 20
 
 @dataclass(frozen=True, eq=False)
 class OutlineCurve:
-    """A smooth run of an outline from s = 0 to `length`, the arc length along its vertices.
+    """A smooth run of an outline: a straight line unless it has an arc or a spline.
 
     Attributes:
         points: vertices, of a straight run its two ends; shape (n, 2).
-        spline: cubic spline over s; None for lines and arcs.
+        spline: cubic spline over the arc length along the vertices; None for lines and arcs.
         arc: arc; None for lines and splines.
-        z_range: heights between which the wall of the outline stands, mm, if known.
-        length: length along the vertices.
     """
 
     points: Array
     spline: BSpline | None = None
     arc: Arc | None = None
-    z_range: tuple[float, float] = (math.inf, -math.inf)
-    length: float = field(init=False)
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "length", float(arc_lengths(self.points)[-1]))
-
-    def evaluate(self, s: float) -> tuple[float, float, float, float]:
-        """Return x, y and their derivatives by s, at arc length s."""
-        if self.spline is not None:
-            return self._evaluate_spline(s)
-        if self.arc is not None:
-            x, y, radius, start, sweep = self.arc
-            angle, speed = start + sweep * s / self.length, radius * sweep / self.length
-            cos, sin = math.cos(angle), math.sin(angle)
-            return x + radius * cos, y + radius * sin, -speed * sin, speed * cos
-        (x0, y0), (x1, y1) = self._coefficients[1]
-        dx, dy = (x1 - x0) / self.length, (y1 - y0) / self.length
-        return x0 + s * dx, y0 + s * dy, dx, dy
-
-    def _evaluate_spline(self, s: float) -> tuple[float, float, float, float]:
-        """De Boor's algorithm on plain floats, several times as fast as SciPy for one place."""
-        t, poles = self._coefficients
-        k = min(max(bisect_right(t, s) - 1, 3), len(t) - 5)
-        (x0, y0), (x1, y1), (x2, y2), (x3, y3) = poles[k - 3 : k + 1]
-        a = (s - t[k - 2]) / (t[k + 1] - t[k - 2])
-        b = (s - t[k - 1]) / (t[k + 2] - t[k - 1])
-        c = (s - t[k]) / (t[k + 3] - t[k])
-        x0, y0, x1, y1 = x0 + a * (x1 - x0), y0 + a * (y1 - y0), x1 + b * (x2 - x1), y1 + b * (y2 - y1)
-        x2, y2 = x2 + c * (x3 - x2), y2 + c * (y3 - y2)
-        a = (s - t[k - 1]) / (t[k + 1] - t[k - 1])
-        b = (s - t[k]) / (t[k + 2] - t[k])
-        x0, y0, x1, y1 = x0 + a * (x1 - x0), y0 + a * (y1 - y0), x1 + b * (x2 - x1), y1 + b * (y2 - y1)
-        span = t[k + 1] - t[k]
-        a = (s - t[k]) / span
-        return x0 + a * (x1 - x0), y0 + a * (y1 - y0), 3 * (x1 - x0) / span, 3 * (y1 - y0) / span
-
-    @cached_property
-    def _coefficients(self) -> tuple[list[float], list[list[float]]]:
-        """Knots and poles of a spline; ends of a line."""
-        if self.spline is not None:
-            return self.spline.t.tolist(), self.spline.c.tolist()
-        return [], self.points[[0, -1]].tolist()
 
 
-def find_joints(plan: Plan, layer: int, half_mm: float) -> Joints:
-    """Return the joints of the walls `half_mm` beside the fibres of a layer.
-
-    A fibre's curvature jumps at its knots, and so does that of its track's walls.
-    """
-    joints: Joints = {}
-    for fibre, (knots, slope) in enumerate(zip(plan.pad.to_mm(plan.pad.knots), slopes(plan.pad), strict=True)):
-        if plan.layer_indices[fibre] == layer:
-            along = np.stack([np.ones_like(slope), slope], axis=1)[:, :: -1 if plan.family(fibre) else 1]
-            along /= np.linalg.norm(along, axis=1, keepdims=True)
-            offset = half_mm * np.stack([-along[:, 1], along[:, 0]], axis=1)
-            for points in (knots + offset, knots - offset):
-                joints |= zip(map(tuple, points.tolist()), along, strict=True)
-    return joints
+def find_joints(plan: Plan, fibre: int, half_mm: float) -> Joints:
+    """Return the joints of the walls `half_mm` beside a fibre: its curvature jumps at its knots, and so does theirs."""
+    knots, slope = plan.pad.to_mm(plan.pad.knots[fibre]), slopes(plan.pad)[fibre]
+    along = np.stack([np.ones_like(slope), slope], axis=1)[:, :: -1 if plan.family(fibre) else 1]
+    along /= np.linalg.norm(along, axis=1, keepdims=True)
+    offset = half_mm * np.stack([-along[:, 1], along[:, 0]], axis=1)
+    walls = np.vstack([knots + offset, knots - offset])
+    return dict(zip(map(tuple, walls.tolist()), np.vstack([along, along]), strict=True))
 
 
 def insert_joints(area: BaseGeometry, joints: Joints) -> BaseGeometry:
@@ -132,23 +79,6 @@ def _insert_vertices(ring: Array, points: Array) -> Array:
     s = np.concatenate([arc_lengths(ring), shapely.line_locate_point(line, shapely.points(near))])
     vertices = np.vstack([ring, near])[np.argsort(s, kind="stable")]
     return vertices[np.linalg.norm(vertices - np.roll(vertices, 1, axis=0), axis=1) > 1e-9]
-
-
-def outline_curves(
-    area: BaseGeometry, joints: Joints, z_range: tuple[float, float], fit_mm: float
-) -> list[OutlineCurve]:
-    """Return the curves of all rings of an area that is drawn within `FINE_MM`, splines within `fit_mm` of the rings.
-
-    At joints the curvature jumps; the wall of the outline stands between two heights `z_range`, mm.
-    """
-    curves = (curve for rings in polygon_rings(area) for ring in rings for curve in ring_curves(ring, joints, fit_mm))
-    return [replace(curve, z_range=z_range) for curve in curves]
-
-
-def edge_curves(lines: BaseGeometry) -> list[OutlineCurve]:
-    """Return every edge of lines or rings as a curve of its own."""
-    paths = (shapely.get_coordinates(line) for line in shapely.get_parts(lines))
-    return [OutlineCurve(points[i : i + 2]) for points in paths for i in range(len(points) - 1)]
 
 
 def ring_curves(ring: Array, joints: Joints, fit_mm: float) -> Iterator[OutlineCurve]:

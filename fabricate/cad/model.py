@@ -1,260 +1,322 @@
-"""CAD models of what is printed: named and coloured parts with exact curves, in one assembly.
+"""CAD models of what is printed, by build123d: one named and coloured solid for the tray, every ridge and number.
 
-A mould is built face by face from its plan, without Boolean operations. A lid or holder, which has few faces, is built
-by build123d. Importing this module loads the CAD kernel (OCP), which takes half a second: import it where it is used.
+A ridge is the extrusion of its exact outline. It reaches into the floor and the walls, and ridges overlap where they
+cross, so that every solid can be filleted, shelled or moved by itself, and their union is the mould.
 """
 
 # pyright: reportAttributeAccessIssue=false
 # The CAD kernel's modules come without types.
 
-import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+import subprocess
+import sys
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import partial
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
-from OCP.BRepAdaptor import BRepAdaptor_Surface
-from OCP.BRepCheck import BRepCheck_Analyzer
+from build123d import (
+    Color,
+    Compound,
+    Edge,
+    Face,
+    GeomType,
+    Location,
+    Plane,
+    Shell,
+    Solid,
+    Vector,
+    Wire,
+    export_brep,
+    export_step,
+    import_brep,
+)
 from OCP.BRepGProp import BRepGProp
-from OCP.GeomAbs import GeomAbs_Cylinder, GeomAbs_Plane, GeomAbs_SurfaceOfExtrusion
 from OCP.GProp import GProp_GProps
 from OCP.Standard import Standard_Failure
-from OCP.TopAbs import TopAbs_FACE, TopAbs_REVERSED
-from OCP.TopExp import TopExp_Explorer
-from OCP.TopoDS import TopoDS
 from shapely import affinity
-from shapely.geometry.base import BaseGeometry
 
 from padforge.common.plotting import HORIZONTAL, VERTICAL
 from padforge.common.validation import InputError
 from padforge.design.morphology import Morphology
+from padforge.fabricate.mesh import build_mesh
 from padforge.fabricate.mould import (
     BODY_COLOURS,
-    INTO_FLOOR_MM,
     Body,
     Prism,
     conductive_plan,
-    registration_pins,
-    well_outlines,
+    fibre_wells,
+    number_prisms,
+    ridge_prisms,
+    tray_body,
 )
-from padforge.fabricate.plan import Plan, polygon_rings
+from padforge.fabricate.plan import Plan, fibre_name, polygon_rings
 from padforge.fabricate.settings import DEFAULTS, FabricationSettings
 
-from .curves import fit_arc
-from .planar_map import HORIZONTAL_TRACKS, TRAY, VERTICAL_TRACKS, compute_contact_area, fill_cells
-from .solids import build_solids
-from .step_file import CadPart
-
-if TYPE_CHECKING:
-    from build123d import Compound, Solid
-    from manifold3d import Manifold
+from .curves import FINE_MM, OutlineCurve, find_joints, fit_arc, insert_joints, ring_curves
 
 FIT_TOLERANCES_MM = (2e-3, 5e-4, 1e-4)
 """Tolerances of curves against the finely drawn outlines; the next is tried where the kernel finds a solid invalid.
 
-Curves that hardly cross may meet in another order than the outlines they replace; finer ones do not.
+Curves that hardly meet may cross where the outlines that they replace do not; finer ones do not.
 """
-_PART_COLOURS = {TRAY: BODY_COLOURS["mould"], HORIZONTAL_TRACKS: HORIZONTAL, VERTICAL_TRACKS: VERTICAL}
-_GREY = "#5D6B7A"
+FUSE_S = 60.0
+"""Time limit for one solid of all."""
+_FUSE = """\
+import sys, build123d
+first, *others = map(build123d.import_brep, sys.argv[2:])
+build123d.export_brep(first.fuse(*others), sys.argv[1])
+"""
+"""Program that writes the union of files to its first argument."""
+_NUMBER_COLOUR = "#5D6B7A"
 _WELL_SIDES = 512
 """Sides of the polygons that stand for the round wells until these become arcs."""
 _MIN_CIRCLE_CORNERS = 32
 """Polygons of fewer corners are no circles."""
+MAX_DEVIATION = 2e-4
+"""Maximum relative deviation of a ridge's volume from that of its mesh."""
+MAX_BODY_DEVIATION = 5e-4
+"""The same for a lid with its round holes, which are polygons in the mesh, and all else of few prisms."""
+_AREA_TOLERANCE = 1e-2
+"""Relative error asked for of areas; it selects an adaptive integration, which is far more accurate."""
+_INTO_TERRACE_MM = 0.005
+"""Overlap of a terrace with the one below, so that no two faces coincide."""
 _SPACING_MM = 10.0
 """Distance between bodies that stand side by side."""
-_AREA_TOLERANCE = 1e-2
-"""Relative error asked for of areas; it selects an adaptive integration that is faster and far more accurate."""
+_TIMESTAMP = "2000-01-01T00:00:00"
+"""STEP files must carry a time; this one makes their bytes reproducible."""
 
 
 @dataclass(frozen=True)
-class CadModel:
-    """CAD model of a printed body.
+class CadPart:
+    """A part of a printed body.
 
     Attributes:
-        part: body, or assembly of its parts, which touch and do not overlap.
-        contact_mm2: area where parts touch.
+        shape: named and coloured; a solid, or an assembly of solids.
+        deviation: maximum relative deviation of a solid's volume from that of its prisms as a mesh.
         fit_mm: tolerance of curves against outlines that are drawn within `FINE_MM`; 0 without curves.
     """
 
-    part: CadPart
-    contact_mm2: float = 0.0
+    shape: Solid | Compound
+    deviation: float
     fit_mm: float = 0.0
 
-    @property
-    def shape(self) -> "Compound":
-        """The model as a build123d `Compound` with labels and colours."""
-        return _to_build123d(self.part)
 
-    def compare(self, mesh: "Manifold") -> tuple[float, float]:
-        """Return the relative deviations of volume and surface area from those of a mesh of the same body."""
-        volume_mm3, area_mm2 = _measure(self.part.compound)
-        area_mm2 -= 2 * self.contact_mm2
-        return abs(volume_mm3 / mesh.volume() - 1), abs(area_mm2 / mesh.surface_area() - 1)
-
-
-def _measure(shape: Any) -> tuple[float, float]:
-    """Return volume and surface area of a shape of the kernel, mm³ and mm².
-
-    By the divergence theorem the volume is the integral of z n_z over the surface. Upright walls have n_z = 0, so that
-    a mould's volume follows from its planes; only shapes with cones need the kernel's slower integral.
-    """
-    volume_mm3, area_mm2, explorer = 0.0, 0.0, TopExp_Explorer(shape, TopAbs_FACE)
-    while explorer.More():
-        face, properties = TopoDS.Face(explorer.Current()), GProp_GProps()
-        BRepGProp.SurfaceProperties_s(face, properties, _AREA_TOLERANCE)
-        area_mm2 += properties.Mass()
-        surface = BRepAdaptor_Surface(face, False)
-        if surface.GetType() == GeomAbs_Plane:
-            up = surface.Plane().Axis().Direction().Z() * (-1 if face.Orientation() == TopAbs_REVERSED else 1)
-            volume_mm3 += up * properties.Mass() * properties.CentreOfMass().Z()
-        elif surface.GetType() not in (GeomAbs_Cylinder, GeomAbs_SurfaceOfExtrusion):
-            volume_mm3 = math.nan
-        explorer.Next()
-    if math.isnan(volume_mm3):
-        BRepGProp.VolumeProperties_s(shape, properties := GProp_GProps())
-        volume_mm3 = properties.Mass()
-    return volume_mm3, area_mm2
-
-
-def build_mould(pad: Morphology, settings: FabricationSettings = DEFAULTS) -> "Compound":
-    """Build the CAD model of a mould: tray, horizontal tracks, vertical tracks, numbers and pins, named and coloured.
+def build_mould(pad: Morphology, settings: FabricationSettings = DEFAULTS, *, fused: bool = False) -> Compound | Solid:
+    """Build the CAD model of a mould: the tray, every ridge, as "horizontal 1", and the numbers, named and coloured.
 
     Args:
         pad: fibres.
         settings: tray, ridges and fibre.
+        fused: return one solid instead, which may take a minute.
 
     Returns:
-        Assembly of closed solids, mm, which touch and do not overlap.
+        Assembly of closed solids, mm. Ridges reach into the floor and overlap where they cross.
 
     Raises:
-        InputError: settings that contradict each other or refuse this pad, or no valid solid comes out.
+        InputError: settings that contradict each other or refuse this pad, or no valid solid comes out; for one solid,
+            not within `FUSE_S`.
     """
     plan = Plan(pad, settings)
     plan.require_levels()
-    return build_mould_model(plan.shrinkage_compensated, "mould").shape
+    parts = mould_parts(plan.shrinkage_compensated, "mould")
+    return fuse(parts, "mould") if fused else assemble({"mould": parts}, plan.shrinkage_compensated)
 
 
-def build_mould_model(plan: Plan, name: str, wells: Sequence[BaseGeometry] = ()) -> CadModel:
-    """Build the CAD model of the mould of a plan of what is printed, with wells that belong to its ridges, if any.
+def mould_parts(plan: Plan, name: str) -> list[CadPart]:
+    """Build the parts of the mould of a plan of what is printed; one with wells if it is called "conductive".
 
     Raises:
         InputError: the CAD kernel finds a solid invalid at every tolerance.
     """
-    for fit_mm in FIT_TOLERANCES_MM:
-        cells, fills = fill_cells(plan, fit_mm, wells)
-        solids = _build_valid({part: partial(build_solids, cells, z_ranges) for part, z_ranges in fills.items()})
-        if solids:
-            break
-    else:
-        raise InputError(f"{name}: the CAD kernel finds a solid invalid; leave step out of the formats")
-    parts = [CadPart(part, _PART_COLOURS.get(part, _GREY), shapes) for part, shapes in solids.items()]
-    contact = compute_contact_area(cells, fills)
-    if plan.settings.mould.pins:
-        pins = [replace(pin, bottom_mm=pin.bottom_mm + INTO_FLOOR_MM) for pin in registration_pins(plan)]
-        parts.append(CadPart("pins", _GREY, tuple(solid.wrapped for solid in prism_solids(pins))))
-        contact += sum(pin.area.area for pin in pins)
-    return CadModel(CadPart(name, children=tuple(parts)), contact, fit_mm)
+    parts = [_build_part("tray", BODY_COLOURS["mould"], tray_body(plan), name)]
+    parts += [_ridge_part(plan, fibre, name) for fibre in range(plan.pad.layout.fibres)]
+    numbers = [
+        _build_part(f"number {fibre}", _NUMBER_COLOUR, Body((prism,)), name)
+        for fibre, prism in enumerate(number_prisms(plan), 1)
+        if prism
+    ]
+    if numbers:
+        shape = Compound(label="numbers", children=[number.shape for number in numbers])
+        parts.append(CadPart(shape, max(number.deviation for number in numbers)))
+    return parts
 
 
-def build_body_model(body: Body, name: str) -> CadModel:
-    """Build the CAD model of a body of few prisms: a lid or a holder.
+def _build_part(name: str, colour: str, body: Body, of: str) -> CadPart:
+    """Build a part by Boolean operations of its prisms; `of` is the printed body that it belongs to."""
+    solid = body_solid(body)
+    if not (isinstance(solid, Solid) and solid.is_valid):
+        raise InputError(f"{of}: the CAD kernel finds its {name} invalid; leave step out of the formats")
+    deviation = abs(solid.volume / build_mesh(body).volume() - 1)
+    if not deviation <= MAX_BODY_DEVIATION:  # NaN fails as well
+        share = f"volume {100 * deviation:.3g} % off"
+        raise InputError(f"{of}: the CAD solid of its {name} does not match its mesh ({share}); nothing was written")
+    return CadPart(_label(solid, name, colour), deviation)
 
-    Raises:
-        InputError: the CAD kernel finds the solid invalid.
+
+def _label(shape: Solid, name: str, colour: str) -> Solid:
+    shape.label, shape.color = name, Color(colour)
+    return shape
+
+
+def _ridge_part(plan: Plan, fibre: int, of: str) -> CadPart:
+    """Build the ridge of a fibre at the first tolerance that gives a valid solid of its mesh's volume.
+
+    The mesh is that of the finely drawn outlines: those that are printed are drawn within the mould's tolerance, which
+    leaves a thousandth of a narrow ridge's volume open.
     """
-    solids = _build_valid({name: lambda: [solid.wrapped for solid in body_solid(body).solids()]})
-    if not solids:
-        raise InputError(f"{name}: the CAD kernel finds the solid invalid; leave step out of the formats")
-    return CadModel(CadPart(name, BODY_COLOURS[name], solids[name]))
+    name, colour = fibre_name(plan, fibre), (HORIZONTAL, VERTICAL)[plan.family(fibre)]
+    top = plan.outline([fibre], 0.0, FINE_MM)
+    top = top | fibre_wells(plan, fibre, _WELL_SIDES) if of == "conductive" else top
+    prisms = ridge_prisms(plan, [fibre], top, FINE_MM)
+    volume_mm3 = build_mesh(Body(tuple(prisms))).volume()
+    for fit_mm in FIT_TOLERANCES_MM:
+        try:
+            solid = _ridge_solid(plan, fibre, prisms, fit_mm)
+        except (Standard_Failure, RuntimeError, ValueError):  # the kernel's, and build123d's about what it was given
+            continue
+        deviation = abs(_upright_volume(solid) / volume_mm3 - 1)
+        if isinstance(solid, Solid) and solid.is_valid and deviation <= MAX_DEVIATION:
+            has_curves = any(face.geom_type == GeomType.EXTRUSION for face in solid.faces())
+            return CadPart(_label(solid, name, colour), deviation, fit_mm if has_curves else 0.0)
+    raise InputError(f"{of}: the CAD kernel finds the ridge of {name} invalid; leave step out of the formats")
 
 
-def build_models(plan: Plan, bodies: Mapping[str, Body]) -> list[CadModel]:
-    """Build the CAD models of all bodies of a pad, in their order; moulds are built from the plan of the pad as used.
+def _upright_volume(solid: Solid) -> float:
+    """Return the volume of a solid whose faces are horizontal or upright, mm³.
+
+    By the divergence theorem it is the integral of z n_z over the surface. The kernel's own integral over the volume is
+    off by up to 3e-3 where outlines have hundreds of edges; its adaptive one over a face is not.
+    """
+    volume_mm3 = 0.0
+    for face in solid.faces().filter_by(Plane.XY):
+        BRepGProp.SurfaceProperties_s(face.wrapped, properties := GProp_GProps(), _AREA_TOLERANCE)
+        volume_mm3 += face.normal_at().Z * face.center().Z * properties.Mass()
+    return volume_mm3
+
+
+def _ridge_solid(plan: Plan, fibre: int, prisms: Sequence[Prism], fit_mm: float) -> Solid:
+    """Build a ridge from its terraces, drawn within `FINE_MM`, the upper first; each stands on the one below."""
+    *upper, lowest = prisms
+    solid, below = _extrude(plan, fibre, lowest, fit_mm), lowest
+    for prism in reversed(upper):
+        solid = solid.fuse(_extrude(plan, fibre, replace(prism, bottom_mm=below.top_mm - _INTO_TERRACE_MM), fit_mm))
+        below = prism
+    return solid
+
+
+def _extrude(plan: Plan, fibre: int, prism: Prism, fit_mm: float) -> Solid:
+    """Extrude the face inside the exact outline of a terrace of a fibre's ridge, which is one polygon."""
+    mould = plan.settings.mould
+    below_mm = mould.floor_mm + plan.heights_mm[plan.layer_indices[fibre]] - prism.top_mm
+    joints = find_joints(plan, fibre, mould.ridge_width_mm / 2 + below_mm * plan.settings.ridge_slope)
+    (rings,) = polygon_rings(insert_joints(prism.area, joints))
+    curves = [ring_curves(ring, joints, fit_mm) for ring in rings]
+    outer, *holes = [Wire([_edge(curve, prism.bottom_mm) for curve in ring]) for ring in curves]
+    face = Face(outer, holes)
+    return Solid.extrude(face, Vector(0, 0, prism.top_mm - prism.bottom_mm))
+
+
+def _edge(curve: OutlineCurve, z: float) -> Edge:
+    """Return the edge of an outline's curve at a height; it begins and ends exactly at the outline's vertices."""
+    start, end = [(x, y, z) for x, y in curve.points[[0, -1]].tolist()]
+    if curve.spline is not None:
+        return Edge.make_bspline([(x, y, z) for x, y in curve.spline.c.tolist()], curve.spline.t.tolist(), 3)
+    if curve.arc is not None:
+        x, y, radius, angle, sweep = curve.arc
+        middle = angle + sweep / 2
+        return Edge.make_three_point_arc(start, (x + radius * np.cos(middle), y + radius * np.sin(middle), z), end)
+    return Edge.make_line(start, end)
+
+
+def build_parts(plan: Plan, bodies: Mapping[str, Body]) -> dict[str, list[CadPart]]:
+    """Build the parts of all bodies of a pad, in their order; moulds are built from the plan of the pad as used.
 
     Raises:
         InputError: the CAD kernel finds a solid invalid.
     """
-    models = []
+    built = {}
     for name, body in bodies.items():
         if name == "mould":
-            models.append(build_mould_model(plan.shrinkage_compensated, name))
+            built[name] = mould_parts(plan.shrinkage_compensated, name)
         elif name == "conductive":
-            second = conductive_plan(plan).shrinkage_compensated
-            models.append(build_mould_model(second, name, well_outlines(second, sides=_WELL_SIDES)))
+            built[name] = mould_parts(conductive_plan(plan).shrinkage_compensated, name)
         else:
-            models.append(build_body_model(body, name))
-    return models
+            built[name] = [_build_part(name, BODY_COLOURS[name], body, name)]
+    return built
 
 
-def assemble(models: Sequence[CadModel], plan: Plan) -> CadPart:
-    """Return the assembly of all bodies, the mould first: the lid on the rim of the mould, the others side by side."""
-    if len(models) == 1:
-        return models[0].part
-    x_mm, parts = 0.0, []
-    for part in (model.part for model in models):
-        x_min, x_max = _x_range(part)
-        if part.name == "lid":
-            position = (0.0, 0.0, plan.settings.mould.floor_mm + plan.silicone_mm)
+def assemble(bodies: Mapping[str, Sequence[CadPart]], plan: Plan) -> Compound:
+    """Assemble all bodies, the mould first: the lid on the rim of the mould, the others side by side."""
+    shapes = [
+        Compound(label=name, children=[part.shape for part in parts]) if len(parts) > 1 else parts[0].shape
+        for name, parts in bodies.items()
+    ]
+    if len(shapes) == 1:
+        return shapes[0]
+    x_mm = shapes[0].bounding_box().max.X
+    for shape in shapes[1:]:
+        box = shape.bounding_box()
+        if shape.label == "lid":
+            shape.locate(Location((0.0, 0.0, plan.settings.mould.floor_mm + plan.silicone_mm)))
         else:
-            position = (x_mm - x_min if parts else 0.0, 0.0, 0.0)
-            x_mm = position[0] + x_max + _SPACING_MM
-        parts.append(replace(part, position_mm=position))
-    return CadPart("moulds of the pad", children=tuple(parts))
+            shape.locate(Location((x_mm + _SPACING_MM - box.min.X, 0.0, 0.0)))
+            x_mm = shape.bounding_box().max.X
+    return Compound(label="moulds of the pad", children=shapes)
 
 
-def _build_valid(builders: Mapping[str, Callable[[], Iterable[Any]]]) -> dict[str, tuple[Any, ...]] | None:
-    """Return the solids of every part, or None if the kernel finds one invalid or cannot build it."""
+def write_step(path: Path, shape: Compound | Solid) -> None:
+    """Write a shape with its names and colours as a STEP file, mm; the same bytes for the same shapes.
+
+    Raises:
+        OSError: the file cannot be written.
+    """
     try:
-        solids = {part: tuple(build()) for part, build in builders.items()}
-    except (Standard_Failure, RuntimeError, ValueError):  # the kernel's, and build123d's about what it was given
-        return None
-    return solids if all(is_valid(solid) for part in solids.values() for solid in part) else None
+        export_step(shape, path, write_pcurves=False, timestamp=_TIMESTAMP)  # curves on surfaces double the size
+    except RuntimeError as error:
+        raise OSError("the CAD kernel could not write it: is the disk full?") from error
 
 
-def is_valid(solid: Any) -> bool:
-    """Tell whether the CAD kernel finds a solid valid: closed, with faces within their tolerances."""
-    return BRepCheck_Analyzer(solid, True, True).IsValid()
+def fuse(parts: Sequence[CadPart], name: str) -> Solid:
+    """Unite the parts of a body into one solid; the kernel does so in a process that can be ended.
+
+    Raises:
+        InputError: the kernel does not make one valid solid within `FUSE_S`.
+    """
+    with TemporaryDirectory() as folder:
+        solids = [solid for part in parts for solid in part.shape.solids()]
+        paths = [Path(folder) / f"{k}.brep" for k in range(len(solids))]
+        for path, solid in zip(paths, solids, strict=True):
+            export_brep(solid, path)
+        whole = Path(folder) / "whole.brep"
+        with suppress(subprocess.SubprocessError):
+            subprocess.run(
+                [sys.executable, "-c", _FUSE, whole, *paths], timeout=FUSE_S, check=True, capture_output=True
+            )
+        shape = import_brep(whole) if whole.exists() else None
+    solids = shape.solids() if shape else []
+    if len(solids) != 1 or not solids[0].is_valid:
+        raise InputError(f"{name}: the CAD kernel makes no single solid of it within {FUSE_S:g} s; use the parts")
+    return _label(solids[0], name, BODY_COLOURS[name])
 
 
-def _x_range(part: CadPart) -> tuple[float, float]:
-    from OCP.Bnd import Bnd_Box
-    from OCP.BRepBndLib import BRepBndLib
-
-    box = Bnd_Box()
-    BRepBndLib.AddOptimal_s(part.compound, box)
-    return box.CornerMin().X(), box.CornerMax().X()
-
-
-def _to_build123d(part: CadPart) -> "Compound":
-    from build123d import Color, Compound, Location, Solid
-
-    shape = Compound([Solid(solid) for solid in part.solids]) if part.solids else Compound()
-    shape.label = part.name
-    shape.children = [_to_build123d(child) for child in part.children]
-    if part.colour:
-        shape.color = Color(part.colour)
-    return shape.locate(Location(part.position_mm))
-
-
-def body_solid(body: Body) -> Any:
+def body_solid(body: Body) -> Solid | Compound:
     """Build the `Solid` of a body by Boolean operations of its prisms, or the `Compound` of several; mm."""
-    solid: Any
-    solid, *others = prism_solids(body.base)
+
+    def solids(prisms: Iterable[Prism]) -> Iterator[Solid]:
+        return (solid for prism in prisms for solid in prism_solids(prism))
+
+    solid, *others = solids(body.base)
     if others:
         solid = solid.fuse(*others)
     if body.cuts:
-        solid = solid.cut(*prism_solids(body.cuts))
-    return solid.fuse(*prism_solids(body.adds)) if body.adds else solid
+        solid = solid.cut(*solids(body.cuts))
+    return solid.fuse(*solids(body.adds)) if body.adds else solid
 
 
-def prism_solids(prisms: Iterable[Prism]) -> list["Solid"]:
-    """Build one `Solid` for every polygon of every prism; circles become cylinders and cones."""
-    return [solid for prism in prisms for solid in _prism_solids(prism)]
-
-
-def _prism_solids(prism: Prism) -> list["Solid"]:
-    from build123d import Face, Plane, Solid, Vector, Wire
+def prism_solids(prism: Prism) -> list[Solid]:
+    """Build one `Solid` for every polygon of a prism; circles become cylinders and cones."""
 
     def wire(ring: np.ndarray, z: float) -> Wire:
         return Wire.make_polygon([Vector(x, y, z) for x, y in ring.tolist()], close=True)
@@ -276,4 +338,9 @@ def _prism_solids(prism: Prism) -> list["Solid"]:
     scale = 1 + 2 * prism.flare_mm / (high - low)
     flared = affinity.scale(prism.area, *scale, origin=tuple((low + high) / 2))
     (((bottom,),), ((top,),)) = polygons, polygon_rings(flared)
-    return [Solid.make_loft([wire(bottom, prism.bottom_mm), wire(top, prism.top_mm)], ruled=True)]
+    low_points, high_points = (
+        [Vector(x, y, z) for x, y in ring.tolist()] for ring, z in ((bottom, prism.bottom_mm), (top, prism.top_mm))
+    )
+    sides = [[low_points[k - 1], low_points[k], high_points[k], high_points[k - 1]] for k in range(len(bottom))]
+    planes = [Face(Wire.make_polygon(points, close=True)) for points in (low_points, high_points, *sides)]
+    return [Solid(Shell(planes))]  # a loft would have splines for planes

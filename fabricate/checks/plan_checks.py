@@ -204,7 +204,9 @@ def _check_silicone_wall(plan: Plan) -> Finding:
     around = plan.cavity.buffer(2 * pitch, join_style="mitre")
     if plan.pillars.area:
         around = without(around, plan.pillars)
-    silicones = [without(around, plan.outline(layer, height)) for layer, height in enumerate(plan.heights_mm)]
+    silicones = [
+        without(around, plan.outline(plan.layer_fibres(layer), height)) for layer, height in enumerate(plan.heights_mm)
+    ]
     patches = [find_thin_patches(silicone, limit, plan.cavity) for silicone in silicones]
     positions = _points_in(chain(*patches))
     low, high, regions = limit, pitch, [plan.cavity] * len(silicones)

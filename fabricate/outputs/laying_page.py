@@ -128,7 +128,7 @@ def _adhesive(plan: Plan) -> dict[str, Any]:
     steps = []
     for layer in fibre_layers(plan):
         tapered = layer.depth_mm / 2 if plan.settings.ridge_slope else 0
-        outline = plan.outline(layer.index, tapered) if tapered else plan.ridges[layer.index]
+        outline = plan.outline(layer.fibres, tapered) if tapered else plan.ridges[layer.index]
         steps.append(overlap(outline, plan.silicone).area * layer.depth_mm / 1000)
     return {"name": "silicone adhesive", "volume_ml": round(sum(steps), 4), "steps_ml": [round(ml, 4) for ml in steps]}
 

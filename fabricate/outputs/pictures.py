@@ -57,7 +57,8 @@ _FAIL_MARKS, _WARN_MARKS = "osp8H", "D^v<>"
 def draw_mould(plan: Plan, vertices: ArrayLike, triangles: ArrayLike, findings: Sequence[Finding], path: Path) -> None:
     """Write the mesh of a mould from above as PNG: colour stands for family and height.
 
-    Rings mark where a check fails and diamonds where it warns; with more checks come further marks.
+    Every fibre has its number on the wall at both of its ends, to be read as the mould lies; those that are cast are
+    mirrored. Rings mark where a check fails and diamonds where it warns; with more checks come further marks.
 
     Args:
         plan: of the mould.
@@ -81,6 +82,12 @@ def draw_mould(plan: Plan, vertices: ArrayLike, triangles: ArrayLike, findings: 
     picture = _Picture(plan.tray.bounds, title, len(handles) + len(_remarks(findings)))
     corners = np.asarray(vertices, dtype=float)[np.asarray(triangles)]
     picture.show(corners, _mould_colours(plan, corners))
+    wall_mm = plan.settings.mould.wall_mm
+    past_mm, size = plan.corner_mm + plan.flare_mm - wall_mm / 2, min(0.8 * wall_mm, 0.6 * plan.min_pitch_mm)
+    for fibre, pair in enumerate(plan.leads.pairs):
+        colour = FAMILY_COLOURS[plan.family(fibre)]
+        for lead in pair:
+            picture.write(str(fibre + 1), lead.point_past_edge(past_mm), size, color=colour, weight="bold")
     picture.save(path, [*handles, *picture.mark(findings)])
 
 
@@ -92,7 +99,7 @@ def _mould_colours(plan: Plan, corners: Array) -> NDArray[np.str_]:
     raised = is_flat & (height > _FLAT) & (height < plan.silicone_mm - _FLAT)
     colours = np.where(is_flat & (height <= _FLAT), PAPER, np.where(raised, _NUMBER, FAINT))
     for layer in reversed(fibre_layers(plan)):  # taller ridges come later and cover lower ones
-        base = plan.outline(layer.index, plan.heights_mm[layer.index])
+        base = plan.outline(layer.fibres, plan.heights_mm[layer.index])
         colours[raised & shapely.contains_xy(base, x, y)] = layer.colour
     return colours
 

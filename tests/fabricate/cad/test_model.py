@@ -4,33 +4,31 @@
 # The CAD kernel's modules come without types.
 
 import math
-from itertools import combinations, product
-from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
+from build123d import Axis, Color, Compound, Solid, import_step
 from OCP.Standard import Standard_Failure
 from scipy.spatial import KDTree
 
+from padforge.common.plotting import HORIZONTAL, VERTICAL
 from padforge.common.validation import InputError
 from padforge.design.morphology import Morphology
 from padforge.design.paths.curves import lengths
 from padforge.fabricate.cad import model as of_model
 from padforge.fabricate.cad.model import (
     FIT_TOLERANCES_MM,
-    CadModel,
+    CadPart,
     assemble,
-    build_models,
     build_mould,
-    build_mould_model,
+    build_parts,
+    mould_parts,
+    write_step,
 )
 from padforge.fabricate.mesh import build_mesh
 from padforge.fabricate.mould import conductive_plan, holder_body, lid_body, mould_body, well_outlines
 from padforge.fabricate.plan import Plan
 from tests.fabricate.planted import exact_fibre, level_pad, winding_pad, with_settings
-
-if TYPE_CHECKING:
-    from build123d import Compound
 
 PLAIN: dict[str, object] = {"wall_draft_deg": 0.0, "exit_mm": 0.0, "number_mm": 0.0}
 
@@ -39,77 +37,85 @@ SOFT = winding_pad((0.3, 1.0), (0.6, 1.5), (0.9, 1.35), (1.3, 0.6), (1.7, 1.0))
 """A fibre without tight bends that leaves the pad straight on."""
 
 
-def part(model: CadModel, name: str) -> "Compound":
-    (found,) = (child for child in model.shape.children if child.label == name)
-    return found
+def shapes_of(parts: list[CadPart]) -> dict[str, Solid | Compound]:
+    return {part.shape.label: part.shape for part in parts}
 
 
-def judged(plan: Plan, **wells) -> CadModel:
-    """The model of a plan's mould, valid and as large as its mesh."""
-    model = build_mould_model(plan.shrinkage_compensated, "mould", **wells)
-    assert all(solid.is_valid for solid in model.shape.solids())
-    apart = model.compare(build_mesh(mould_body(plan.shrinkage_compensated, **wells)))
-    assert max(apart) < 2e-4, apart
-    return model
+def judged(plan: Plan, name: str = "mould") -> dict[str, Solid | Compound]:
+    """The shapes of a plan's mould by name: valid solids of the mesh's volumes."""
+    parts = mould_parts(plan.shrinkage_compensated, name)
+    assert all(solid.is_valid for part in parts for solid in part.shape.solids())
+    assert max(part.deviation for part in parts) < 2e-4
+    return shapes_of(parts)
+
+
+def upright_area(solid: Solid | Compound) -> float:
+    return sum(face.area for face in solid.faces() if abs(face.normal_at().Z) < 0.5)
 
 
 @pytest.mark.parametrize(("draft_deg", "deep"), [(0.0, "vertical"), (20.0, "horizontal")])
-def test_mould_model_of_a_straight_pad_has_closed_form_volumes(draft_deg, deep):
-    settings = with_settings(PLAIN | {"wall_draft_deg": draft_deg}, pad={"deep_family": deep})
-    plan = Plan(Morphology.straight(2), settings)
-    slope = math.tan(math.radians(draft_deg))
-    inner, ridge, lean = 33.75, 0.4, 2 * 6 * slope
-    behind = 2 * ridge * slope * 2 / 2  # where the wall leans off a ridge's end, times its height squared
+def test_mould_of_a_straight_pad_has_closed_form_volumes(draft_deg, deep):
+    """Ridges reach 0.2 mm into the floor, 0.5 mm into the walls, and through each other."""
+    plan = Plan(Morphology.straight(2), with_settings(PLAIN | {"wall_draft_deg": draft_deg}, pad={"deep_family": deep}))
+    inner, lean = 33.75, 2 * 6 * math.tan(math.radians(draft_deg))
     rim = inner + lean
     tray = (rim + 4) ** 2 * 8 - 6 * (inner**2 + inner * rim + rim**2) / 3
-    deeper = 2 * inner * ridge * 1.2 + behind * 1.2**2
-    shallow = 2 * (inner - 2 * ridge) * ridge * 0.4 + behind * 0.4**2  # the taller ones go through
-    model, other = judged(plan), {"horizontal": "vertical", "vertical": "horizontal"}[deep]
-    volumes = {child.label: child.volume for child in model.shape.children}
-    expected = {"tray": tray, f"{deep} tracks": deeper, f"{other} tracks": shallow}
-    assert volumes == pytest.approx(expected, rel=1e-9)
-    assert build_mould(plan.pad, plan.settings).volume == pytest.approx(sum(expected.values()), rel=1e-9)
-    assert max(model.compare(build_mesh(mould_body(plan)))) < 1e-7
-    assert all(face.geom_type.name == "PLANE" for face in model.shape.faces())
-    footprint = 2 * (inner + inner - 2 * ridge) * ridge
-    crossings, ends = 4 * 2 * ridge * 0.4, 2 * 2 * ridge * (1.2 + 0.4) * math.hypot(1, slope)
-    assert model.contact_mm2 == pytest.approx(footprint + crossings + ends, rel=1e-6)
+    heights = {family: 1.2 if family == deep else 0.4 for family in ("horizontal", "vertical")}
+    ridges = {
+        f"{family} {number}": (inner + 2 * 0.5) * 0.4 * (height + 0.2)
+        for family, height in heights.items()
+        for number in (1, 2)
+    }
+    shapes = judged(plan)
+    assert {name: shape.volume for name, shape in shapes.items()} == pytest.approx({"tray": tray} | ridges, rel=1e-9)
+    assert all(face.geom_type.name == "PLANE" for shape in shapes.values() for face in shape.faces())
+    fused = build_mould(plan.pad, plan.settings, fused=True)
+    assert isinstance(fused, Solid)
+    assert fused.volume == pytest.approx(build_mesh(mould_body(plan)).volume(), rel=1e-6)
 
 
-def test_mould_model_walls_are_as_long_as_exact_offsets():
+def test_ridge_walls_are_as_long_as_exact_offsets():
     """Where a bend is wider than half the track, the offsets to the left and right are together as long as two fibres.
 
     So are each by itself where a fibre leaves the pad as it came: what one gains in a bend the other loses.
     """
-    plan = Plan(SOFT, with_settings(PLAIN))
-    model = judged(plan)
-    length = SOFT.unit_mm * float(lengths(SOFT)[0])
-    tracks = part(model, "horizontal tracks")
-    upright = [face for face in tracks.faces() if abs(face.normal_at().Z) < 0.5]
-    ends = 2 * 0.4 * 1.2
-    assert sum(face.area for face in upright) == pytest.approx(2 * length * 1.2 + ends, rel=5e-5)
+    ridge = judged(Plan(SOFT, with_settings(PLAIN)))["horizontal 1"]
+    length, height = SOFT.unit_mm * float(lengths(SOFT)[0]) + 2 * 0.5, 1.2 + 0.2
+    assert upright_area(ridge) == pytest.approx(2 * length * height + 2 * 0.4 * height, rel=5e-5)
     mean_mm = 2.4e-4  # of how far walls lie off, of 2 µm allowed
-    assert tracks.volume == pytest.approx(length * 0.4 * 1.2, rel=mean_mm / 0.4)
-    curved = sum(face.area for face in upright if face.geom_type.name in ("EXTRUSION", "CYLINDER"))
-    assert curved > 0.9 * (2 * length * 1.2 - 2 * 2 * 3.0 * 1.2)  # the fibre begins and ends 3 mm straight
+    assert ridge.volume == pytest.approx(length * 0.4 * height, rel=mean_mm / 0.4)
 
 
 @pytest.mark.parametrize(
     ("pad", "mould"),
     [(SOFT, {}), pytest.param(Morphology.random(1, 6, seed=3), {"ridge_width_mm": 0.8}, marks=pytest.mark.slow)],
 )
-def test_mould_model_edges_are_half_a_width_from_exact_fibres(pad, mould):
-    """Thousands of places on the kernel's own curves, on the floor, against scipy's own PCHIP."""
+def test_ridge_edges_are_half_a_width_from_exact_fibres(pad, mould):
+    """Thousands of places on the kernel's own curves, against scipy's own PCHIP."""
     plan = Plan(pad, with_settings(PLAIN | mould))
     points = []
-    for edge in part(build_mould_model(plan, "mould"), "horizontal tracks").edges():
-        if edge.geom_type.name != "LINE" and abs(edge.center().Z - 2.0) < 1e-9:
+    for edge in judged(plan)["horizontal 1"].edges():
+        if edge.geom_type.name != "LINE":
             points += [(p.X, p.Y) for p in edge.positions(np.linspace(0, 1, 400).tolist())]
     inside = np.array(points)
     inside = inside[np.abs(inside[:, 0]) < plan.cavity.bounds[2] - 1.0]
     distance, _ = KDTree(exact_fibre(pad, 0)).query(inside)
     assert len(inside) > 2000
     assert np.abs(distance - plan.settings.mould.ridge_width_mm / 2).max() < 3e-3
+
+
+def test_ridge_can_be_filleted_and_shelled():
+    """As whoever opens the mould in CAD does first: its upper edges rounded, its inside taken out."""
+    ridge = judged(Plan(SOFT, with_settings({"ridge_width_mm": 1.0})))["horizontal 1"]
+    assert isinstance(ridge, Solid)
+    top = ridge.faces().sort_by(Axis.Z)[-1]
+    rounded = ridge.fillet(0.05, [*top.edges()])
+    assert rounded.is_valid
+    lost = (1 - math.pi / 4) * 0.05**2 * sum(edge.length for edge in top.edges())
+    assert ridge.volume - rounded.volume == pytest.approx(lost, rel=0.02)
+    shell = ridge.hollow([ridge.faces().sort_by(Axis.Z)[0]], -0.2)
+    assert shell.is_valid
+    assert 0.3 * ridge.volume < shell.volume < 0.7 * ridge.volume
 
 
 SETTINGS = {
@@ -144,58 +150,66 @@ RARE = {*SETTINGS, *ODD} - {*[*SETTINGS, *ODD][::5], NARROW}
 @pytest.mark.parametrize(
     "case", [pytest.param(case, marks=[pytest.mark.slow] if case in RARE else []) for case in [*SETTINGS, *ODD]]
 )
-def test_mould_models_are_valid_and_match_their_meshes(case):
+def test_moulds_are_valid_and_match_their_meshes(case):
     pad, mould = ODD.get(case) or (Morphology.random(1, 3, seed=5), SETTINGS[case])
-    model = judged(Plan(pad, with_settings(mould)))
-    assert case in ODD or model.fit_mm == FIT_TOLERANCES_MM[0]
+    judged(Plan(pad, with_settings(mould)))
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("grid", "knots", "seed"), [(3, 8, 0)])
-def test_mould_models_of_dense_pads_match_their_meshes(grid, knots, seed):
-    judged(Plan(Morphology.random(grid, knots, seed)))
+def test_mould_of_a_dense_pad_matches_its_mesh():
+    judged(Plan(Morphology.random(3, 8, 0)))
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["5para_dis"])
-def test_mould_models_of_published_pads_match_their_meshes(published, name):
+@pytest.mark.parametrize("name", ["5para_dis", "20para"])
+def test_moulds_of_published_pads_match_their_meshes(published, name):
     judged(Plan(Morphology.load(published / f"{name}.mat")))
 
 
-def test_mould_model_has_wells():
+def test_mould_for_conductive_material_has_wells():
     plan = conductive_plan(Plan(SOFT, with_settings({"conductive": True, "pins": True})))
-    model = judged(plan, wells=well_outlines(plan, sides=512))
-    plain = build_mould_model(plan, "mould")
-    for name in ("horizontal tracks", "vertical tracks"):  # the wells belong to their tracks
-        assert part(model, name).volume > part(plain, name).volume + 2 * 0.3 * math.pi * 1.5**2
-    assert part(model, "numbers").volume == pytest.approx(part(plain, "numbers").volume)
-    round_ = [face for face in part(model, "vertical tracks").faces() if face.geom_type.name == "CYLINDER"]
-    assert sum(face.area for face in round_) == pytest.approx(2 * (2 * math.pi * 1.5 - 2 * 0.4) * 0.4, rel=0.01)
+    wells, plain = judged(plan, "conductive"), judged(plan)
+    for name in ("horizontal 1", "vertical 1"):  # the wells belong to their ridges
+        assert wells[name].volume > plain[name].volume + 2 * 0.48 * math.pi * 1.5**2
+    assert wells["numbers"].volume == pytest.approx(plain["numbers"].volume)
+    round_ = [face for face in wells["vertical 1"].faces() if face.geom_type.name == "CYLINDER"]
+    assert sum(face.area for face in round_) == pytest.approx(2 * (2 * math.pi * 1.5 - 2 * 0.4) * 0.6, rel=0.01)
 
 
-def test_mould_model_parts_are_named_coloured_and_disjoint():
-    model = build_mould_model(Plan(SOFT, with_settings({"pins": True})), "mould")
-    assert model.shape.label == "mould"
-    children = list(model.shape.children)
-    assert [child.label for child in children] == ["tray", "horizontal tracks", "vertical tracks", "numbers", "pins"]
-    assert len({tuple(child.color) for child in children}) == 4  # numbers and pins are alike
-    assert all(child.volume > 0 for child in children)
-    for one, other in combinations(children, 2):
-        for a, b in product(one.solids(), other.solids()):
-            shared = a.intersect(b)
-            assert sum(each.volume for each in shared.solids()) < 1e-6 if shared else True
-    without = build_mould_model(Plan(SOFT, with_settings(PLAIN)), "mould").shape
-    assert [child.label for child in without.children] == ["tray", "horizontal tracks", "vertical tracks"]
+def test_mould_is_an_assembly_of_named_and_coloured_solids(tmp_path):
+    """In build123d, and as its STEP file reads back: one solid for the tray, every ridge and number."""
+    mould = build_mould(Morphology.random(4, 3, seed=1), with_settings({"pins": True, "number_mm": 1.5}))
+    ridges = [f"{family} {number}" for family in ("horizontal", "vertical") for number in range(1, 5)]
+    assert mould.label == "mould"
+    assert [child.label for child in mould.children] == ["tray", *ridges, "numbers"]
+    assert [child.label for child in mould.children[-1].children] == [f"number {k}" for k in range(1, 9)]
+    write_step(path := tmp_path / "mould.step", mould)
+    read = import_step(path)
+    assert read.is_valid
+    assert (read.label, len(read.children), len(read.solids())) == ("mould", 1 + 8 + 1, 1 + 8 + 8)
+    tray, *tracks, _ = read.children
+    assert [child.label for child in tracks] == [name.replace(" ", "_") for name in ridges]  # as build123d reads blanks
+    assert [[*child.color] for child in tracks] == [
+        pytest.approx([*Color(colour)], abs=2e-3) for colour in (HORIZONTAL, VERTICAL) for _ in range(4)
+    ]
+    for child, original in zip((tray, *tracks), mould.children, strict=False):
+        assert child.volume == pytest.approx(original.volume, rel=1e-4)
+    text = path.read_text(encoding="utf-8")
+    assert "2000-01-01T00:00:00" in text
+    assert path.stat().st_size < 1_000_000
 
 
-def test_mould_model_is_compensated_for_shrinkage():
+def test_build_mould_is_compensated_for_shrinkage():
     plan = Plan(SOFT, with_settings(silicone={"shrinkage": 0.02}))
-    model = judged(plan)
-    for shape in (model.shape, build_mould(SOFT, plan.settings)):
-        size = np.array([*shape.bounding_box().size])
-        assert size == pytest.approx(
-            [2 * plan.shrinkage_compensated.tray.bounds[2]] * 2 + [2.0 + plan.shrinkage_compensated.silicone_mm]
-        )
+    size = np.array([*build_mould(SOFT, plan.settings).bounding_box().size])
+    printed = plan.shrinkage_compensated
+    assert size == pytest.approx([2 * printed.tray.bounds[2]] * 2 + [2.0 + printed.silicone_mm])
+
+
+def test_build_mould_says_that_no_single_solid_comes_out(monkeypatch):
+    monkeypatch.setattr(of_model, "FUSE_S", 0.0)
+    with pytest.raises(InputError, match="the CAD kernel makes no single solid of it within 0 s; use"):
+        build_mould(Morphology.straight(1), fused=True)
 
 
 def test_assemble_places_bodies_side_by_side():
@@ -204,45 +218,42 @@ def test_assemble_places_bodies_side_by_side():
     wells = conductive_plan(plan)
     second = mould_body(wells, well_outlines(wells, sides=512))
     bodies = {"mould": mould_body(plan), "lid": lid_body(plan), "conductive": second, "holder": holder_body(wells)}
-    made = build_models(plan, bodies)
-    for name, model in zip(bodies, made, strict=True):
-        assert max(model.compare(build_mesh(bodies[name]))) < 5e-4  # a lid's mesh has polygons for circles
-    whole = assemble(made, plan)
-    assert [child.name for child in whole.children] == list(bodies)
-    shapes = {child.name: CadModel(child).shape for child in whole.children}
-    low = {name: [*shape.bounding_box().min] for name, shape in shapes.items()}
-    high = {name: [*shape.bounding_box().max] for name, shape in shapes.items()}
-    assert low["lid"][2] == pytest.approx(8.0)
-    assert high["mould"][2] == pytest.approx(10.0)
-    assert low["lid"][:2] == pytest.approx(low["mould"][:2])
-    assert low["conductive"][0] == pytest.approx(high["mould"][0] + 10)
-    assert low["holder"][0] == pytest.approx(high["conductive"][0] + 10)
-    assert CadModel(whole).shape.is_valid
+    built = build_parts(plan, bodies)
+    assert max(part.deviation for parts in built.values() for part in parts) < 5e-4  # meshes have polygons for circles
+    whole = assemble(built, plan)
+    assert [child.label for child in whole.children] == list(bodies)
+    boxes = {child.label: child.bounding_box() for child in whole.children}
+    assert pytest.approx(8.0) == boxes["lid"].min.Z
+    assert pytest.approx(10.0) == boxes["mould"].max.Z
+    assert pytest.approx(boxes["mould"].min.X) == boxes["lid"].min.X
+    assert pytest.approx(boxes["mould"].max.X + 10) == boxes["conductive"].min.X
+    assert pytest.approx(boxes["conductive"].max.X + 10) == boxes["holder"].min.X
 
 
-def test_build_models_needs_no_room_for_absent_wells():
+def test_build_parts_needs_no_room_for_absent_wells():
     """Wells would find no room there, but nobody asked for any."""
     plan = Plan(Morphology.straight(1, pitch_mm=5.0))
     with pytest.raises(InputError, match="exit_width_mm"):
         conductive_plan(plan)
-    (made,) = build_models(plan, {"mould": mould_body(plan)})
-    assert made.shape.is_valid
+    assert [*build_parts(plan, {"mould": mould_body(plan)})] == ["mould"]
 
 
 @pytest.mark.parametrize(("failures", "fit_mm"), [(1, FIT_TOLERANCES_MM[1]), (1000, None)])
-def test_build_mould_model_fits_finer_curves_until_solids_are_valid(monkeypatch, failures, fit_mm):
+def test_ridges_are_fitted_finer_until_they_are_valid(monkeypatch, failures, fit_mm):
     """Planted: the kernel fails at the first tries."""
-    build, tries = of_model.build_solids, []
+    extrude, tries = Solid.extrude, []
 
-    def fail_first(*arguments):
-        tries.append(arguments)
+    def fail_first(face, direction):
+        tries.append(face)
         if len(tries) <= failures:
             raise Standard_Failure("")
-        return build(*arguments)
+        return extrude(face, direction)
 
-    monkeypatch.setattr(of_model, "build_solids", fail_first)
+    monkeypatch.setattr(Solid, "extrude", fail_first)
+    monkeypatch.setattr(of_model, "body_solid", lambda body: Solid.make_box(1, 1, build_mesh(body).volume()))
     if fit_mm:
-        assert build_mould_model(Plan(Morphology.straight(1)), "mould").fit_mm == fit_mm
+        parts = mould_parts(Plan(SOFT), "mould")
+        assert [part.fit_mm for part in parts[1:2]] == [fit_mm]
     else:
-        with pytest.raises(InputError, match=r"^second: the CAD kernel finds a solid invalid; leave step out"):
-            build_mould_model(Plan(Morphology.straight(1)), "second")
+        with pytest.raises(InputError, match=r"^second: the CAD kernel finds the ridge of horizontal 1 invalid; leave"):
+            mould_parts(Plan(SOFT), "second")

@@ -11,6 +11,7 @@ from padforge.design.morphology import Morphology
 from padforge.fabricate.cad.curves import (
     FINE_MM,
     OutlineCurve,
+    arc_lengths,
     find_joints,
     fit_spline,
     insert_joints,
@@ -29,17 +30,27 @@ FINE = 64
 """Segments of a quarter of a circle: the rings are drawn within FINE_MM of circles of a few mm."""
 
 
-def values(piece: OutlineCurve, s: Array | float) -> Array:
-    """Points and derivatives at arc lengths (...,), shape (..., 4)."""
-    return np.array([piece.evaluate(float(each)) for each in np.ravel(s)]).reshape(*np.shape(s), 4)
+def length(piece: OutlineCurve) -> float:
+    """Arc length along the vertices of a piece, up to which its parameter runs."""
+    return float(arc_lengths(piece.points)[-1])
 
 
 def at(piece: OutlineCurve, s: Array | float) -> Array:
-    return values(piece, s)[..., :2]
+    """Points at arc lengths (...,), shape (..., 2)."""
+    share = np.asarray(s)[..., None] / length(piece)
+    if piece.spline is not None:
+        return piece.spline(s)
+    if piece.arc is not None:
+        x, y, radius, start, sweep = piece.arc
+        angle = start + sweep * share
+        return (x, y) + radius * np.concatenate([np.cos(angle), np.sin(angle)], axis=-1)
+    return (1 - share) * piece.points[0] + share * piece.points[-1]
 
 
-def tangent(piece: OutlineCurve, s: Array | float) -> Array:
-    return values(piece, s)[..., 2:]
+def tangent(piece: OutlineCurve, s: float) -> Array:
+    """Direction at one of the ends, by a difference within the piece."""
+    step = 1e-7 * length(piece)
+    return (at(piece, s + step) - at(piece, s)) if s == 0 else (at(piece, s) - at(piece, s - step))
 
 
 def ring(area: shapely.Polygon) -> Array:
@@ -48,32 +59,31 @@ def ring(area: shapely.Polygon) -> Array:
 
 def turns(pieces: list[OutlineCurve]) -> Array:
     """Degrees that the direction turns by where one piece follows another, all round."""
-    ends = np.array([tangent(piece, piece.length) for piece in pieces])
+    ends = np.array([tangent(piece, length(piece)) for piece in pieces])
     starts = np.array([tangent(piece, 0) for piece in [*pieces[1:], pieces[0]]])
     cross = ends[:, 0] * starts[:, 1] - ends[:, 1] * starts[:, 0]
     return np.degrees(np.abs(np.arctan2(cross, (ends * starts).sum(axis=1))))
 
 
 def gaps(pieces: list[OutlineCurve]) -> Array:
-    ends = np.array([at(piece, piece.length) for piece in pieces])
+    ends = np.array([at(piece, length(piece)) for piece in pieces])
     return np.linalg.norm(ends - [at(piece, 0) for piece in [*pieces[1:], pieces[0]]], axis=1)
 
 
-def walls(plan: Plan, level: int, fit_mm: float = FIT_MM) -> list[list[OutlineCurve]]:
-    """The pieces of every ring of the tracks of a level."""
-    at = find_joints(plan, level, plan.settings.mould.ridge_width_mm / 2)
-    outline = insert_joints(plan.outline(level, 0.0, FINE_MM), at)
+def walls(plan: Plan, fibre: int, fit_mm: float = FIT_MM) -> list[list[OutlineCurve]]:
+    """The pieces of every ring of the ridge of a fibre."""
+    at = find_joints(plan, fibre, plan.settings.mould.ridge_width_mm / 2)
+    outline = insert_joints(plan.outline([fibre], 0.0, FINE_MM), at)
     return [list(ring_curves(each, at, fit_mm)) for rings in polygon_rings(outline) for each in rings]
 
 
-def deviation(plan: Plan, level: int, fit_mm: float = FIT_MM) -> tuple[float, int]:
-    """How far walls stray from half a width beside the nearest fibre, mm, and at how many places that was looked at."""
-    sampled = [at(piece, np.linspace(0, piece.length, 400)) for own in walls(plan, level, fit_mm) for piece in own]
+def deviation(plan: Plan, fibre: int, fit_mm: float = FIT_MM) -> tuple[float, int]:
+    """How far walls stray from half a width beside their fibre, mm, and at how many places that was looked at."""
+    sampled = [at(piece, np.linspace(0, length(piece), 400)) for own in walls(plan, fibre, fit_mm) for piece in own]
     points = np.concatenate(sampled)
     clear = plan.cavity.bounds[2] - 1.0  # near the walls ends of tracks are square
     points = points[np.abs(points).max(axis=1) < clear]
-    exact = [exact_fibre(plan.pad, fibre) for fibre, own in enumerate(plan.layer_indices) if own == level]
-    distance, _ = KDTree(np.concatenate(exact)).query(points)
+    distance, _ = KDTree(exact_fibre(plan.pad, fibre)).query(points)
     return float(np.abs(distance - plan.settings.mould.ridge_width_mm / 2).max()), len(points)
 
 
@@ -86,7 +96,7 @@ def test_ring_curves_of_a_circle_are_two_arcs(clockwise):
         assert piece.arc is not None
         assert piece.arc[:3] == pytest.approx((3, 4, 2), abs=1e-9)
     assert sum(piece.arc[4] for piece in pieces if piece.arc) == pytest.approx((-2 if clockwise else 2) * math.pi)
-    assert turns(pieces).max() < 1e-6
+    assert turns(pieces).max() < 1e-4
 
 
 @pytest.mark.parametrize("corners", [3, 12])
@@ -96,7 +106,7 @@ def test_ring_curves_of_a_polygon_are_its_edges(corners):
     pieces = list(ring_curves(ring(drawn), {}, FIT_MM))
     assert len(pieces) == corners
     assert all(piece.arc is None and piece.spline is None for piece in pieces)
-    assert sum(piece.length for piece in pieces) == pytest.approx(drawn.length)
+    assert sum(length(piece) for piece in pieces) == pytest.approx(drawn.length)
     assert sorted(turns(pieces)) == pytest.approx([360 / corners] * corners, abs=0.5)
 
 
@@ -106,7 +116,7 @@ def test_ring_curves_of_an_ellipse_are_closed_splines():
     pieces = list(ring_curves(drawn, {}, FIT_MM))
     assert all(piece.spline for piece in pieces)
     for piece in pieces:
-        x, y = at(piece, np.linspace(0, piece.length, 500)).T
+        x, y = at(piece, np.linspace(0, length(piece), 500)).T
         slope = np.hypot(x / 64, y / 9)
         assert np.abs((x**2 / 64 + y**2 / 9 - 1) / 2 / slope).max() < FIT_MM + FINE_MM
     assert gaps(pieces).max() < 1e-9
@@ -116,14 +126,14 @@ def test_ring_curves_of_an_ellipse_are_closed_splines():
 @pytest.mark.parametrize(("knots", "seed"), [(1, 0), (8, 2), pytest.param(20, 3, marks=pytest.mark.slow)])
 def test_track_outlines_close_and_turn_at_corners_only(knots, seed):
     plan = Plan(Morphology.random(1, knots, seed), with_settings({"border_mm": 2.0}))
-    for level in range(2):
-        for pieces in walls(plan, level):
+    for fibre in range(2):
+        for pieces in walls(plan, fibre):
             turned = turns(pieces)
             arcs = np.array([piece.arc is not None for piece in pieces])
             assert gaps(pieces)[~(arcs | np.roll(arcs, -1))].max(initial=0) < 1e-9
             assert gaps(pieces).max() < 1e-4  # an arc is through all vertices, about
             assert not ((turned > 0.1) & (turned < 5)).any()
-            square = np.abs(turned - 90) < 1e-6
+            square = np.abs(turned - 90) < 1e-3
             assert square.sum() in (0, 4)  # none round a hole that folds leave
 
 
@@ -137,8 +147,8 @@ def test_track_outlines_close_and_turn_at_corners_only(knots, seed):
 )
 def test_track_outlines_are_half_a_width_from_exact_fibres(grid, knots, seed, mould):
     plan = Plan(Morphology.random(grid, knots, seed), with_settings(mould))
-    for level in range(len(plan.heights_mm)):
-        off, count = deviation(plan, level)
+    for fibre in range(plan.pad.layout.fibres):
+        off, count = deviation(plan, fibre)
         assert off < 3e-3
         assert count > 500
 
