@@ -3,7 +3,7 @@
 # pyright: reportPrivateImportUsage=false  ezdxf does not mark as exported what its manual imports
 import io
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,7 +14,7 @@ import numpy as np
 
 from padforge.common.files import check_file, read_bytes
 from padforge.common.validation import InputError, short_repr
-from padforge.design.morphology import Array
+from padforge.design.morphology import Array, Ints
 
 if TYPE_CHECKING:
     from ezdxf.path import Path as BezierPath
@@ -25,7 +25,9 @@ FLATNESS = 1e-5  # largest distance of curve and polyline, relative to the size 
 
 _MAX_REASON = 120
 _FIBRES = re.compile(r"(fibre|fiber|horizontal|vertical)", re.IGNORECASE)
-_JOIN_TOLERANCE = 1e-6  # distance of ends that are one point, relative to the size of the drawing
+JOIN_MM = 0.01  # distance of ends that are joined, as programs round where pieces of a line meet
+_COINCIDENT = 1e-6  # distance of ends that are one point, relative to the size of the drawing
+_MAX_NAMED = 3
 
 
 @dataclass(frozen=True)
@@ -34,6 +36,7 @@ class DrawnCurve:
 
     name: str  # in the file, or kind and number
     points: Array  # vertices; shape (n, 2), in units of the drawing, y upwards
+    ends: Array  # as the file has them; shape (2, 2)
     groups: tuple[str, ...] = ()  # names of the curve and of all groups or layers that contain it
     closed: bool = False
 
@@ -43,17 +46,19 @@ class DrawnPlan:
     """Content of a drawing."""
 
     unit_mm: float = 1.0  # of the drawing
-    note: str = ""  # assumptions that were made
+    unit: str = "mm"  # name of the unit that the file states
+    notes: list[str] = field(default_factory=list)  # assumptions that were made, and what was left out
     curves: list[DrawnCurve] = field(default_factory=list)
+    n_hidden: int = 0
 
-    def add(self, name: str, points: Array, groups: Sequence[str] = (), closed: bool = False) -> None:
+    def add(self, name: str, points: Array, ends: Array, groups: Sequence[str] = (), closed: bool = False) -> None:
         """Add a `DrawnCurve` unless it is a single point; refuse coordinates beyond MAX_COORDINATE."""
         if not (np.abs(points) <= MAX_COORDINATE).all():
             raise InputError(f"{name}: coordinates that are no numbers or beyond {MAX_COORDINATE:g}")
         points = points[np.append(True, (np.diff(points, axis=0) != 0).any(axis=1))]
         if len(points) > 1:
             closed = closed or bool((points[0] == points[-1]).all())
-            self.curves.append(DrawnCurve(name, points, tuple(filter(None, groups)), closed))
+            self.curves.append(DrawnCurve(name, points, ends, tuple(filter(None, groups)), closed))
 
     @property
     def border(self) -> Array | None:
@@ -67,36 +72,37 @@ class DrawnPlan:
     @property
     def fibres(self) -> list[DrawnCurve]:
         """Curves named fibre, horizontal or vertical, or else all open ones, joined where one ends at another."""
-        named = [curve for curve in self.curves if any(map(_FIBRES.match, curve.groups))]
+        named, others = [], []
+        for curve in self.curves:
+            if any(map(_FIBRES.match, curve.groups)):
+                named.append(curve)
+            elif not curve.closed and not _is_pad(curve):
+                others.append(curve)
         for curve in named:
             if curve.closed:
                 raise InputError(f"{curve.name}: closed, expected a curve from one border of the pad to the other")
-        chosen = named or [curve for curve in self.curves if not curve.closed and not _is_pad(curve)]
-        return list(_join(chosen))
+        if named and others:
+            layers = dict.fromkeys(next(filter(_FIBRES.match, curve.groups)) for curve in named)
+            where = ", ".join(map(short_repr, list(layers)[:_MAX_NAMED]))
+            self.notes.append(f"open curves outside of {where}, which are left out: {len(others)}")
+        return list(_join(named or others, JOIN_MM / self.unit_mm))
 
 
 def _is_pad(curve: DrawnCurve) -> bool:
     return "pad" in (group.lower() for group in curve.groups)
 
 
-def _join(curves: list[DrawnCurve]) -> Iterator[DrawnCurve]:
-    """Join curves whose ends coincide."""
+def _join(curves: list[DrawnCurve], tolerance: float) -> Iterator[DrawnCurve]:
+    """Join curves whose ends coincide, or are no farther apart than the tolerance, where nothing coincides."""
     if not curves:
         return
-    from scipy.spatial import KDTree
-
     # 1. end 2 k is the start of curve k, end 2 k + 1 its end: which other end is each one joined to?
     ends = np.array([curve.points[end] for curve in curves for end in (0, -1)])
-    tolerance = _JOIN_TOLERANCE * max(float(np.ptp(ends, axis=0).max()), 1e-9)
-    nearest = KDTree(ends).query(ends, k=min(3, len(ends)), distance_upper_bound=tolerance)
-    partners: dict[int, int] = {}
-    for end, row in enumerate(zip(*(values.tolist() for values in nearest), strict=True)):
-        close = [other for distance, other in zip(*row, strict=True) if distance <= tolerance and other != end]
-        if len(close) > 1:
-            x, y = ends[end]
-            raise InputError(f"{curves[end // 2].name}: more than two curves end at ({x:g}, {y:g})")
-        if close:
-            partners[end] = close[0]
+    names = [curve.name for curve in curves]
+    partners = _pair_ends(ends, np.arange(len(ends)), _COINCIDENT * max(float(np.ptp(ends, axis=0).max()), 1e-9), names)
+    free = np.setdiff1d(np.arange(len(ends)), list(partners))
+    gaps = _pair_ends(ends, free, tolerance, names)
+    partners |= gaps
     # 2. walk from every free end to the other end of its chain
     remaining = set(range(len(curves)))
     for start in range(len(ends)):
@@ -109,11 +115,36 @@ def _join(curves: list[DrawnCurve]) -> Iterator[DrawnCurve]:
             remaining.discard(end // 2)
             end = partners.get(end ^ 1)
         first, last = curves[chain[0] // 2], curves[chain[-1] // 2]
-        points = np.vstack([curves[end // 2].points[:: 1 - 2 * (end % 2)] for end in chain])
-        yield DrawnCurve(first.name if len(chain) == 1 else f"{first.name} to {last.name}", points, first.groups)
+        pieces = [curves[end // 2].points[:: 1 - 2 * (end % 2)].copy() for end in chain]
+        for before, after, end in zip(pieces, pieces[1:], chain[1:], strict=False):
+            if end in gaps:
+                before[-1] = after[0] = (before[-1] + after[0]) / 2
+        name = first.name if len(chain) == 1 else f"{first.name} to {last.name}"
+        drawn_ends = np.array([first.ends[chain[0] % 2], last.ends[1 - chain[-1] % 2]])
+        yield DrawnCurve(name, np.vstack(pieces), drawn_ends, first.groups)
     if remaining:
         name = curves[min(remaining)].name
         raise InputError(f"{name}: part of a ring, or drawn twice, expected curves from border to border")
+
+
+def _pair_ends(ends: Array, candidates: Ints, tolerance: float, names: Sequence[str]) -> dict[int, int]:
+    """Return the other end within the tolerance of each of the candidates that has one."""
+    from scipy.spatial import KDTree
+
+    if len(candidates) < 2:
+        return {}
+    points = ends[candidates]
+    nearest = KDTree(points).query(points, k=min(3, len(points)), distance_upper_bound=tolerance)
+    partners: dict[int, int] = {}
+    for end, row in zip(candidates.tolist(), zip(*(values.tolist() for values in nearest), strict=True), strict=True):
+        close = [int(candidates[at]) for distance, at in zip(*row, strict=True) if distance <= tolerance]
+        close = [other for other in close if other != end]
+        if len(close) > 1:
+            x, y = ends[end]
+            raise InputError(f"{names[end // 2]}: more than two curves end at ({x:g}, {y:g})")
+        if close:
+            partners[end] = close[0]
+    return partners
 
 
 def _shorten(error: Exception) -> str:
@@ -133,6 +164,7 @@ def _flatten(path: "BezierPath") -> Array:
 _MM_PER_PIXEL = 25.4 / 96
 _TEMPLATES = {"symbol", "mask", "marker"}  # drawn only where they are used
 _CONTAINERS = {"a", "switch"}
+_LENGTHS = ("mm", "cm", "in", "pt", "pc", "m")
 _LABEL = "{http://www.inkscape.org/namespaces/inkscape}label"
 
 
@@ -141,20 +173,30 @@ def read_svg(path: Path) -> DrawnPlan:
     from svgelements import SVG, Matrix
 
     content = read_bytes(path, MAX_BYTES)
-    drawing = DrawnPlan()
+    drawing = DrawnPlan(unit="mm of its width and viewBox")
     try:
         tree = ElementTree.fromstring(content)
         if _kind(tree) != "svg":
             raise InputError(f"{path}: the root is <{_kind(tree)}>, expected <svg>")
         _adapt_tree(tree)
-        root: Any = SVG.parse(io.BytesIO(ElementTree.tostring(tree)), on_error="raise")
+        if not tree.get("width", "%").endswith(_LENGTHS) or "viewBox" not in tree.attrib:
+            drawing.unit = "pixels of 1/96 inch, as it states no other unit"
+        # Internal entities, as Illustrator declares them, are replaced by expat, which limits them.
+        root: Any = SVG.parse(io.BytesIO(ElementTree.tostring(tree)), on_error="raise", parse_display_none=True)
         # the drawing's own origin is the one that was drawn from, not the corner of the viewBox
-        origin = Matrix(root.viewbox_transform).point_in_matrix_space((0, 0))
-        for shape, groups in _iterate_shapes(root, ()):
+        to_pixels = Matrix(root.viewbox_transform)
+        to_file = ~to_pixels
+        origin = to_pixels.point_in_matrix_space((0, 0))
+        for shape, groups, is_hidden in _iterate_shapes(root, (), False):
             number = f"{shape.values['tag']} {len(drawing.curves) + 1}"
             name = next((group for group in reversed(groups) if group), number)
             for points, closed in _flatten_shape(shape):
-                drawing.add(name, (points - origin) * [_MM_PER_PIXEL, -_MM_PER_PIXEL], groups, closed)  # y points down
+                if is_hidden:
+                    drawing.n_hidden += 1
+                    continue
+                ends = np.array([tuple(to_file.point_in_matrix_space(tuple(points[end]))) for end in (0, -1)])
+                points_mm = (points - origin) * [_MM_PER_PIXEL, -_MM_PER_PIXEL]  # y points down
+                drawing.add(name, points_mm, ends, groups, closed)
     except InputError:
         raise
     except (ElementTree.ParseError, ValueError, ArithmeticError, LookupError, RecursionError, TypeError) as error:
@@ -183,17 +225,21 @@ def _adapt_tree(tree: Element) -> None:
                 child.set("d", "")
 
 
-def _iterate_shapes(container: Any, groups: tuple[str, ...]) -> Iterator[tuple[Any, tuple[str, ...]]]:
-    """Iterate over the lines that are drawn, in order, with the names of all that contains each."""
+def _iterate_shapes(
+    container: Any, groups: tuple[str, ...], is_hidden: bool
+) -> Iterator[tuple[Any, tuple[str, ...], bool]]:
+    """Iterate over the lines, in order, with the names of all that contains each, and whether it is hidden."""
     from svgelements import Group, Path, Polygon, Polyline, Rect, SimpleLine, Use
 
     for element in container:
         attributes = element.values["attributes"]
         names = (*groups, attributes.get("id", ""), attributes.get(_LABEL, ""))
+        # What a group does not display, nothing in it can; what it makes invisible, something in it may show.
+        is_none = is_hidden or element.values.get("display") == "none" or element.values.get("opacity") == "0"
         if isinstance(element, Group | Use):
-            yield from _iterate_shapes(element, names)
+            yield from _iterate_shapes(element, names, is_none)
         elif isinstance(element, Path | Polygon | Polyline | Rect | SimpleLine):
-            yield element, names
+            yield element, names, is_none or element.values.get("visibility") in ("hidden", "collapse")
 
 
 def _flatten_shape(shape: Any) -> Iterator[tuple[Array, bool]]:
@@ -220,10 +266,14 @@ def _flatten_shape(shape: Any) -> Iterator[tuple[Array, bool]]:
 
 
 _KINDS = ("LINE", "ARC", "LWPOLYLINE", "POLYLINE", "SPLINE", "ELLIPSE")
+_MAX_DEPTH = 8  # of blocks in blocks
 
 
 def read_dxf(path: Path) -> DrawnPlan:
-    """Read the curves of a DXF's modelspace, in $INSUNITS or mm; blocks, hatches and text are ignored."""
+    """Read the curves of a DXF's modelspace and of blocks inserted there, in $INSUNITS or mm.
+
+    Hatches, dimensions and text are ignored, and what is on a layer that is off or frozen.
+    """
     import ezdxf
     from ezdxf import path as paths
     from ezdxf import units
@@ -237,11 +287,14 @@ def read_dxf(path: Path) -> DrawnPlan:
         raise
     except Exception as error:  # ezdxf raises whatever a torn file leads it to
         raise InputError(f"{path}: not a DXF file that can be read ({_shorten(error)})") from error
-    drawing = DrawnPlan(unit_mm, note="" if unit else "the file says no unit: mm")
-    for number, entity in enumerate(document.modelspace(), 1):
-        if entity.dxftype() not in _KINDS:
+    unit_name = f"{units.unit_name(unit).lower()}, as $INSUNITS says" if unit else "mm, as it states no unit"
+    drawing = DrawnPlan(unit_mm, unit_name, notes=[] if unit else ["the file says no unit: mm"])
+    hidden = {layer.dxf.name.lower() for layer in document.layers if layer.is_off() or layer.is_frozen()}
+    for number, entity, layers in _iterate_entities(document.modelspace(), ()):
+        name = f"{entity.dxftype()} {number} of layer {short_repr(layers[-1])}"
+        if entity.dxf.get("invisible", 0) or any(layer.lower() in hidden for layer in layers):
+            drawing.n_hidden += 1
             continue
-        name = f"{entity.dxftype()} {number} of layer {short_repr(entity.dxf.layer)}"
         try:
             lines = [_flatten(part) for part in paths.make_path(entity).sub_paths()]
         except InputError as error:
@@ -249,5 +302,20 @@ def read_dxf(path: Path) -> DrawnPlan:
         except (ValueError, TypeError, ArithmeticError, LookupError, AttributeError, ezdxf.DXFError) as error:
             raise InputError(f"{name}: no curve ({_shorten(error)})") from error
         for points in lines:
-            drawing.add(name, points, (str(entity.dxf.layer),))
+            drawing.add(name, points, points[[0, -1]], layers)
     return drawing
+
+
+def _iterate_entities(entities: Iterable[Any], inserts: tuple[str, ...]) -> Iterator[tuple[int, Any, tuple[str, ...]]]:
+    """Iterate over the curves of a layout and of the blocks inserted in it, with their numbers and layers.
+
+    The layers of a curve in a block are also those of the block references, whose layer it has where its own is 0.
+    """
+    for number, entity in enumerate(entities, 1):
+        layer = str(entity.dxf.layer)
+        layers = inserts if layer == "0" and inserts else (*inserts, layer)
+        if entity.dxftype() == "INSERT" and len(inserts) < _MAX_DEPTH:
+            for reference in entity.multi_insert():
+                yield from _iterate_entities(reference.virtual_entities(), layers)
+        elif entity.dxftype() in _KINDS:
+            yield number, entity, layers

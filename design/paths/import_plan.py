@@ -1,22 +1,16 @@
-"""Import of a drawing as a pad: matching curves to fibres, and fitting knots to them.
-
-Knots are inserted where a curve turns and where the misfit is largest, then all are moved along and across by
-non-linear least squares (SciPy's), and removed one by one while the others suffice.
-"""
+"""Import of a drawing as a pad: its curves are placed on the pad, and each becomes a fibre."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
-
 import numpy as np
 import shapely
 
 from padforge.common.validation import InputError
-from padforge.design.kernels.pchip import pchip_slopes
-from padforge.design.morphology import Array, Ints, Morphology
+from padforge.design.morphology import Array, Morphology
 from padforge.design.paths.curves import add_spare_knots, flatten
 from padforge.design.paths.drawing_files import DrawnCurve, DrawnPlan, read_dxf, read_svg
+from padforge.design.paths.knot_fitting import fit_knots
 from padforge.design.settings import Layout
 
 READERS = {".svg": read_svg, ".dxf": read_dxf}
@@ -28,14 +22,23 @@ _MARGIN_MM = 1.0  # beyond this margin across the pad, curves are leads to its o
 _ASPECT_TOLERANCE = 2e-3  # largest relative difference in aspect ratio of the drawn border and the pad
 _FIT_SHARE = 0.8  # tolerance of the fit, relative to the stated one: the fit measures its misfit at samples only
 _FLATNESS_MM = 1e-3  # tolerance to which curves are compared
-SAMPLES = 700  # samples of a polyline
-_MAX_ROUNDS = 20  # fits, each within the room between the knots of the last
-_MIN_GAIN = 0.01  # relative gain in squared misfit from which another fit follows
-_MAX_STEP = 0.4  # largest shift of a knot along the axis in one fit, as a share of the way to its neighbour
-_TINY = 1e-12  # room of a knot that has none: bounds must differ
-_MAX_CANDIDATES = 4  # knots whose removal is tried, those with the smallest misfit first
-_SUPPORT = 3  # spans on either side of a knot that may depend on it, while it moves within one
-_MIN_SPAN = 2e-3  # smallest distance of knots along the axis, as a share of the curve's extent
+_SCALES = {
+    72 / 96: "points of 1/72 inch that were taken for 1/96 inch",
+    96 / 72: "pixels of 1/96 inch that were taken for points",
+    25.4: "it states inches and was drawn in mm",
+    1 / 25.4: "it states mm and was drawn in inches",
+    1000.0: "it states m and was drawn in mm",
+    1 / 1000: "it states mm and was drawn in m",
+    10.0: "it states cm and was drawn in mm",
+    1 / 10: "it states mm and was drawn in cm",
+    25.4 / 96: "it states no unit, which are pixels, and was drawn in mm",
+    96 / 25.4: "it states mm and was drawn in pixels",
+    90 / 96: "pixels of 1/96 inch that were drawn as 1/90 inch, by an old Inkscape",
+    300 / 96: "pixels of 1/96 inch that were drawn with 300 dots an inch",
+    25.4 / 72: "it states points and was drawn in mm",
+}
+"""Sizes of a drawing relative to the pad that programs make of others' units, and what they come from."""
+_SCALE_TOLERANCE = 0.03
 
 
 @dataclass(frozen=True)
@@ -63,6 +66,7 @@ class _FibrePath:
     name: str
     fibre: int  # the one whose ends are nearest
     points: Array  # along and across the fibre's axis, from border to border; shape (n, 2), mm from the middle
+    drawn: str  # where it begins and ends in the drawing
     error_mm: float  # largest distance of its ends to the fibre's
 
 
@@ -80,18 +84,37 @@ def import_plan(path: Path, layout: Layout, tolerance_mm: float) -> ImportedPlan
         drawing = reader(path)
         curves = drawing.fibres
         if not curves:
-            raise InputError("there is no open curve in it")
+            hidden = f" but {drawing.n_hidden} hidden ones" if drawing.n_hidden else ""
+            raise InputError(f"there is no open curve in it{hidden}")
         if len(curves) > MAX_CURVES_PER_FIBRE * layout.fibres:
             hint = "put these into a layer or group whose name begins with fibre"
             raise InputError(f"it has {len(curves)} open curves, expected {layout.fibres}, one a fibre; {hint}")
-        candidates, placement = _place_curves(drawing, curves, layout)
-        fibre_paths = _match_fibres(candidates, layout, tolerance_mm)
+        try:
+            candidates, placement = _place_curves(drawing, curves, layout)
+            fibre_paths = _match_fibres(candidates, layout, tolerance_mm)
+        except InputError as error:
+            raise InputError(f"{_describe_scale(drawing, curves, layout)}{error}") from error
         pad = Morphology.from_layout(_fit_paths(fibre_paths, layout, tolerance_mm), layout)
         lines = flatten(pad, _FLATNESS_MM / layout.unit_mm)
         fibres = [_check_fit(line, drawn, layout, tolerance_mm) for line, drawn in zip(lines, fibre_paths, strict=True)]
     except InputError as error:
         raise InputError(f"{path}: {str(error).removeprefix(f'{path}: ')}") from error
-    return ImportedPlan(pad, tuple(fibres), placement + (f"; {drawing.note}" if drawing.note else ""))
+    notes = [f"hidden curves, which are left out: {drawing.n_hidden}"] if drawing.n_hidden else []
+    return ImportedPlan(pad, tuple(fibres), "; ".join([placement, *drawing.notes, *notes]))
+
+
+def _describe_scale(drawing: DrawnPlan, curves: Sequence[DrawnCurve], layout: Layout) -> str:
+    """Say how large a drawing is that has another size than the pad, and what that may come from; else ""."""
+    if drawing.border is not None:
+        return ""
+    drawn_mm = np.ptp(np.vstack([curve.points for curve in curves]), axis=0) * drawing.unit_mm
+    ratio = float(drawn_mm.max() / max(layout.size_mm))
+    if abs(ratio - 1) < _SCALE_TOLERANCE:
+        return ""
+    cause = next((text for scale, text in _SCALES.items() if abs(ratio / scale - 1) < _SCALE_TOLERANCE), "")
+    sizes = [f"{width:.5g} by {height:.5g} mm" for width, height in (np.round(drawn_mm, 2), layout.size_mm)]
+    likely = f"a factor of {ratio:.4g}" + (f" ({cause}?)" if cause else "")
+    return f"its curves span {sizes[0]}, in {drawing.unit}, and the pad {sizes[1]}, {likely}; "
 
 
 def _place_curves(drawing: DrawnPlan, curves: Sequence[DrawnCurve], layout: Layout) -> tuple[list[_FibrePath], str]:
@@ -136,7 +159,7 @@ def _assign_curves(curves: Sequence[DrawnCurve], lines: Sequence[Array], layout:
         for family in (0, 1):
             if layout.counts[family]:
                 try:
-                    candidates.append(_assign_to_family(curve.name, line, family, layout))
+                    candidates.append(_assign_to_family(curve, line, family, layout))
                 except InputError as error:
                     errors.append((abs(np.diff(line[[0, -1], family])[0]), error))
         if not candidates:
@@ -145,8 +168,9 @@ def _assign_curves(curves: Sequence[DrawnCurve], lines: Sequence[Array], layout:
     return paths
 
 
-def _assign_to_family(name: str, line: Array, family: int, layout: Layout) -> _FibrePath:
+def _assign_to_family(curve: DrawnCurve, line: Array, family: int, layout: Layout) -> _FibrePath:
     """Clip a curve to the pad, and assign it to the nearest fibre of a family."""
+    name, drawn = curve.name, " to ".join(f"({x:.6g}, {y:.6g})" for x, y in curve.ends + 0.0)
     half_length, half_width = layout.size_mm[family] / 2, layout.size_mm[1 - family] / 2
     # 1. from the first to the last point on the pad
     dense = np.empty((2 * len(line) - 1, 2))  # with midpoints: a straight line may have no vertex on the pad
@@ -154,7 +178,7 @@ def _assign_to_family(name: str, line: Array, family: int, layout: Layout) -> _F
     along, across = dense[:, family], dense[:, 1 - family]
     inside = np.flatnonzero((np.abs(along) < half_length) & (np.abs(across) <= half_width + _MARGIN_MM))
     if not len(inside):
-        raise InputError(f"{name}: not on the pad of {layout}")
+        raise InputError(f"{name}: runs from {drawn} in the drawing, not on the pad of {layout}")
     part = slice(max(int(inside[0]) - 1, 0), int(inside[-1]) + 2)
     t, v = along[part], across[part]
     if t[0] > t[-1]:
@@ -177,7 +201,7 @@ def _assign_to_family(name: str, line: Array, family: int, layout: Layout) -> _F
     levels = (layout.levels[layout.families[family]] - layout.extent[1 - family] / 2) * layout.unit_mm
     number = int(np.argmin(np.abs(levels - ends.mean())))
     error_mm = max(missing, float(np.abs(ends - levels[number]).max()))
-    return _FibrePath(name, layout.families[family].start + number, points, error_mm)
+    return _FibrePath(name, layout.families[family].start + number, points, drawn, error_mm)
 
 
 def _match_fibres(paths: Sequence[_FibrePath], layout: Layout, tolerance_mm: float) -> list[_FibrePath]:
@@ -187,10 +211,9 @@ def _match_fibres(paths: Sequence[_FibrePath], layout: Layout, tolerance_mm: flo
         family = layout.family(path.fibre)
         name = _fibre_name(path.fibre, layout)
         if path.error_mm > tolerance_mm:
-            begin, end = (_format_position(path.points[at], family) for at in (0, -1))
             allowed = f"{tolerance_mm:g} mm (--tolerance-mm) on a pad of {layout}"
             error = f"{path.error_mm:.3g} mm from where {name} ends; allowed is {allowed}"
-            raise InputError(f"{path.name}: runs from {begin} to {end}, {error}")
+            raise InputError(f"{path.name}: runs from {path.drawn} in the drawing, {error}")
         if path.fibre in by_fibre:
             both = f"{by_fibre[path.fibre].name} and {path.name}"
             raise InputError(f"{both}: both are {name}, expected one curve a fibre")
@@ -242,139 +265,3 @@ def _fibre_name(fibre: int, layout: Layout) -> str:
 def _format_position(point: Array, family: int) -> str:
     x, y = point if family == 0 else point[::-1]
     return f"({x:.1f}, {y:.1f}) mm"
-
-
-def fit_knots(points: Array, tolerance: float, max_inner: int = 64) -> Array:
-    """Fit the knots (n, 2) of a PCHIP curve to a polyline; misfits are measured along the normal.
-
-    Args:
-        points: coordinates along, strictly ascending, and across; shape (m, 2).
-        tolerance: largest misfit, in the unit of the points.
-        max_inner: largest number of inner knots; with that many the tolerance may be exceeded.
-    """
-    samples, weight = _sample(points)
-    knots = samples[_find_turns(samples, tolerance)]
-    if len(knots) > max_inner + 2:  # more turns than knots
-        return np.vstack([knots[: max_inner + 1], knots[-1:]])
-    while True:
-        knots = _optimise(samples, weight, knots)
-        misfit = _misfit(samples, weight, knots)
-        if misfit.max() <= tolerance or len(knots) >= max_inner + 2:
-            break
-        knots = _insert_knots(samples, knots, misfit, tolerance, max_inner + 2 - len(knots))
-    return _remove_redundant(samples, weight, knots, tolerance)
-
-
-def _sample(points: Array) -> tuple[Array, Array]:
-    """Sample a polyline evenly (m, 2), and return the ratio of misfit along the normal to that across."""
-    arc = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(points, axis=0).T))])
-    at = np.linspace(0, arc[-1], SAMPLES)
-    samples = np.stack([np.interp(at, arc, points[:, axis]) for axis in (0, 1)], axis=1)
-    samples[-1] = points[-1]
-    samples = samples[np.append(True, samples[1:, 0] > np.maximum.accumulate(samples[:, 0])[:-1])]
-    slope = np.gradient(samples[:, 1], samples[:, 0]) if len(samples) > 1 else np.zeros(1)
-    return samples, 1 / np.sqrt(1 + slope**2)
-
-
-def _find_turns(samples: Array, tolerance: float) -> Ints:
-    """Find the samples at which the polyline turns back by more than the tolerance, and its ends.
-
-    A PCHIP curve turns only at knots.
-    """
-    across, turns, direction, extreme = samples[:, 1], [0], 0, 0
-    for k, value in enumerate(across):
-        further = value - across[extreme]
-        if direction == 0 and abs(value - across[0]) > tolerance:
-            direction, extreme = (1 if value > across[0] else -1), k
-        elif direction and further * direction >= 0:
-            extreme = k
-        elif direction and -further * direction > tolerance:
-            turns.append(extreme)
-            direction, extreme = -direction, k
-    return np.unique([*turns, len(samples) - 1])
-
-
-def _evaluate(knots: Array, along: Array) -> Array:
-    """Evaluate the PCHIP curve through knots at ascending coordinates."""
-    t, v = np.ascontiguousarray(knots[:, 0]), np.ascontiguousarray(knots[:, 1])
-    d = np.empty(len(t))
-    pchip_slopes(t, v, d)
-    span = np.clip(np.searchsorted(t, along, side="right") - 1, 0, len(t) - 2)
-    h = t[span + 1] - t[span]
-    s, rise = (along - t[span]) / h, v[span + 1] - v[span]
-    a, b = h * d[span], h * d[span + 1]
-    return v[span] + s * (a + s * (3 * rise - 2 * a - b + s * (a + b - 2 * rise)))
-
-
-def _misfit(samples: Array, weight: Array, knots: Array) -> Array:
-    """Return the misfit along the normal at each sample."""
-    return np.abs(_evaluate(knots, samples[:, 0]) - samples[:, 1]) * weight
-
-
-def _insert_knots(samples: Array, knots: Array, misfit: Array, tolerance: float, limit: int) -> Array:
-    """Insert up to `limit` knots, the worst first, each where a span's misfit is largest and above the tolerance."""
-    span = np.clip(np.searchsorted(knots[:, 0], samples[:, 0], side="right") - 1, 0, len(knots) - 2)
-    worst = []
-    for k in range(len(knots) - 1):
-        inside = np.flatnonzero(span == k)[1:]
-        if len(inside) and misfit[inside].max() > tolerance:
-            worst.append(int(inside[np.argmax(misfit[inside])]))
-    new = samples[sorted(worst, key=lambda at: -misfit[at])[:limit]]
-    if not len(new):  # spans shorter than the distance of samples
-        longest = int(np.argmax(np.diff(knots[:, 0])))
-        new = knots[longest : longest + 2].mean(axis=0, keepdims=True)
-    combined = np.vstack([knots, new])
-    return combined[np.argsort(combined[:, 0], kind="stable")]
-
-
-def _optimise(samples: Array, weight: Array, knots: Array) -> Array:
-    """Move the inner knots along and across by non-linear least squares, again and again while they gain by it."""
-    cost = np.inf
-    for _ in range(_MAX_ROUNDS if len(knots) > 2 else 0):
-        fit = _fit_within_room(samples, weight, knots)
-        knots = np.vstack([knots[:1], fit.x.reshape(-1, 2), knots[-1:]])
-        if fit.cost > (1 - _MIN_GAIN) * cost:
-            break
-        cost = fit.cost
-    return knots
-
-
-def _fit_within_room(samples: Array, weight: Array, knots: Array) -> Any:
-    """Fit inner knots that stay within a share of the way to their neighbours, so that they keep their order."""
-    from scipy.optimize import least_squares
-
-    along, across = samples.T
-
-    def residual(inner: Array) -> Array:
-        return (_evaluate(np.vstack([knots[:1], inner.reshape(-1, 2), knots[-1:]]), along) - across) * weight
-
-    min_span = _MIN_SPAN * (knots[-1, 0] - knots[0, 0])
-    room = _MAX_STEP * np.maximum(np.diff(knots[:, 0]) - min_span, 0) + _TINY
-    bounds = np.full((2, len(knots) - 2, 2), np.inf) * [[[-1]], [[1]]]
-    bounds[:, :, 0] = knots[1:-1, 0] - room[:-1], knots[1:-1, 0] + room[1:]
-    span = np.clip(np.searchsorted(knots[:, 0], along, side="right") - 1, 0, len(knots) - 2)
-    depends = np.abs(span[:, None] - np.arange(1, len(knots) - 1) + 0.5) < _SUPPORT
-    return least_squares(
-        residual,
-        knots[1:-1].ravel(),
-        bounds=bounds.reshape(2, -1),
-        jac_sparsity=np.repeat(depends, 2, axis=1),  # derivatives by knots without a span in common at once
-        x_scale="jac",
-        ftol=1e-3,
-        max_nfev=8,
-    )
-
-
-def _remove_redundant(samples: Array, weight: Array, knots: Array, tolerance: float) -> Array:
-    """Remove knots that the others do not need."""
-    while len(knots) > 2:
-        fewer = [np.delete(knots, k, axis=0) for k in range(1, len(knots) - 1)]
-        fewer.sort(key=lambda trial: _misfit(samples, weight, trial).max())
-        for trial in fewer[:_MAX_CANDIDATES]:
-            optimised = _optimise(samples, weight, trial)
-            if _misfit(samples, weight, optimised).max() <= tolerance:
-                knots = optimised
-                break
-        else:
-            break
-    return knots

@@ -1,7 +1,7 @@
 """MATLAB files of all versions and HDF5 files: their full matrices of real numbers, none of them from another file."""
 
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -13,12 +13,15 @@ from padforge.common.files import check_file
 from padforge.common.validation import InputError
 
 MAX_BYTES = 2**33  # size limit of a file
+_OBJECTS = ("cell", "char", "table", "timetable", "string", "datetime", "duration", "categorical")
+"""Classes of MATLAB 7.3 whose datasets hold no numbers, or numbers of something else."""
 
 
 class Hdf5Reader:
     """The datasets of an open HDF5 file.
 
-    Its `names` are the paths of the datasets that are reached without a link and have all values in the file.
+    Its `names` are the paths of the datasets that are reached without a link and have all values in the file, and of the
+    columns of tables among them.
     """
 
     def __init__(self, file: Any) -> None:
@@ -29,6 +32,8 @@ class Hdf5Reader:
         def visit(name: str, node: Any) -> None:
             if isinstance(node, h5py.Dataset) and not (node.is_virtual or node.external):
                 self._datasets[name] = node
+                for column in node.dtype.names or ():  # a table of named columns
+                    self._datasets[f"{name}/{column}"] = node.fields(column)
 
         file.visititems(visit)  # follows no links
         self.names = list(self._datasets)
@@ -47,15 +52,26 @@ class Hdf5Reader:
 
     def is_numeric(self, name: str) -> bool:
         """Whether a dataset holds real numbers or truth values."""
-        return self._datasets[name].dtype.kind in "fiub"
+        return self._datasets[name].dtype.base.kind in "fiub"
+
+    def describe(self, name: str) -> str:
+        """Return the shape and the type of a dataset, for people."""
+        dataset = self._datasets[name]
+        dtype = "table" if dataset.dtype.names else dataset.dtype
+        return f"{getattr(dataset, 'shape', ('n',))} {dtype}"
+
+    def matlab_class(self, name: str) -> str:
+        """Return the class that MATLAB 7.3 says a dataset is of; "" if none."""
+        attribute = getattr(self._datasets[name], "attrs", {}).get("MATLAB_class", b"")
+        return attribute.decode("ascii", "replace") if isinstance(attribute, bytes) else str(attribute)
 
     def read(self, name: str) -> NDArray[Any]:
         """Read the values of a dataset; raise InputError if they are no real numbers."""
         if (dataset := self._datasets.get(name)) is None:
             raise InputError(f"{name} is no dataset, expected one with all of its values in this file")
-        if dataset.size is None or not self.is_numeric(name):
+        if getattr(dataset, "size", 0) is None or not self.is_numeric(name):
             raise InputError(f"{name} holds {dataset.dtype} values, expected an array of real numbers")
-        return np.asarray(dataset)
+        return np.asarray(dataset[()])
 
 
 @contextmanager
@@ -98,15 +114,38 @@ def load_mat(path: Path, required: tuple[str, ...]) -> dict[str, Any]:
     return content
 
 
+def flatten_variables(content: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Return the variables of `load_mat` with the fields of structures by a dot, as `data.t`."""
+    flat = dict[str, Any]()
+    for name, value in content.items():
+        flat |= flatten_variables(value, f"{prefix}{name}.") if isinstance(value, dict) else {prefix + name: value}
+    return flat
+
+
 def _load_hdf5(path: Path) -> dict[str, Any]:
     """Read MATLAB 7.3: arrays are transposed, structures are groups, and #refs# holds what cell arrays refer to."""
     content = dict[str, Any]()
     with open_hdf5(path) as file:
-        for name in filter(file.is_numeric, file.names):
-            structure, _, field = name.rpartition("/")
-            if "/" not in structure and not structure.startswith("#"):
-                (content.setdefault(structure, {}) if structure else content)[field] = file.read(name).T
+        for name in file.names:
+            *structures, field = name.split("/")
+            if name.startswith("#"):
+                continue
+            node = content
+            for structure in structures:
+                node = node.setdefault(structure, {})
+            kind = file.matlab_class(name)
+            is_matrix = file.is_numeric(name) and kind not in _OBJECTS
+            node[field] = (
+                file.read(name).T if is_matrix else _name_object("a cell array" if kind == "cell" else kind, field)
+            )
     return content
+
+
+def _name_object(kind: str, name: str) -> str:
+    """Say what a variable is that is no matrix, and how MATLAB writes it for others."""
+    if kind in ("table", "timetable"):
+        return f"a {kind}, which only MATLAB reads: write{kind}({name}, '{name}.csv') there"
+    return kind if kind.startswith("a ") else f"of class {kind or 'unknown'}"
 
 
 def _load_matrices(path: Path) -> dict[str, Any]:
@@ -115,18 +154,21 @@ def _load_matrices(path: Path) -> dict[str, Any]:
 
     with warnings.catch_warnings(action="ignore"):  # variables of one name
         variables = scipy.io.loadmat(path, appendmat=False)
-    return {name: _to_plain(value) for name, value in variables.items() if not name.startswith("__")}
+    return {name: _to_plain(value, name) for name, value in variables.items() if not name.startswith("__")}
 
 
-def _to_plain(value: Any) -> Any:
+def _to_plain(value: Any, name: str) -> Any:
     from scipy.io.matlab import MatlabFunction, MatlabObject, MatlabOpaque
 
     if not isinstance(value, np.ndarray):
         return "a sparse matrix"
-    if isinstance(value, MatlabFunction | MatlabObject | MatlabOpaque):
+    if isinstance(value, MatlabOpaque):
+        return _name_object(value["s2"][0].decode("ascii", "replace"), name)
+    if isinstance(value, MatlabFunction | MatlabObject):
         return "a function or an object"
-    if value.dtype.names and value.shape == (1, 1):
-        return {field: _to_plain(value[0, 0][field]) for field in value.dtype.names}
+    if value.dtype.names:
+        elements = [{field: _to_plain(element[field], field) for field in value.dtype.names} for element in value.flat]
+        return elements[0] if len(elements) == 1 else {f"[{i}]": element for i, element in enumerate(elements)}
     if value.dtype.kind in "fiub":
         return value.astype(value.dtype.newbyteorder("="))
     return {"c": "complex", "U": "text", "O": "a cell array"}.get(value.dtype.kind, "a structure")

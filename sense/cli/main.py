@@ -9,6 +9,7 @@ from padforge.common.command_line import SectionedGroup, echo, out_option, pad_f
 from padforge.sense.cli import localizer, rig
 from padforge.sense.cli.live import live
 from padforge.sense.cli.options import (
+    FILE,
     FOLDER,
     echo_note,
     predict_despite_faults,
@@ -27,18 +28,31 @@ _PATH = click.Path(path_type=Path)
 
 @click.command("import")
 @click.argument("file", type=_PATH)
+@click.option("--show", is_flag=True, help="Print what FILE holds, to write --columns by, and import nothing.")
 @click.option("--columns", default="", metavar="QUANTITY=NAME,...", help="Content of columns, datasets or topics.")
+@click.option("--presses", type=FILE, help="Table of presses, a line each, beside readings without any.")
+@click.option("--press-columns", default="", metavar="QUANTITY=NAME,...", help="Content of the columns of --presses.")
+@click.option("--encoding", default="", help="Of a table's text, such as cp1252 (default: by its first bytes).")
 @out_option(what="Folder of the recording; must be new or empty")
-def import_(file: Path, columns: str, out: Path | None) -> None:
-    """Import a recording of another program from FILE. FILE is a .csv, .tsv, .txt, .h5, .hdf5, .mat, or a
-    ROS 2 bag (.mcap, .db3 or a folder with metadata.yaml). The default folder for NAME.csv is out/NAME/recording.
+def import_(
+    file: Path, show: bool, columns: str, presses: Path | None, press_columns: str, encoding: str, out: Path | None
+) -> None:
+    """Import a recording of another program from FILE. FILE is a table (.csv, .tsv, .txt, .log, .dat), an .h5,
+    .hdf5, .mat, or a bag of ROS (.mcap, .db3, .bag or a folder with metadata.yaml). The default folder for NAME.csv
+    is out/NAME/recording.
 
     \b
+    padforge sense import --show lab.csv
     padforge sense import readings.csv
     padforge sense import lab.csv --columns 'time=t_ms:ms,fibres=ch*:mV,x=px,y=py'
     padforge sense import lab.csv --columns 'time=Time [s],fibres=ch*,press=contact,x=X:cm,y=Y:cm'
+    padforge sense import plain.txt --columns 'rate=100,fibres=2-5'
     padforge sense import lab.h5 --columns 'time=/t,fibres=/volts,positions=/xy,down_command=/on:s,up_command=/off:s'
+    padforge sense import lab.h5 --columns 'time=/log/t,fibres=/log/c*,press=/log/contact'
+    padforge sense import lab.mat --columns 'time=data.t,fibres=data.volts[0:8]'
     padforge sense import lab.mcap --columns 'fibres=/skin/readings,positions=/probe,force=/wrench'
+    padforge sense import lab.mcap --columns 'fibres=/synced.measurements.data'
+    padforge sense import lab.csv --columns 'time=t,fibres=ch*' --presses presses.csv
 
     \b
     Without --columns a CSV has the columns time_s, fibre_0_v, fibre_1_v, ..., x_mm, y_mm, and optionally
@@ -47,15 +61,23 @@ def import_(file: Path, columns: str, out: Path | None) -> None:
 
     \b
     --columns lists columns, datasets, variables or topics, separated by commas; * stands for any
-    characters, ? for one. A unit or a factor follows a colon; without it they are s, V, mm, N.
-      time, fibres    of each reading, needed
+    characters, ? for one, NAME[1:5] for columns 1 to 4 of an array, from 0, and 2-5 for columns of a table
+    without header, from 1. A unit or a factor follows a colon; without it they are s, V, mm, N. Fields of
+    a structure follow a point in MATLAB, columns of a table a slash in HDF5, fields of messages a point.
+      time, fibres    of each reading, needed; rate=HZ in place of time
       x, y, positions of each reading, or of each press; positions are both in one dataset
       depth, reached, force
                       of each reading, or of each press: depth commanded and measured, and force
       press           1 or a number while the pad is pressed, 0 or empty while not
       down_command, up_command
                       of each press: the reading, from 0, or the time where a unit is given
-    Where nothing says when the pad is pressed, presses are detected in the readings.
+    Where nothing says when the pad is pressed, presses are detected in the readings. Fibres whose names
+    differ by a number are in the order of that number.
+
+    \b
+    --presses has the columns down_s and up_s or duration_s, by the clock of the readings, and optionally
+    x_mm, y_mm, depth_mm, reached_mm, force_n; or --press-columns names them:
+      down, up or duration, x, y, depth, reached, force
 
     \b
     In a bag, time is when messages were logged, and lengths are m where no unit is given:
@@ -68,20 +90,25 @@ def import_(file: Path, columns: str, out: Path | None) -> None:
     A value holds until the next message.
     """
     from padforge.common.files import provenance
-    from padforge.sense.formats.columns import PRESSES_DETECTED, join_names
-    from padforge.sense.formats.import_export import find_reader
+    from padforge.sense.formats.columns import join_names
+    from padforge.sense.formats.import_export import describe_file, import_file
     from padforge.sense.recording.doubts import find_doubts
+    from padforge.sense.recording.recording import PRESSES_DETECTED
     from padforge.sense.recording.run_directory import check_new_folder
 
-    read, folder = find_reader(file), out or pad_folder(file) / "recording"
+    if show:
+        for line in describe_file(file, encoding):
+            echo(line)
+        return
+    folder = out or pad_folder(file) / "recording"
     check_new_folder(folder)
-    recording = read(file, columns)
+    recording = import_file(file, columns, encoding, presses, press_columns)
     echo_note(recording, file)
     if PRESSES_DETECTED.items() <= recording.source.items():
         echo(f"{file}: does not say when the pad was pressed; presses were detected in the readings", err=True)
     for doubt in find_doubts(recording):
         echo(f"doubtful: {doubt}", err=True)
-    recording.save(folder, provenance("padforge sense import", inputs=[file]))
+    recording.save(folder, provenance("padforge sense import", inputs=[file, *([presses] if presses else [])]))
     if recording.fibre_names:
         echo(f"fibres from 1 on: {join_names(recording.fibre_names)}")
     echo(recording_line(recording, folder))

@@ -7,7 +7,8 @@ run of equal positions; where no line or every line has one, presses are detecte
 """
 
 import csv
-from collections.abc import Iterator
+import re
+from collections.abc import Iterator, Sequence
 from itertools import repeat
 from pathlib import Path
 
@@ -17,54 +18,144 @@ from padforge.common.files import atomic_file, reraise_write_error
 from padforge.common.validation import InputError, short_repr
 from padforge.sense.arrays import MAX_FIBRES, Array
 from padforge.sense.formats.annotations import check_export
+from padforge.sense.formats.assembly import MEASURES, Arrays, ForeignArrays, assemble_recording
 from padforge.sense.formats.columns import (
-    MEASURES,
+    UNITS,
     ColumnEntry,
-    assemble_recording,
     check_import,
     match_columns,
     naming_file,
+    order_notes,
     parse_columns,
+    read_entries,
 )
-from padforge.sense.recording.csv_table import CsvTable
 from padforge.sense.recording.recording import Recording
+from padforge.sense.recording.tables import Table, read_table
 
-QUANTITIES = ("time", "fibres", "x", "y", "depth", "reached", "force", "press")
+QUANTITIES = ("time", "rate", "fibres", "x", "y", "depth", "reached", "force", "press")
 """Quantities that a column may hold."""
+PRESS_COLUMNS = {
+    "down": "down_s",
+    "up": "up_s",
+    "duration": "duration_s",
+    "x": "x_mm",
+    "y": "y_mm",
+    "depth": "depth_mm",
+    "reached": "reached_mm",
+    "force": "force_n",
+}
+"""Quantities of a table of presses, and the names of their columns."""
 _MEASURED = {"depth_mm": "depth", "reached_mm": "reached", "force_n": "force"}
 
 
-def import_csv(path: str | Path, columns: str = "") -> Recording:
-    """Read a recording from a CSV file.
+def import_csv(path: str | Path, columns: str = "", encoding: str = "", presses: Arrays = ()) -> Recording:
+    """Read a recording from a table of text.
 
     Args:
         path: of the file.
         columns: what its columns hold, as `time=t_ms:ms,fibres=ch*`; by default they are padforge's own.
+        encoding: of the text; by default by its first bytes.
+        presses: of a table of their own, as `read_presses` returns them.
     """
     path, columns = check_import(path, columns)
     entries = parse_columns(columns, QUANTITIES) if columns else None
-    table = CsvTable(path)
+    table = read_table(path, encoding)
     with naming_file(path):
-        matched = match_columns(entries or _own_entries(table.names), table.names)
-    indices = [i for _, i in matched]
-    x_y = [i for entry, i in matched if entry.quantity in "xy"]
-    values = table.read_columns(indices, x_y)
-    missing = np.isnan(values[:, [indices.index(i) for i in x_y]])
-    if (incomplete := missing.any(axis=1) & ~missing.all(axis=1)).any():
-        x, y = (table.names[i] for i in x_y)
-        line = table.line_number(int(np.argmax(incomplete)))
-        raise InputError(f"{path}: line {line} has one of {x} and {y}, expected both or neither")
-    arrays = [(entry, column) for (entry, _), column in zip(matched, values.T, strict=True)]
-    return assemble_recording(
-        path, arrays, {"kind": "csv", "file": path.name} | ({"columns": columns} if columns else {})
+        matched = match_columns(entries or _own_entries(table), table.names)
+    arrays = _read_matched(table, matched)
+    if not columns:
+        _check_positions(table, arrays)
+    content = ForeignArrays(
+        path,
+        arrays,
+        {"kind": "csv", "file": path.name} | ({"columns": columns} if columns else {}),
+        [*table.notes, *(order_notes(matched) if columns else [])],
+        table.line_number,
+        is_own=not columns,
     )
+    return assemble_recording(content, presses)
 
 
-def _own_entries(names: list[str]) -> list[ColumnEntry]:
+def read_presses(path: Path, columns: str = "", encoding: str = "") -> Arrays:
+    """Read when and where a pad was pressed from a table with a line for each press.
+
+    Args:
+        path: of the file.
+        columns: what its columns hold, as `down=t0:ms,duration=d:ms,x=px,y=py`; by default they have the names of
+            `PRESS_COLUMNS`. `down` and one of `up` and `duration` are needed.
+        encoding: of the text; by default by its first bytes.
+
+    Returns:
+        Arrays for `assemble_recording`.
+    """
+    path, columns = check_import(path, columns)
+    table = read_table(path, encoding)
+    own = [ColumnEntry(quantity, name) for quantity, name in PRESS_COLUMNS.items() if name in table.names]
+    with naming_file(path):
+        entries = parse_columns(columns, tuple(PRESS_COLUMNS)) if columns else own
+        named = {entry.quantity for entry in entries}
+        if "down" not in named or len(named & {"up", "duration"}) != 1:
+            allowed = "down (down_s) and one of up (up_s) and duration (duration_s)"
+            raise InputError(f"columns are {', '.join(table.names)}, expected {allowed}; --press-columns names others")
+        arrays = {
+            entry.quantity: (entry, values)
+            for entry, values in _read_matched(table, match_columns(entries, table.names))
+        }
+    times = {
+        name: values * (entry.factor or 1.0)
+        for name, (entry, values) in arrays.items()
+        if name in ("down", "up", "duration")
+    }
+    times["up"] = times["up"] if "up" in times else times["down"] + times["duration"]
+    rest = [array for name, array in arrays.items() if name not in times]
+    return [*((ColumnEntry(f"{name}_command", name, 1.0), times[name]) for name in ("down", "up")), *rest]
+
+
+def describe_table(path: Path, encoding: str = "") -> list[str]:
+    """Return what the columns of a table hold, each in a line with its unit and first values."""
+    table = read_table(path, encoding)
+    values = table.read_columns(range(len(table.names)))
+    lines = [f"table of {len(values)} lines, text in {table.encoding}" + ("" if table.has_header else ", no header")]
+    for name, unit, *cells in zip(table.names, table.units, *table.rows[:3], strict=True):
+        lines.append(
+            f"{name or '(no name)'}{f' [{unit}]' if unit else ''}: {', '.join(cell or '-' for cell in cells)}, ..."
+        )
+    return lines + table.notes
+
+
+def _read_matched(table: Table, matched: Sequence[tuple[ColumnEntry, int]]) -> Arrays:
+    """Read the columns of entries; one without a unit has that of the line of units, or of its header in brackets."""
+    indices = list(dict.fromkeys(i for _, i in matched if i >= 0))
+    values = table.read_columns(indices, [i for entry, i in matched if entry.quantity in "xy"])
+    stated = []
+    for entry, i in matched:
+        bracketed = re.search(r"[\[(]([^\])]+)[\])]$", table.names[i])
+        unit = table.units[i].strip("[]() ") or (bracketed[1] if bracketed else "")
+        if entry.factor is None and (factor := UNITS[entry.quantity].get(unit)):
+            entry = entry._replace(factor=factor)
+            if factor != 1:
+                table.notes.append(f"{entry.quantity} is in {unit}, as the file says")
+        stated.append((entry, i))
+    return read_entries(stated, lambda i: values[:, indices.index(i)])
+
+
+def _check_positions(table: Table, arrays: Arrays) -> None:
+    """Raise InputError where a line of padforge's own table has one of x and y."""
+    x_y = [np.isnan(values) for entry, values in arrays if entry.quantity in ("x", "y")]
+    if x_y and (incomplete := x_y[0] != x_y[1]).any():
+        line = table.line_number(int(np.argmax(incomplete)))
+        raise InputError(f"{table.path}: line {line} has one of x_mm and y_mm, expected both or neither")
+
+
+def _own_entries(table: Table) -> list[ColumnEntry]:
+    names = table.names
     entries = [ColumnEntry(name[0], name) for name in ("x_mm", "y_mm") if name in names]
     if entries:
         entries += [ColumnEntry(quantity, name) for name, quantity in _MEASURED.items() if name in names]
     fibres = len(names) - 1 - len(entries)
+    if not table.has_header:
+        last = f"its columns are 1 to {len(names)}, which --columns names, as time=1,fibres=2-{len(names)}"
+        raise InputError(f"no line names its columns; {last} (rate=HZ where it has no time)")
     if "time_s" not in names or len(entries) == 1 or not 1 <= fibres <= MAX_FIBRES:
         raise InputError(
             f"header is {short_repr(','.join(names) or 'nothing')}, expected time_s, one column per fibre, x_mm, y_mm; "

@@ -12,21 +12,21 @@ from typing import Any
 import numpy as np
 
 from padforge.common.files import atomic_file, reraise_write_error
-from padforge.common.mat_files import load_mat, open_hdf5
+from padforge.common.mat_files import flatten_variables, load_mat, open_hdf5
 from padforge.common.validation import InputError
 from padforge.sense.arrays import Array
 from padforge.sense.formats.annotations import check_export
+from padforge.sense.formats.assembly import MEASURES, Arrays, ForeignArrays, assemble_recording
 from padforge.sense.formats.columns import (
-    MEASURES,
-    NOTE,
-    assemble_recording,
     check_import,
     join_names,
     match_columns,
     naming_file,
+    order_notes,
     parse_columns,
+    read_entries,
 )
-from padforge.sense.recording.recording import Recording
+from padforge.sense.recording.recording import NOTE, Recording
 
 FORMAT = "padforge-hdf5/2"
 _DATASETS = {name: name for name in ("times_s", "presses_mm", "down_command", "up_command")}
@@ -63,20 +63,23 @@ def export_hdf5(recording: Recording, path: str | Path) -> None:
             file.create_dataset(name, data=values, compression="gzip", shuffle=True, track_times=False)
 
 
-def import_hdf5(path: str | Path, columns: str = "") -> Recording:
+def import_hdf5(path: str | Path, columns: str = "", presses: Arrays = ()) -> Recording:
     """Read a recording from an HDF5 file.
 
     Args:
         path: of the file.
         columns: what its datasets hold, as `time=/t,fibres=/data/volts`; by default it was exported.
+        presses: of a table of their own, as `read_presses` returns them.
     """
     path, columns = check_import(path, columns)
     if columns:
         entries = [entry._replace(name=entry.name.removeprefix("/")) for entry in parse_columns(columns)]
         with open_hdf5(path) as file:
             matched = match_columns(entries, file.names)
-            arrays = [(entry, file.read(entry.name)) for entry, _ in matched]
-        return assemble_recording(path, arrays, {"kind": "hdf5", "file": path.name, "columns": columns})
+            arrays = read_entries(matched, lambda i: file.read(file.names[i]))
+        source = {"kind": "hdf5", "file": path.name, "columns": columns}
+        return assemble_recording(ForeignArrays(path, arrays, source, order_notes(matched)), presses)
+    check_no_presses(path, presses)
     with open_hdf5(path) as file:
         if (file_format := file.read_text("format")) != FORMAT:
             raise InputError(
@@ -92,7 +95,7 @@ def import_hdf5(path: str | Path, columns: str = "") -> Recording:
         raise InputError(f"{path}: {error}") from error
 
 
-def import_mat(path: str | Path, columns: str = "") -> Recording:
+def import_mat(path: str | Path, columns: str = "", presses: Arrays = ()) -> Recording:
     """Read a recording from a MATLAB file, by default as published.
 
     Published are `voltage` (R, C) volts, `pos` (2, Q) mm and `tim` (1, R) s, with 40 readings a press. `pos` may be
@@ -101,17 +104,56 @@ def import_mat(path: str | Path, columns: str = "") -> Recording:
 
     Args:
         path: of the file.
-        columns: what its variables hold, as `time=t,fibres=volts`.
+        columns: what its variables hold, as `time=data.t,fibres=data.volts` or `time=x[0],fibres=x[1:9]`.
+        presses: of a table of their own, as `read_presses` returns them.
     """
     path, columns = check_import(path, columns)
-    content = load_mat(path, () if columns else ("voltage", "tim"))
+    content = flatten_variables(load_mat(path, ()))
     with naming_file(path):
         if not columns:
+            if missing := [name for name in ("voltage", "tim") if name not in content]:
+                for name in content:  # a timetable says what to do with it
+                    if isinstance(content[name], str) and "only MATLAB" in content[name]:
+                        _matrix(content, name)
+                there = f"has no variable {', '.join(missing)} (found {join_names(sorted(content))})"
+                raise InputError(
+                    f"{there}; --columns says what others hold, as time=data.t,fibres=data.v or fibres=x[1:5]"
+                )
+            check_no_presses(path, presses)
             return _import_published(path, content)
-        names = [name for name in content if not name.startswith("__")]
-        matched = match_columns(parse_columns(columns), names)
-        arrays = [(entry, _matrix(content, entry.name)) for entry, _ in matched]
-    return assemble_recording(path, arrays, {"kind": "mat", "file": path.name, "columns": columns})
+        entries = [
+            entry._replace(name=entry.name.removeprefix("/").replace("/", ".")) for entry in parse_columns(columns)
+        ]
+        matched = match_columns(entries, names := list(content))
+        arrays = read_entries(matched, lambda i: _matrix(content, names[i]))
+    source = {"kind": "mat", "file": path.name, "columns": columns}
+    return assemble_recording(ForeignArrays(path, arrays, source, order_notes(matched)), presses)
+
+
+def check_no_presses(path: Path, presses: Arrays) -> None:
+    """Raise InputError if presses are given beside a whole recording."""
+    if presses:
+        raise InputError(f"{path}: holds presses of its own, expected --columns for readings beside --presses")
+
+
+def describe_arrays(path: Path) -> list[str]:
+    """Return what the datasets or variables of an HDF5 or MATLAB file hold, each in a line."""
+    if path.suffix.lower() != ".mat":
+        with open_hdf5(path) as file:
+            return [
+                f"/{name}: {file.describe(name)}{_first_values(file.read(name)) if file.is_numeric(name) else ''}"
+                for name in file.names
+            ]
+    content = flatten_variables(load_mat(path, ()))
+    shown = {
+        name: f"{value.shape} {value.dtype}{_first_values(value)}" if isinstance(value, np.ndarray) else value
+        for name, value in content.items()
+    }
+    return [f"{name}: {text}" for name, text in shown.items()]
+
+
+def _first_values(values: Array) -> str:
+    return ", begins " + ", ".join(f"{value:.6g}" for value in values.ravel()[:3].tolist())
 
 
 def _import_published(path: Path, content: dict[str, Any]) -> Recording:
@@ -142,6 +184,5 @@ def _import_published(path: Path, content: dict[str, Any]) -> Recording:
 def _matrix(content: dict[str, Any], name: str) -> Array:
     values = content[name]
     if not isinstance(values, np.ndarray):
-        kind = values if isinstance(values, str) else "a structure"
-        raise InputError(f"{name} is {kind}, expected a full matrix of real numbers")
+        raise InputError(f"{name} is {values}, expected a full matrix of real numbers")
     return values.astype(np.float64)

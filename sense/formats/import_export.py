@@ -9,18 +9,22 @@ from padforge.common.mat_files import load_mat
 from padforge.common.validation import InputError, check_path
 from padforge.sense.arrays import Array
 from padforge.sense.formats.annotations import ModelAnnotations
-from padforge.sense.formats.csv_recording import export_csv, import_csv
-from padforge.sense.formats.hdf5_mat import export_hdf5, import_hdf5, import_mat
+from padforge.sense.formats.csv_recording import describe_table, export_csv, import_csv, read_presses
+from padforge.sense.formats.hdf5_mat import describe_arrays, export_hdf5, import_hdf5, import_mat
 from padforge.sense.formats.lerobot import export_lerobot
-from padforge.sense.formats.ros_recording import METADATA, SUFFIXES, export_bag, import_bag
+from padforge.sense.formats.ros_recording import METADATA, SUFFIXES, describe_bag, export_bag, import_bag
 from padforge.sense.recording.block_file import read_blocks
 from padforge.sense.recording.recording import Recording
 from padforge.sense.recording.run_directory import START, STATE_COLUMNS, STATES
 
-Reader = Callable[[Path, str], Recording]
-_READERS: dict[str, Reader] = {
+_TABLES = (".csv", ".tsv", ".txt", ".log", ".dat")
+_ADVICE = dict.fromkeys((".xlsx", ".xls", ".ods"), "save the sheet as CSV UTF-8") | {
+    ".npz": "padforge.sense.Recording.from_arrays takes arrays",
+    ".npy": "padforge.sense.Recording.from_arrays takes arrays",
+}
+_READERS: dict[str, Callable[..., Recording]] = {
     ".mat": import_mat,
-    **dict.fromkeys((".csv", ".tsv", ".txt"), import_csv),
+    **dict.fromkeys(_TABLES, import_csv),
     **dict.fromkeys((".h5", ".hdf5"), import_hdf5),
     **dict.fromkeys(SUFFIXES, import_bag),
 }
@@ -54,23 +58,43 @@ def is_recording(path: Path) -> bool:
     return path.is_dir() or path.suffix.lower() in _READERS
 
 
-def import_file(path: Path, columns: str = "") -> Recording:
-    """Read a recording from a MATLAB, CSV, HDF5, MCAP or SQLite file, by its extension, or a rosbag2 folder.
+def import_file(
+    path: Path, columns: str = "", encoding: str = "", presses: Path | None = None, press_columns: str = ""
+) -> Recording:
+    """Read a recording from a table, an HDF5 or MATLAB file, or a bag, by its extension, or from a rosbag2 folder.
 
     Args:
         path: of the file or folder.
         columns: what the columns, datasets or topics of a foreign file hold.
+        encoding: of tables; by default by their first bytes.
+        presses: table of presses, where the file has readings alone.
+        press_columns: what its columns hold.
     """
-    return find_reader(path)(path, columns)
+    read = find_reader(path)
+    if encoding and read is not import_csv:
+        raise InputError(f"{path}: --encoding is of tables, allowed with {', '.join(_TABLES)}")
+    options = {"encoding": encoding} if encoding else {}
+    return read(path, columns, **options, presses=read_presses(presses, press_columns, encoding) if presses else ())
 
 
-def find_reader(path: Path) -> Reader:
+def find_reader(path: Path) -> Callable[..., Recording]:
     """Return what imports a file of a name that ends so, or a rosbag2 folder; raises InputError for another path."""
     if _is_bag_folder(path):
         return import_bag
     if path.suffix.lower() not in _READERS:
-        raise InputError(f"{path}: ends in {path.suffix!r}, allowed are {', '.join(_READERS)}, or a rosbag2 folder")
+        hint = f"; {_ADVICE[path.suffix.lower()]}" if path.suffix.lower() in _ADVICE else ""
+        raise InputError(
+            f"{path}: ends in {path.suffix!r}, allowed are {', '.join(_READERS)}, or a rosbag2 folder{hint}"
+        )
     return _READERS[path.suffix.lower()]
+
+
+def describe_file(path: Path, encoding: str = "") -> list[str]:
+    """Return what a file holds, each column, dataset, variable or topic in a line: name, shape, unit, first values."""
+    read = find_reader(path)
+    if read is import_csv:
+        return describe_table(path, encoding)
+    return describe_bag(path) if read is import_bag else describe_arrays(path)
 
 
 def arm_states(path: Path) -> Array | None:

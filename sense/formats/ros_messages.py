@@ -9,7 +9,7 @@ where the other messages still say the same.
 """
 
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from operator import attrgetter
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -83,9 +83,10 @@ TOPICS = {
 
 
 class RawMessages(NamedTuple):
-    """Messages of a topic in the order of the file: their type, and the log time (ns) and CDR of each."""
+    """Messages of a topic in the order of the file: type, what deserializes one, and log time (ns) and bytes of each."""
 
     msgtype: str
+    deserialize: Callable[[bytes], Any]
     stamps: list[int]
     messages: list[bytes]
 
@@ -197,17 +198,15 @@ def encode(store: "Typestore", topic: str, series: TopicSeries) -> list[memoryvi
     return encoded
 
 
-def decode(store: "Typestore", raw: RawMessages, paths: Sequence[str]) -> TopicSeries:
+def decode(raw: RawMessages, paths: Sequence[str]) -> TopicSeries:
     """Return the numbers at the paths, attributes of the messages, in the order of stamps; refuse damaged messages."""
-    from rosbags.serde import SerdeError
-
-    getters, rows, width = [attrgetter(path) for path in paths], bytearray(), 0
+    rows, width = bytearray(), 0
     for index, content in enumerate(raw.messages):
         try:
-            message = store.deserialize_cdr(content, raw.msgtype)
-        except (SerdeError, IndexError) as error:
+            message = raw.deserialize(content)
+        except Exception as error:  # of damaged messages, rosbags raises many kinds
             raise InputError(f"message {index} of {raw.msgtype} is damaged ({error})") from error
-        row = b"".join(np.asarray(get(message), np.float64).tobytes() for get in getters)
+        row = b"".join(_numbers(message, path, raw.msgtype).tobytes() for path in paths)
         if not row:
             raise InputError(f"message {index} has no {paths[0]}")
         width = width or len(row)
@@ -219,15 +218,26 @@ def decode(store: "Typestore", raw: RawMessages, paths: Sequence[str]) -> TopicS
     return TopicSeries(stamps[order], np.frombuffer(rows, np.float64).reshape(len(stamps), -1)[order])
 
 
-def decode_text(store: "Typestore", raw: RawMessages) -> str:
-    """Return the text of the last message of RECORDING; "" if it is damaged."""
-    from rosbags.serde import SerdeError
+def get_field(message: Any, path: str) -> Any:
+    """Return the field at a path; of a list of messages, the list of theirs."""
+    for name in path.split("."):
+        message = [getattr(item, name) for item in message] if isinstance(message, list) else getattr(message, name)
+    return message
 
+
+def _numbers(message: Any, path: str, msgtype: str) -> Array:
     try:
-        message: Any = store.deserialize_cdr(raw.messages[-1], raw.msgtype)
-    except (SerdeError, IndexError):
+        return np.asarray(get_field(message, path), np.float64).ravel()
+    except (AttributeError, TypeError, ValueError) as error:
+        raise InputError(f"{msgtype} has no numbers at {path!r}") from error
+
+
+def decode_text(raw: RawMessages) -> str:
+    """Return the text of the last message of RECORDING; "" if it is damaged."""
+    try:
+        return raw.deserialize(raw.messages[-1]).data
+    except Exception:  # of damaged messages, rosbags raises many kinds
         return ""
-    return message.data
 
 
 def _empty(store: "Typestore", msgtype: str, **fields: Any) -> Any:

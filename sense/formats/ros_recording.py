@@ -4,14 +4,16 @@ The library rosbags reads and writes them. A file without its end is refused; `r
 repair it.
 """
 
+import re
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import partial
 from heapq import merge
 from itertools import repeat
 from operator import itemgetter
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,19 +23,20 @@ from padforge.common.validation import InputError, short_repr
 from padforge.sense.arrays import MAX_BYTES, Array, Indices, check_numbers
 from padforge.sense.formats import ros_messages
 from padforge.sense.formats.annotations import ModelAnnotations, check_export
+from padforge.sense.formats.assembly import Arrays, ForeignArrays, assemble_recording
 from padforge.sense.formats.columns import (
     MILLIMETRES,
-    NOTE,
     UNITS,
     ColumnEntry,
-    assemble_recording,
     check_import,
     join_names,
     match_columns,
     matches,
     naming_file,
+    order_notes,
     parse_columns,
 )
+from padforge.sense.formats.hdf5_mat import check_no_presses
 from padforge.sense.formats.ros_messages import (
     ARM,
     FORCE,
@@ -49,13 +52,10 @@ from padforge.sense.formats.ros_messages import (
     TopicSeries,
 )
 from padforge.sense.formats.ros_writer import load_typestore, write_mcap
-from padforge.sense.recording.recording import Recording
+from padforge.sense.recording.recording import NOTE, Recording
 from padforge.sense.recording.run_directory import STATE_COLUMNS
 
-if TYPE_CHECKING:
-    from rosbags.typesys.store import Typestore
-
-SUFFIXES = (".mcap", ".db3")
+SUFFIXES = (".mcap", ".db3", ".bag")
 METADATA = "metadata.yaml"
 """The file that makes a folder a rosbag2 bag."""
 
@@ -97,26 +97,34 @@ class BagContent(NamedTuple):
     types: dict[str, str]
 
 
-def read_bag(path: Path, is_wanted: Callable[[str], bool]) -> BagContent:
-    """Read messages of a bag: an .mcap or .db3 file, or a folder of such with METADATA.
+def read_bag(path: Path, is_wanted: Callable[[str], bool], limit: int | None = None) -> BagContent:
+    """Read messages of a bag: a file of `SUFFIXES`, or a folder of such with METADATA.
 
     Args:
         path: of the file or folder.
         is_wanted: whether a topic is asked for, by its name.
+        limit: number of messages that are read of a topic; by default all.
     """
-    from rosbags.rosbag2 import Reader
+    from rosbags.highlevel import AnyReader
 
     if not path.is_dir():
         check_file(path, MAX_BYTES)
     topics = dict[str, RawMessages]()
-    with _one_line_errors(path), Reader(path) as reader:
+    store = load_typestore(f"{path}: a bag of ROS")
+    with _one_line_errors(path), AnyReader([path], default_typestore=store) as reader:
         types = {connection.topic: connection.msgtype for connection in reader.connections}
+        store = reader.typestore  # of the bag's own definitions
+        deserialize = store.deserialize_cdr if reader.is2 else store.deserialize_ros1
         # None at all would be all topics.
         if wanted := [connection for connection in reader.connections if is_wanted(connection.topic)]:
             for connection, stamp, message in reader.messages(wanted):
-                topic = topics.setdefault(connection.topic, RawMessages(connection.msgtype, [], []))
-                topic.stamps.append(stamp)
-                topic.messages.append(message)
+                if connection.topic not in topics:
+                    decode = partial(deserialize, typename=connection.msgtype)
+                    topics[connection.topic] = RawMessages(connection.msgtype, decode, [], [])
+                topic = topics[connection.topic]
+                if limit is None or len(topic.stamps) < limit:
+                    topic.stamps.append(stamp)
+                    topic.messages.append(bytes(message))
     return BagContent(topics, types)
 
 
@@ -131,22 +139,27 @@ def _one_line_errors(path: Path) -> Iterator[None]:
         raise InputError(f"{path}: no bag, or cut off or damaged ({reason})") from error
 
 
-def import_bag(path: str | Path, columns: str = "") -> Recording:
-    """Read a recording from a bag of ROS 2.
+def import_bag(path: str | Path, columns: str = "", presses: Arrays = ()) -> Recording:
+    """Read a recording from a bag of ROS.
 
     Args:
-        path: .mcap or .db3 file, or rosbag2 folder.
-        columns: topics of each quantity, as `fibres=/skin/readings,positions=/probe,force=/wrench`; times are those at
-            which messages were logged, a press or position holds until the next message, and positions without a unit
-            are m. Without it, the bag is one that `export_bag` wrote.
+        path: file of `SUFFIXES`, or rosbag2 folder.
+        columns: topics of each quantity, as `fibres=/skin/readings,positions=/probe,force=/wrench`, or fields of their
+            messages, as `fibres=/synced.measurements.data`; times are those at which messages were logged, a press or
+            position holds until the next message, and positions without a unit are m. Without it, the bag is one that
+            `export_bag` wrote.
+        presses: of a table of their own, as `read_presses` returns them.
     """
     path, columns = check_import(path, columns)
-    store = load_typestore(f"{path}: a bag of ROS 2")
+    load_typestore(f"{path}: a bag of ROS")
     with np.errstate(all="ignore"):  # damaged numbers are refused afterwards
-        return _import_mapped(store, path, columns) if columns else _import_exported(store, path)
+        if columns:
+            return _import_mapped(path, columns, presses)
+        check_no_presses(path, presses)
+        return _import_exported(path)
 
 
-def _import_exported(store: "Typestore", path: Path) -> Recording:
+def _import_exported(path: Path) -> Recording:
     """Read a bag that was exported: exactly as it was if all messages still agree, else as the messages say."""
     number_topics = (READINGS, PRESSED, PLACE, REACHED, FORCE)
     raw, types = read_bag(path, {*number_topics, RECORDING}.__contains__)
@@ -155,20 +168,19 @@ def _import_exported(store: "Typestore", path: Path) -> Recording:
             f"{path}: has no topic {READINGS}; columns (--columns) say what other topics hold, "
             f"there are {join_names(list(types))}"
         )
-    source = {"kind": "ros", "file": path.name}
+    notes = []
     with naming_file(path):
         for name, topic in raw.items():
             if topic.msgtype != TOPICS[name].msgtype:
                 raise InputError(f"{name} is of {short_repr(topic.msgtype)}, expected {TOPICS[name].msgtype}")
-        topics = {
-            name: ros_messages.decode(store, raw[name], TOPICS[name].paths) for name in number_topics if name in raw
-        }
+        topics = {name: ros_messages.decode(raw[name], TOPICS[name].paths) for name in number_topics if name in raw}
         if RECORDING in raw:
-            if (recording := _restore(ros_messages.decode_text(store, raw[RECORDING]), topics)) is not None:
+            if (recording := _restore(ros_messages.decode_text(raw[RECORDING]), topics)) is not None:
                 return recording
-            source[NOTE] = f"was changed since it was exported; {RECORDING} is left out"
+            notes = [f"was changed since it was exported; {RECORDING} is left out"]
         arrays = _to_arrays(topics)
-    return assemble_recording(path, arrays, source)
+    source = {"kind": "ros", "file": path.name}
+    return assemble_recording(ForeignArrays(path, arrays, source, notes, is_own=True))
 
 
 def _restore(text: str, topics: Mapping[str, TopicSeries]) -> Recording | None:
@@ -233,14 +245,28 @@ def _find_commands(pressed: TopicSeries, readings: Indices) -> tuple[Indices, In
     return down[valid], up[valid]
 
 
-def _import_mapped(store: "Typestore", path: Path, columns: str) -> Recording:
+def _import_mapped(path: Path, columns: str, presses: Arrays) -> Recording:
     entries = parse_columns(columns, QUANTITIES)
-    raw, types = read_bag(path, lambda name: any(matches(name, entry.name) for entry in entries))
+    # A topic has no point in its name: what follows one is the path of a field in its messages.
+    topics = [entry.name.partition(".")[0] for entry in entries]
+    raw, types = read_bag(path, lambda name: any(matches(name, re.sub(r"\[.*", "", topic)) for topic in topics))
     names = sorted(types)  # bags list topics as they were discovered, each bag in another order
+    arrays: _Arrays = []
     with naming_file(path):
-        series = [(entry, _decode_entry(store, entry, raw)) for entry, _ in match_columns(entries, names)]
+        matched = match_columns([entry for entry in entries if "." not in entry.name], names)
+        series = [(entry, _decode_entry(entry, "", raw)) for entry, _ in matched]
+        for entry in entries:
+            topic, _, field = entry.name.partition(".")
+            field, _, index = field.partition("[")
+            if field:
+                columns_of_field = match_columns([entry._replace(name=topic, index=index and f"[{index}")], names)
+                matched += columns_of_field
+                series += [
+                    (each._replace(name=f"{each.name}.{field}"), _decode_entry(each, field, raw))
+                    for each, _ in columns_of_field
+                ]
         clock = next(topic.stamps for entry, topic in series if entry.quantity == "fibres")
-        arrays: _Arrays = [(ColumnEntry("time", ""), clock / 1e9)]
+        arrays.append((ColumnEntry("time", ""), clock / 1e9))
         for entry, topic in series:
             if entry.quantity == "press":
                 arrays += _commands(*_find_commands(topic, clock))
@@ -250,21 +276,60 @@ def _import_mapped(store: "Typestore", path: Path, columns: str) -> Recording:
             values = topic.values
             if entry.quantity == "force" and values.shape[1] == 3:
                 values = np.linalg.norm(values, axis=1, keepdims=True)
-            values = values if entry.quantity in ("fibres", "positions") else values[:, 0]
+            values = values if entry.quantity in ("fibres", "positions") or entry.index else values[:, 0]
             arrays.append((entry, _hold(topic.stamps, values, clock)))
-    return assemble_recording(path, arrays, {"kind": "ros", "file": path.name, "columns": columns})
+    source = {"kind": "ros", "file": path.name, "columns": columns}
+    return assemble_recording(ForeignArrays(path, arrays, source, order_notes(matched), is_held=True), presses)
 
 
-def _decode_entry(store: "Typestore", entry: ColumnEntry, raw: Mapping[str, RawMessages]) -> TopicSeries:
-    """Return the numbers of a topic, of a type that may hold the quantity."""
+def _decode_entry(entry: ColumnEntry, field: str, raw: Mapping[str, RawMessages]) -> TopicSeries:
+    """Return the numbers of a topic, of a type that may hold the quantity, or of a field of its messages."""
     name, types = entry.name, _TYPES[entry.quantity]
     what = f"{entry.quantity} is {short_repr(name)}"
     if name not in raw:
         raise InputError(f"{what}, which has no messages")
-    if raw[name].msgtype not in types:
-        raise InputError(f"{what} of {short_repr(raw[name].msgtype)}, expected {', '.join(types)}")
     with naming_file(what):
-        return ros_messages.decode(store, raw[name], types[raw[name].msgtype])
+        topic = raw[name]
+        kind = topic.msgtype
+        if field:
+            kind = getattr(ros_messages.get_field(topic.deserialize(topic.messages[0]), field), "__msgtype__", "")
+        if kind in types:
+            return ros_messages.decode(topic, [f"{field}.{path}".lstrip(".") for path in types[kind]])
+        if field and not kind:
+            return ros_messages.decode(topic, [field])
+        fields = join_names(list(_number_fields(topic)))
+        raise InputError(f"of {short_repr(kind)}, which has numbers in fields; name one of {fields} as {name}.FIELD")
+
+
+def _number_fields(topic: RawMessages) -> dict[str, int]:
+    """Return the paths of numbers in the messages of a topic, and how many numbers the first message has in each."""
+    fields = dict[str, int]()
+
+    def visit(value: Any, path: str) -> None:
+        if isinstance(value, list) and value and hasattr(value[0], "__msgtype__"):
+            for name in vars(value[0]):
+                visit([getattr(item, name) for item in value], f"{path}.{name}")
+        elif hasattr(value, "__msgtype__"):
+            for name in vars(value):
+                visit(getattr(value, name), f"{path}.{name}")
+        elif np.asarray(value).dtype.kind in "fiub" and not path.endswith("__msgtype__"):
+            fields[path.lstrip(".")] = np.size(value)
+
+    visit(topic.deserialize(topic.messages[0]), "")
+    return fields
+
+
+def describe_bag(path: Path) -> list[str]:
+    """Return what the topics of a bag hold, each in a line, with the fields of their messages."""
+    load_typestore(f"{path}: a bag of ROS")
+    topics, types = read_bag(path, lambda name: True, limit=1)
+    lines = []
+    for name in sorted(types):
+        with naming_file(path):
+            fields = _number_fields(topics[name]) if name in topics else {}
+        numbers = ", ".join(f"{field} ({count})" if count != 1 else field for field, count in fields.items())
+        lines.append(f"{name}: {types[name]}" + (f", fields {numbers}" if numbers else ""))
+    return lines
 
 
 def _hold(stamps: Indices, values: Array, clock: Indices) -> Array:

@@ -14,7 +14,6 @@ from numpy.typing import ArrayLike
 from padforge.common.parallel import one_torch_thread, run_tasks
 from padforge.common.validation import InputError, check_float, short_repr
 from padforge.sense.arrays import Array, Floats, Mask, check_numbers
-from padforge.sense.formats.columns import PRESSES_DETECTED
 from padforge.sense.health.domain_shift import rest_levels
 from padforge.sense.health.fault_likelihoods import HYPOTHESES, MAX_LLR, cusum_update, estimate_noise
 from padforge.sense.health.health_model import (
@@ -36,7 +35,7 @@ from padforge.sense.health.trace_model import (
 )
 from padforge.sense.localizer.model_files import check_same_pad, files_of
 from padforge.sense.recording.frames import framed
-from padforge.sense.recording.recording import Recording
+from padforge.sense.recording.recording import PRESSES_DETECTED, Recording
 from padforge.sense.signals.press_detection import align_to_detected
 
 MAX_MISSING = 20  # successive presses without a reading after which a fibre is missing

@@ -1,5 +1,9 @@
 """Doubts about a recording: units that cannot be right, and presses far outside of the others."""
 
+import re
+from collections.abc import Mapping, Sequence
+from typing import Any
+
 import numpy as np
 
 from padforge.sense.arrays import Array, Mask
@@ -10,6 +14,8 @@ MIN_SPAN_MM, MAX_SPAN_MM = 2.0, 2000.0
 MIN_RATE_HZ, MAX_RATE_HZ = 1.5, 10_000.0
 """Readings a second of multimeters to fast boards: what reads 200 times a second seems to do so at 0.2 Hz in ms."""
 MAX_REST_V = 50.0
+COMMON_BITS, REFERENCE_V = (10, 12, 14, 16), 3.3
+"""Bits of the converters of common boards, and their highest voltage."""
 MARGIN = 0.5  # of the span of most presses, by which one may lie beside them
 MIN_PRESSES = 20  # from which it is known where most lie
 MAX_NAMED = 5
@@ -34,20 +40,47 @@ def name_presses(recording: Recording, mask: Mask) -> str:
     return ", ".join([*named[:MAX_NAMED], *more])
 
 
+def suggest_unit(source: Mapping[str, Any], quantity: str, readings: Array | None = None) -> str:
+    """Return the unit that a quantity may be in, and the entry of the mapping that says so.
+
+    Args:
+        source: of the recording, with its mapping as `columns`.
+        quantity: `time`, `positions` or `fibres`.
+        readings: as they were taken, V; whether they are counts of a converter, and of how many bits.
+    """
+    columns = str(source.get("columns", ""))
+    names = [piece.partition("=")[::2] for piece in columns.split(",")] if columns else []
+
+    def entry(quantities: Sequence[str], unit: str) -> str:
+        stated = [
+            (quantity, re.sub(r":[^:\]]*$", "", name)) for quantity, name in names if quantity.strip() in quantities
+        ]
+        return ",".join(f"{quantity.strip()}={name}:{unit}" for quantity, name in stated or [(quantities[0], "NAME")])
+
+    if quantity == "time":
+        return f"ms ({entry(['time'], 'ms')})"
+    if quantity == "positions":
+        return f"in m ({entry(['x', 'y'] if 'x=' in columns or not columns else ['positions'], 'm')})"
+    highest = float(np.nanmax(readings)) if readings is not None else 0.0
+    bits = next((bits for bits in COMMON_BITS if highest < 2**bits), 24)
+    volts = f"{entry(['fibres'], format(REFERENCE_V / (2**bits - 1), '.3g'))} for {bits} bits of {REFERENCE_V:g} V"
+    return f"counts ({volts}), or mV ({entry(['fibres'], 'mV')})"
+
+
 def _unit_doubts(recording: Recording) -> list[str]:
-    doubts = []
+    doubts, source = [], recording.source
     area, rate_hz = area_mm(recording), recording.rate_hz
     rest_v = float(np.nanmedian(np.abs(recording.readings)))
     if area is not None and 0 < area.max() < MIN_SPAN_MM:
-        doubts.append(f"presses span {area[0]:.4g} x {area[1]:.4g} mm: are positions in m (x=NAME:m,y=NAME:m)?")
+        doubts.append(f"positions span {area[0]:.4g} x {area[1]:.4g} mm; are they {suggest_unit(source, 'positions')}?")
     if area is not None and area.max() > MAX_SPAN_MM:
-        doubts.append(f"presses span {area[0]:.4g} x {area[1]:.4g} mm: are positions in another unit (x=NAME:UNIT)?")
+        doubts.append(f"positions span {area[0]:.4g} x {area[1]:.4g} mm; are they in another unit (x=NAME:UNIT)?")
     if rate_hz < MIN_RATE_HZ:
-        doubts.append(f"there are {rate_hz:.2g} readings a second: are times in ms (time=NAME:ms)?")
+        doubts.append(f"there are {rate_hz:.2g} readings a second; is time in {suggest_unit(source, 'time')}?")
     if rate_hz > MAX_RATE_HZ:
-        doubts.append(f"there are {rate_hz:.4g} readings a second: are times in s (time=NAME:s)?")
+        doubts.append(f"there are {rate_hz:.4g} readings a second; is time in s (time=NAME:s)?")
     if rest_v > MAX_REST_V:
-        doubts.append(f"fibres read {rest_v:.4g} V: are they counts (fibres=NAME:FACTOR), or mV (fibres=NAME:mV)?")
+        doubts.append(f"fibres rest at {rest_v:.4g} V; are they {suggest_unit(source, 'fibres', recording.readings)}?")
     return doubts
 
 

@@ -14,7 +14,7 @@ from padforge.design.morphology import Morphology
 from padforge.design.paths.keep_outs import is_outside, keep_outs
 from padforge.design.settings import Contact, PadSettings
 from padforge.sense.arrays import MAX_MM, Array, Indices, Mask, check_magnitude, check_numbers
-from padforge.sense.recording.csv_table import CsvTable
+from padforge.sense.recording.tables import read_table
 from padforge.sense.settings import RigSettings
 
 COLUMNS = ("x_mm", "y_mm", "depth_mm")
@@ -227,7 +227,7 @@ def read_plan(path: Path, depths_mm: Sequence[float]) -> PressPlan:
         path: file with the columns x_mm, y_mm and, optionally, depth_mm.
         depths_mm: depths that presses take in turn where the file has none.
     """
-    table = CsvTable(path)
+    table = read_table(path)
     if tuple(table.names) not in (COLUMNS, COLUMNS[:2]):
         raise InputError(f"{path}: header is {','.join(table.names)[:60]!r}, expected x_mm,y_mm or x_mm,y_mm,depth_mm")
     values = table.read_columns(range(len(table.names)))

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from padforge.common.files import (
     LOCK,
@@ -21,6 +21,7 @@ from padforge.common.files import (
     sync,
     temporary_folder,
 )
+from padforge.common.files import provenance as origin
 from padforge.common.validation import InputError, check_path, check_type, short_repr
 from padforge.sense.arrays import (
     MAX_FIBRES,
@@ -56,6 +57,11 @@ _ARRAYS |= dict.fromkeys(("down_command", "up_command"), np.int64)
 _CHUNK_BYTES = 2**18  # of readings that are written at once
 FIBRE_NAMES = "fibre_names"
 """Key in the source of a recording for what its fibres are called in the file that it was imported from."""
+NOTE = "note"
+"""Key in the source of a recording that says what was left out of it, or filled in."""
+PRESSES_DETECTED = {"presses": "detected"}
+"""Entry of the source of a recording whose presses were detected in its readings."""
+_MIN_READINGS = 100  # of a recording that was meant as one
 _MEASURES = {"depths_mm": (MAX_MM, "mm"), "reached_mm": (MAX_MM, "mm"), "forces_n": (MAX_N, "N")}
 
 
@@ -179,6 +185,44 @@ class Recording:
         return digest.hexdigest()
 
     @classmethod
+    def from_arrays(
+        cls,
+        readings: ArrayLike,
+        times_s: ArrayLike,
+        *,
+        down_s: ArrayLike | None = None,
+        up_s: ArrayLike | None = None,
+        presses_mm: ArrayLike | None = None,
+        **measures: ArrayLike,
+    ) -> "Recording":
+        """Make a recording of arrays.
+
+        Args:
+            readings: NaN where one is missing; shape (R, C), V.
+            times_s: of the readings, ascending; shape (R,), s.
+            down_s: when the pad began to be pressed, by the same clock; shape (Q,), s. Without it and `up_s`, presses
+                are detected in the readings.
+            up_s: when each press ended; shape (Q,), s.
+            presses_mm: position of each press from the pad's centre; shape (Q, 2), mm. By default unknown.
+            **measures: `depths_mm`, `reached_mm`, `forces_n`, as of a `Recording`; shape (Q,).
+
+        Raises:
+            InputError: arrays that do not fit together, or hold no press.
+        """
+        readings, times = check_stream(times_s, readings)[::-1]
+        source: dict[str, Any] = {"kind": "arrays"}
+        if (down_s is None) != (up_s is None):
+            raise InputError("down_s and up_s are one of them, expected both or neither")
+        if down_s is None or up_s is None:
+            down, up = detect_commands(readings, times, source)
+            source |= PRESSES_DETECTED
+        else:
+            seconds = (check_numbers(values, np.float64, name) for name, values in (("down_s", down_s), ("up_s", up_s)))
+            down, up = (np.searchsorted(times, values) for values in seconds)
+        positions = np.full((len(down), 2), np.nan) if presses_mm is None else presses_mm
+        return cls(readings, times, positions, down, up, source, **measures)  # type: ignore[arg-type]
+
+    @classmethod
     def open(cls, path: str | Path) -> "Recording":
         """Read a run directory, finished or not; `import_export.open_recording` reads files as well.
 
@@ -212,15 +256,16 @@ class Recording:
         except InputError as error:
             raise InputError(f"{path}: {error}") from error
 
-    def save(self, path: str | Path, provenance: Mapping[str, Any], replacing: bool = False) -> None:
+    def save(self, path: str | Path, provenance: Mapping[str, Any] | None = None, replacing: bool = False) -> None:
         """Write a run directory that appears complete or not at all.
 
         Args:
             path: of the folder.
-            provenance: of the recording; JSON.
+            provenance: of the recording; JSON. By default the versions of padforge and what it uses.
             replacing: whether an existing simulated recording is replaced, see `check_replaceable`; no other one is
                 ever written over, not even one that appeared meanwhile.
         """
+        provenance = origin("padforge.sense.Recording.save") if provenance is None else provenance
         check_target = check_replaceable if check_type("replacing", replacing, bool) else check_new_folder
         check_target(path := check_path("path", path))
         path = path.resolve()
@@ -309,6 +354,24 @@ def check_replaceable(path: Path) -> None:
             raise InputError(f"{path}: holds a recording of kind {kind!r}, not a simulated one; {advice}")
     with locked(path, busy_message(path)):
         pass
+
+
+def detect_commands(readings: Array, times_s: Array, source: Mapping[str, Any]) -> tuple[Indices, Indices]:
+    """Return the down and up commands (Q,) of presses that are detected in readings (R, C).
+
+    Raises:
+        InputError: the readings are none of a pad, or hold no press.
+    """
+    from padforge.sense.signals.press_detection import detect_presses, estimate_commands
+
+    placeholder = np.array([1])
+    Recording(readings, times_s, np.zeros((1, 2)), placeholder, placeholder + 1, source)  # checks the readings first
+    presses = detect_presses(readings, times_s)
+    if len(presses.touched) == 0:
+        what = "no position or number tells of one, and none is detected in the readings"
+        hint = "; a line for each press is no recording" if len(readings) < _MIN_READINGS else ""
+        raise InputError(f"has no press: {what}{hint}")
+    return estimate_commands(presses, times_s)
 
 
 def _check_source(source: object) -> None:

@@ -8,7 +8,7 @@ from scipy.interpolate import PchipInterpolator
 
 from padforge.design import Morphology
 from padforge.design.paths.curves import SPARE_LENGTH, add_spare_knots, remove_spare_knots
-from padforge.design.paths.import_plan import fit_knots
+from padforge.design.paths.knot_fitting import fit_knots
 
 
 def max_misfit(knots, points):

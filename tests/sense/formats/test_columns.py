@@ -8,13 +8,9 @@ import pytest
 
 from padforge.common.validation import InputError
 from padforge.sense import Recording
-from padforge.sense.formats.columns import (
-    PRESSES_DETECTED,
-    ColumnEntry,
-    assemble_recording,
-    match_columns,
-    parse_columns,
-)
+from padforge.sense.formats.assembly import ForeignArrays, assemble_recording
+from padforge.sense.formats.columns import ColumnEntry, match_columns, parse_columns
+from padforge.sense.recording.recording import PRESSES_DETECTED
 
 NAMES = ["t_ms", "Time [s]", "ch1", "ch2", "a,b", "a:b", "px", "py", "contact"]
 
@@ -57,9 +53,12 @@ def test_match_columns_orders_fibres_by_their_numbers() -> None:
 @pytest.mark.parametrize(
     ("mapping", "message"),
     [
-        ("", "columns are '', expected QUANTITY=NAME or QUANTITY=NAME:UNIT, where QUANTITY is one of time, fibres, x"),
+        (
+            "",
+            "columns are '', expected QUANTITY=NAME or QUANTITY=NAME:UNIT, where QUANTITY is one of time, rate, fibres, x",
+        ),
         ("time=t_ms,fibres=ch*,x=px", "name one of x and y, expected both or neither"),
-        ("time=t_ms:volt,fibres=ch*", "unit of time is 'volt', allowed is s, ms, us, min or a factor"),
+        ("time=t_ms:volt,fibres=ch*", "unit of time is 'volt', allowed is s, ms, us, µs, ns, min, h, d or a factor"),
         ("time=ch1,fibres=ch1", "fibres is 'ch1', which is named before"),
     ],
 )
@@ -83,7 +82,7 @@ NUMBERED = PRESSED * np.array([5] * 6 + [3] * 6)
 def assembled(arrays: Mapping[str, np.ndarray], **factors: float) -> Recording:
     content = {"time": TIMES, "fibres": VOLTS} | dict(arrays)
     entries = [(ColumnEntry(name, "?", factors.get(name)), content[name]) for name in content]
-    return assemble_recording(Path("f"), entries, {})
+    return assemble_recording(ForeignArrays(Path("f"), entries, {}))
 
 
 @pytest.mark.parametrize(
@@ -115,7 +114,7 @@ def test_assemble_recording_accepts_fibres_as_rows_or_columns() -> None:
         (ColumnEntry("fibres", "two", 2.0), VOLTS.T),
         *((ColumnEntry(name, ""), COMMANDS[name]) for name in COMMANDS),
     ]
-    several = assemble_recording(Path("f"), arrays, {})
+    several = assemble_recording(ForeignArrays(Path("f"), arrays, {}))
     assert np.array_equal(several.readings, np.column_stack([VOLTS[:, 1], 2 * VOLTS]))
     assert several.fibre_names == ("one", "two[0]", "two[1]")
 

@@ -1,0 +1,402 @@
+"""The recording in the arrays of a foreign file: its readings, their times, and its presses.
+
+What cannot be right is refused, or put right where that is certain, in one line that names the mapping to mend it.
+"""
+
+import re
+from bisect import bisect_right
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from padforge.common.validation import InputError
+from padforge.sense.arrays import MAX_VOLTS, Array, Indices, Mask, check_numbers
+from padforge.sense.formats.columns import ColumnEntry, naming_file
+from padforge.sense.recording.doubts import suggest_unit
+from padforge.sense.recording.recording import FIBRE_NAMES, NOTE, PRESSES_DETECTED, Recording, detect_commands
+from padforge.sense.recording.tables import UNKNOWN, name_lines
+
+Arrays = Sequence[tuple[ColumnEntry, NDArray[Any]]]
+"""Arrays of a file, each with its entry of the mapping and its own name."""
+MEASURES = {"depth": "depths_mm", "reached": "reached_mm", "force": "forces_n"}
+"""Quantities with one value a press, and their attributes of a `Recording`."""
+MAX_GAP = 3  # readings without a position that are bridged within a press
+MAX_JITTER_MM = 0.5  # between two readings, of a position that an arm or camera measures within a press
+MAX_NOISE_SHARE = 0.1  # of the largest force, below 0: a load cell that is not quite at 0
+MAX_LATE_SHARE = 0.01  # of readings whose times go back and that are left out
+WRAPS_S = (2**32 / 1e6, 2**32 / 1e3, 2**16 / 1e3, 2**16 / 1e6, 86400.0, 43200.0)
+"""After which the clocks of boards begin anew: counters of us and ms with 32 and 16 bits, and times of day."""
+
+
+@dataclass
+class ForeignArrays:
+    """What was read of a file by a mapping.
+
+    Attributes:
+        path: of the file, for messages.
+        arrays: `time` and `press` have R values; `fibres` is (R, C), (C, R), (R,) or frames (R, h, w), in one array or
+            several; `positions` is (n, 2) or (2, n), and x and y are (n,), for n readings or presses.
+        source: of the recording; the names of the fibres are added.
+        notes: what was left out in reading, each in one line.
+        line_number: number of the line of a row, for messages; by default rows are named, from 0.
+        is_own: whether padforge wrote the file: positions are exact, and every line is a reading.
+        is_held: whether values hold until the next, so that a position does not say when the pad is pressed.
+    """
+
+    path: Path
+    arrays: Arrays
+    source: Mapping[str, Any]
+    notes: list[str] = field(default_factory=list)
+    line_number: Callable[[int], int] | None = None
+    is_own: bool = False
+    is_held: bool = False
+
+
+def assemble_recording(content: ForeignArrays, presses: Arrays = ()) -> Recording:
+    """Make a recording of the arrays of a file.
+
+    Presses are where `down_command` and `up_command` are, else `press`, else where positions are missing between
+    presses; or they are detected in the readings. Of positions, depths and forces with one value a reading, a press
+    gets the one in its middle.
+
+    Args:
+        content: of the file.
+        presses: of a table of their own, as `read_presses` returns them; in place of what the file says of presses.
+
+    Raises:
+        InputError: arrays that do not fit together, or that are no recording.
+    """
+    with naming_file(content.path):
+        return _assemble(content, presses)
+
+
+def _assemble(content: ForeignArrays, presses: Arrays) -> Recording:
+    notes, arrays = list(content.notes), [*content.arrays, *presses]
+    columns: dict[str, Array] = {}
+    fibres: list[tuple[ColumnEntry, Array]] = []
+    for entry, array in arrays:
+        values = _scale(entry, entry.select(array))
+        if entry.quantity == "fibres":
+            fibres.append((entry, values))
+        elif entry.quantity == "positions" or values.size in values.shape:
+            columns[entry.quantity] = values if entry.quantity == "positions" else values.ravel()
+        else:
+            raise InputError(f"{entry.quantity} has shape {values.shape}, expected one row or column")
+    if "rate" in columns:
+        n_readings = max(fibres[0][1].shape)
+        columns["time"] = np.arange(n_readings) / columns.pop("rate")[0]
+    times = columns.pop("time")
+    fibres = [(entry, _by_readings(values, len(times))) for entry, values in fibres]
+    readings = fibres[0][1] if len(fibres) == 1 else np.column_stack([values for _, values in fibres])
+    if not np.nanmax(np.abs(readings), initial=0) <= MAX_VOLTS:
+        _check_volts(readings, content.source)
+    names = [name for each in fibres for name in _fibre_names(*each)]
+    # 1. lines without a reading, and times
+    with_values = {name: values for name, values in columns.items() if len(values) == len(times)}
+    keep, is_held = np.ones(len(times), bool), content.is_held
+    if not content.is_own:
+        keep = ~np.isnan(readings).all(axis=1)
+        if not keep.all() and keep.any():
+            present = [~np.isnan(values.reshape(len(times), -1)).all(axis=1) for values in with_values.values()]
+            if present and not np.any(present & keep):  # a table of several sources, each with lines of its own
+                is_held = True
+                columns |= {name: _hold(values) for name, values in with_values.items()}
+            notes.append(f"{(~keep).sum()} lines without any reading are no readings")
+    times, is_timed = repair_times(np.where(keep, times, np.nan), notes, content.line_number, keep)
+    rows = np.flatnonzero(is_timed)
+    if len(rows) < len(is_timed):
+        readings, times = readings[rows], times[rows]
+        columns = {name: values[rows] if len(values) == len(is_timed) else values for name, values in columns.items()}
+    # 2. presses
+    timed = {entry.quantity for entry, _ in arrays if entry.factor is not None}
+    for name in timed & {"down_command", "up_command"}:
+        # A thousandth of an interval is allowed for: times that were converted to another unit and back are rounded.
+        tolerance = 1e-3 * np.median(np.diff(times)) if len(times) > 1 else 0.0
+        columns[name] = np.searchsorted(times, columns[name] - tolerance).astype(np.float64)
+    columns = _within(columns, len(times), notes) if presses else columns
+    positions, rows = _join_positions(columns), np.arange(len(times))
+    jitter_mm = 0.0 if content.is_own else MAX_JITTER_MM
+    if positions is not None and len(positions) == len(times) and not {"press", "down_command"} & columns.keys():
+        rows = _bridge_gaps(positions, jitter_mm)
+        positions, n_bridged = positions[rows], int((rows != np.arange(len(rows))).sum())
+        if n_bridged:
+            notes.append(f"{n_bridged} readings within presses lack a position; gaps of up to {MAX_GAP} are bridged")
+    commands = _find_presses(columns, None if is_held else positions, len(times), jitter_mm)
+    source = {**content.source, FIBRE_NAMES: names}
+    if commands is None:
+        commands, source = detect_commands(readings, times, source), {**source, **PRESSES_DETECTED}
+    down, up = commands
+
+    def at_presses(name: str, values: Array) -> Array:
+        if len(values) == len(down):
+            return values
+        if len(values) != len(times):
+            expected = f"one for each of {len(down)} presses or {len(times)} readings"
+            raise InputError(f"{name} are {len(values)}, expected {expected}")
+        return values[rows[np.clip((down + up) // 2, 0, len(times) - 1)]]
+
+    measures = {name: at_presses(MEASURES[name], columns[name]) for name in MEASURES if name in columns}
+    for name in measures.keys() & {"force", "depth"}:
+        entry = next(entry for entry, _ in arrays if entry.quantity == name)
+        measures[name] = _upright(entry, measures[name], notes)
+    presses_mm = np.full((len(down), 2), np.nan) if positions is None else at_presses("positions", positions)
+    presses_mm = np.where(presses_mm == UNKNOWN, np.nan, presses_mm)
+    source |= {NOTE: "; ".join(notes)} if notes else {}
+    by_attribute: dict[str, Any] = {MEASURES[name]: values for name, values in measures.items()}
+    return Recording(readings, times, presses_mm, down, up, source, **by_attribute)
+
+
+def _scale(entry: ColumnEntry, array: NDArray[Any]) -> Array:
+    """Return values in s, V, mm or N; UNKNOWN stays what it is."""
+    array = np.asarray(array)
+    array = array.astype(np.uint8) if array.dtype.kind == "b" else array
+    values = check_numbers(array, np.float64, entry.quantity, copy=False)
+    if entry.factor in (None, 1):
+        return values
+    with np.errstate(over="ignore"):  # a recording refuses infinity
+        return np.where(values == UNKNOWN, UNKNOWN, values * entry.factor)
+
+
+def _by_readings(values: Array, n_readings: int) -> Array:
+    """Return (R, c) readings from (R, c), (c, R), (R,), or frames with R along their first or last axis."""
+    if values.ndim == 0 or n_readings not in (values.shape[0], values.shape[-1]):
+        expected = f"({n_readings}, C) or (C, {n_readings}), as time has it"
+        raise InputError(f"fibres have shape {values.shape}, expected {expected}")
+    by_readings = values if len(values) == n_readings else np.moveaxis(values, -1, 0)
+    return by_readings.reshape(n_readings, -1)
+
+
+def _fibre_names(entry: ColumnEntry, values: Array) -> list[str]:
+    """Return the names of (R, c) readings from an array: its own, with an index where it holds several fibres."""
+    if not entry.index and values.shape[1] == 1:
+        return [entry.name]
+    first = int(re.search(r"\d*", entry.index.lstrip("[:, "))[0] or 0)  # type: ignore[index]
+    return [f"{entry.name}[{first + i}]" for i in range(values.shape[1])]
+
+
+def _check_volts(readings: Array, source: Mapping[str, Any]) -> None:
+    """Raise InputError if finite readings are beyond what is allowed, with the factor that counts would have."""
+    rest = float(np.nanmedian(np.abs(readings)))
+    if np.isfinite(rest) and rest > MAX_VOLTS:
+        hint = suggest_unit(source, "fibres", readings)
+        raise InputError(f"fibres rest at {rest:.4g} V, allowed is {MAX_VOLTS:g} V; are they {hint}?")
+
+
+def _hold(values: Array) -> Array:
+    """Return values (n, ...) that hold until the next."""
+    missing = np.isnan(values.reshape(len(values), -1)).all(axis=1)
+    last = np.maximum.accumulate(np.where(missing, -1, np.arange(len(values))))
+    return np.where((last < 0).reshape(-1, *[1] * (values.ndim - 1)), np.nan, values[np.maximum(last, 0)])
+
+
+def repair_times(
+    times_s: Array, notes: list[str], line_number: Callable[[int], int] | None, readings: Mask
+) -> tuple[Array, Mask]:
+    """Put right times that do not ascend, where that is certain.
+
+    A clock that begins anew goes on; readings whose times go back are left out, if they are few; equal times are
+    spread between their neighbours.
+
+    Args:
+        times_s: NaN where missing; shape (n,), s.
+        notes: of the recording, to which what was done is added.
+        line_number: number of the line of a row.
+        readings: rows that are readings; shape (n,).
+
+    Returns:
+        Times (n,), and which of them are those of readings (n,).
+
+    Raises:
+        InputError: times go back where no clock wraps.
+    """
+
+    def name_rows(rows: Indices) -> str:
+        if line_number:
+            return name_lines([line_number(int(row)) for row in rows])
+        return f"readings {', '.join(map(str, rows[:5]))}{' and more' if len(rows) > 5 else ''} are"
+
+    rows = np.flatnonzero(~np.isnan(times_s))
+    if n_untimed := int(readings.sum()) - len(rows):
+        notes.append(f"{name_rows(np.flatnonzero(readings & np.isnan(times_s)))} left out: no time")
+        if n_untimed > max(3, MAX_LATE_SHARE * len(times_s)):
+            raise InputError(f"time is missing in {n_untimed} of {int(readings.sum())} readings, expected it in each")
+    times = times_s[rows]
+    steps = np.diff(times)
+    if not (steps <= 0).any():
+        return times_s, np.isin(np.arange(len(times_s)), rows) if len(rows) < len(times_s) else readings
+    # 1. clocks that begin anew
+    usual = float(np.median(steps[steps > 0])) if (steps > 0).any() else 0.0
+    offsets, n_wraps = np.zeros(len(times)), 0
+    for row in np.flatnonzero(steps < 0):
+        for wrap in WRAPS_S:
+            if 0 < steps[row] + wrap <= 5 * usual:
+                offsets[row + 1 :] += wrap
+                n_wraps += 1
+                break
+    times = times + offsets
+    if n_wraps:
+        notes.append(
+            f"the clock began anew {n_wraps} times; times go on"
+            if n_wraps > 1
+            else "the clock began anew once; times go on"
+        )
+    # 2. single times that go back: the longest part in order stays
+    if (np.diff(times) < 0).any():
+        in_order = _longest_ascent(times)
+        late = np.setdiff1d(np.arange(len(times)), in_order)
+        if len(late) > max(1, MAX_LATE_SHARE * len(times)):
+            row = int(np.flatnonzero(np.diff(times) < 0)[0]) + 1
+            where = f"line {line_number(int(rows[row]))}" if line_number else f"reading {row}"
+            what = f"times go back from {times[row - 1]:.10g} to {times[row]:.10g} s at {where}"
+            raise InputError(f"{what}, expected every reading later than the one before; are there several runs in it?")
+        notes.append(f"{name_rows(rows[late])} left out: times go back")
+        times, rows = times[in_order], rows[in_order]
+    # 3. equal times
+    starts = np.flatnonzero(np.append(True, np.diff(times) > 0))
+    if len(starts) < len(times):
+        if len(starts) == 1:
+            raise InputError(f"times are all {times[0]:g} s, expected every reading later than the one before")
+        notes.append(f"{len(times) - len(starts)} times equal the one before; they are spread between their neighbours")
+        # A time that several readings share is that of the middle one; at the ends readings follow at the mean rate.
+        middles = (starts + np.append(starts[1:], len(times)) - 1) / 2
+        interval = (times[-1] - times[0]) / (middles[-1] - middles[0])
+        ends_s = times[0] - interval * middles[0], times[-1] + interval * (len(times) - 1 - middles[-1])
+        knots = np.concatenate([[-1e-9], middles, [len(times) - 1 + 1e-9]])
+        times = np.interp(np.arange(len(times)), knots, np.concatenate([ends_s[:1], times[starts], ends_s[1:]]))
+    repaired, is_kept = np.full(len(times_s), np.nan), np.zeros(len(times_s), bool)
+    repaired[rows], is_kept[rows] = times, True
+    return repaired, is_kept
+
+
+def _longest_ascent(values: Array) -> Indices:
+    """Return the indices of the longest subsequence that never descends, by patience sorting."""
+    tails: list[float] = []
+    tail_rows: list[int] = []
+    before = np.full(len(values), -1)
+    for row, value in enumerate(values.tolist()):
+        length = bisect_right(tails, value)
+        before[row] = tail_rows[length - 1] if length else -1
+        tails[length : length + 1], tail_rows[length : length + 1] = [value], [row]
+    chain = [tail_rows[-1]]
+    while before[chain[-1]] >= 0:
+        chain.append(int(before[chain[-1]]))
+    return np.array(chain[::-1])
+
+
+def _within(columns: Mapping[str, Array], n_readings: int, notes: list[str]) -> dict[str, Array]:
+    """Leave out the presses of a table that lie outside of the readings."""
+    down, up = columns["down_command"], columns["up_command"]
+    is_within = (down >= 1) & (up > down) & (down < n_readings)
+    if not is_within.any():
+        raise InputError("no press of --presses lies within the readings, expected times of the same clock in s")
+    if not is_within.all():
+        notes.append(f"{(~is_within).sum()} of {len(down)} presses lie outside of the readings, and are left out")
+    return {name: values[is_within] if len(values) == len(down) else values for name, values in columns.items()}
+
+
+def _upright(entry: ColumnEntry, values: Array, notes: list[str]) -> Array:
+    """Return depths or forces of presses, which point down; a force little below 0 is 0."""
+    if np.nanmedian(np.append(values, np.nan) if np.isnan(values).all() else values) < 0:
+        factor = -1 if entry.factor is None else -entry.factor
+        what = f"{entry.quantity} is below 0 in most presses, such as {np.nanmin(values):g}"
+        raise InputError(f"{what}; does it point the other way ({entry.quantity}={entry.name}:{factor:g})?")
+    is_noise = (values < 0) & (values > -MAX_NOISE_SHARE * np.nanmax(values, initial=0))
+    if entry.quantity == "force" and is_noise.any():
+        notes.append(f"{is_noise.sum()} forces are little below 0, the least {values[is_noise].min():g} N; they are 0")
+        return np.where(is_noise, 0.0, values)
+    return values
+
+
+def _join_positions(columns: Mapping[str, Array]) -> Array | None:
+    """Return (n, 2) positions of readings or presses; None if there are none."""
+    if "x" in columns:
+        x, y = columns["x"], columns["y"]
+        if len(x) != len(y):
+            raise InputError(f"x has {len(x)} values and y {len(y)}, expected as many")
+        return np.column_stack([x, y])
+    positions = columns.get("positions")
+    if positions is not None and (positions.ndim != 2 or 2 not in positions.shape):
+        raise InputError(f"positions have shape {positions.shape}, expected (n, 2) or (2, n)")
+    return positions if positions is None or positions.shape[1] == 2 else positions.T
+
+
+def _find_presses(
+    columns: Mapping[str, Array], positions: Array | None, n_readings: int, jitter_mm: float
+) -> tuple[Indices, Indices] | None:
+    """Return the (Q,) down and up commands that the columns say; None if they say nothing."""
+    if "down_command" in columns:
+        down, up = (check_numbers(columns[name], np.int64, name) for name in ("down_command", "up_command"))
+        if len(down) != len(up):
+            raise InputError(f"down_command has {len(down)} values and up_command {len(up)}, expected as many")
+        return down, up
+    if "press" in columns:
+        press = columns["press"]
+        if len(press) != n_readings:
+            raise InputError(f"press has {len(press)} values, expected {n_readings}, one a reading")
+        missing = np.isnan(press)
+        if (press == 0).any() and missing.sum() <= max(1, MAX_LATE_SHARE * n_readings):
+            press = _hold(press)  # a cell without a number
+        return _find_runs(press[:, None], _is_pressed(press), 0.0)
+    if positions is None or len(positions) != n_readings:
+        return None
+    missing = np.isnan(positions)
+    incomplete = missing[:, 0] != missing[:, 1]
+    if incomplete.any():
+        raise InputError(f"positions have one of x and y in row {int(np.argmax(incomplete))}, expected both or neither")
+    pressed = ~missing[:, 0]
+    if not pressed.any() or pressed.all():
+        return None
+    down, up = _find_runs(positions, pressed, jitter_mm)
+    # A position that is known from some reading on, at several places, does not say when the pad is pressed.
+    is_late = jitter_mm > 0 and len(down) > 1 and pressed[down[0] :].all()
+    return None if is_late else (down, up)
+
+
+def _bridge_gaps(positions: Array, jitter_mm: float) -> Indices:
+    """Return which of (R, 2) positions each reading takes, (R,): its own, or in a short gap the last before it.
+
+    A gap is short if it has MAX_GAP readings at most, fewer than half a rest between presses, and the same position
+    before and after.
+    """
+    known = np.flatnonzero(~np.isnan(positions[:, 0]))
+    before, after = known[:-1], known[1:]
+    n_missing = after - before - 1
+    is_same = (np.abs(positions[after] - positions[before]) <= jitter_mm).all(axis=1) & (
+        positions[before, 0] != UNKNOWN
+    )
+    rests = n_missing[~is_same & (n_missing > 0)]
+    max_gap = min(MAX_GAP, (np.median(rests) - 1) // 2) if len(rests) else 0
+    rows = np.arange(len(positions))
+    for gap in np.flatnonzero(is_same & (n_missing > 0) & (n_missing <= max_gap)):
+        rows[before[gap] : after[gap]] = before[gap]
+    return rows
+
+
+def _is_pressed(press: Array) -> Mask:
+    """Return (R,) where `press` is not 0, or where it is neither missing nor negative."""
+    missing, zero = ~(press >= 0), press == 0
+    if missing.any() and zero.any():
+        raise InputError(
+            f"press is missing or negative in row {int(np.argmax(missing))} and 0 in row {int(np.argmax(zero))}, "
+            f"expected one of both where the pad is not pressed"
+        )
+    pressed = ~(missing | zero)
+    if pressed.all() or not pressed.any():
+        what = "0, missing or negative" if pressed.all() else "above 0"
+        raise InputError(f"press is nowhere {what}; without it, presses are detected in the readings")
+    return pressed
+
+
+def _find_runs(values: Array, pressed: Mask, jitter: float) -> tuple[Indices, Indices]:
+    """Return the down and up commands of presses: runs of readings that are pressed, of values (R, k) that stay.
+
+    From one reading of a run to the next, values change by the jitter at most.
+    """
+    steps = np.vstack([np.full((1, values.shape[1]), np.nan), np.abs(np.diff(values, axis=0))])
+    down = np.flatnonzero(pressed & ~(steps <= jitter).all(axis=1))
+    ends = np.append(np.flatnonzero(~pressed), len(values))
+    return down, np.minimum(ends[np.searchsorted(ends, down)], np.append(down[1:], len(values)))

@@ -1,0 +1,387 @@
+"""Columns of numbers from tables of text, as programs, loggers and spreadsheets write them.
+
+What the first lines show decides how a table is read: its encoding by the byte order mark, its separator by which one
+gives most numbers, its header as the last line of names before them, and whether a comma is a decimal point. A line
+of units may follow the header, and lines of anything may precede it. Lines are split by the module csv.
+"""
+
+import codecs
+import csv
+import re
+from array import array
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from itertools import islice
+from pathlib import Path
+
+import numpy as np
+
+from padforge.common.files import check_file
+from padforge.common.validation import InputError, short_repr
+from padforge.sense.arrays import MAX_BYTES, Array
+
+UNKNOWN = -1.7e308
+"""Stands for `?` among numbers, far from all others."""
+MISSING = {"", "nan", "na", "n/a", "#n/a", "#na", "null", "none", "-", "--", "inf", "-inf", "+inf", "#num!", "#value!"}
+MISSING |= {"ovf", "overflow", "over", "ol", "#div/0!", "missing", "infinity", "-infinity", "nan(ind)", "-nan"}
+"""Words for a value that is missing or out of range, in lower case."""
+SEPARATORS = ",;\t| "
+FALLBACK = "cp1252"
+"""Encoding of what is no UTF-8: that of Windows in western Europe and America."""
+_TRUTH = {"true": 1.0, "false": 0.0, "yes": 1.0, "no": 0.0, "on": 1.0, "off": 0.0}
+_BYTE_ORDER_MARKS = {codecs.BOM_UTF8: "utf-8-sig", codecs.BOM_UTF16_LE: "utf-16", codecs.BOM_UTF16_BE: "utf-16"}
+_N_SAMPLED = 400  # lines that show how a table is written
+_MAX_BAD_SHARE = 0.05  # of lines or cells that are left out; more say that the table is understood wrongly
+_MIN_BAD = 3
+_MAX_NAMED = 5
+_MONITOR = re.compile(r"^(\d{1,2}:\d\d:\d\d(?:[.,]\d+)?) -> ?")  # time stamps of the Arduino IDE's monitor
+_GARBAGE = re.compile("^[\x00-\x08\x0e-\x1f\x7f-\xff\ufffd]*[\x00-\x08\x0e-\x1f\xfe\xff\ufffd]")  # sent while booting
+_CLOCK = re.compile(r"(\d{1,2}):(\d\d)(?::(\d\d(?:[.,]\d+)?))?")
+_DATE = re.compile(r"\d{1,4}[-/.]\d{1,2}[-/.]\d{1,4}[T ,]+\d{1,2}:\d\d.*|\d{1,2} \w{3} \d{4} .*|" + _CLOCK.pattern)
+_THOUSANDS = re.compile(r"[-+]?\d{1,3}(,\d{3})+(\.\d*)?")
+
+
+@dataclass(frozen=True)
+class _Layout:
+    """How a table is written."""
+
+    separator: str
+    decimal_comma: bool
+    header: int  # number of the line of names; 0 without one
+    first: int  # number of the first line of values
+    names: list[str]
+    units: list[str]
+    dates: frozenset[int]  # columns of dates or times of day
+
+
+@dataclass
+class Table:
+    """A table whose columns are read by their indices.
+
+    Attributes:
+        path: of the file.
+        names: of the columns; numbers from 1 without a header.
+        units: of the columns, from a line below the header; "" without.
+        rows: first cells of the table, for people.
+        notes: what was left out in reading, each in one line.
+    """
+
+    path: Path
+    encoding: str
+    names: list[str]
+    units: list[str]
+    rows: list[list[str]]
+    notes: list[str] = field(default_factory=list)
+    _layout: _Layout = field(repr=False, default=None)  # type: ignore[assignment]
+    _lines: "array[int]" = field(repr=False, default_factory=lambda: array("q"))
+
+    @property
+    def has_header(self) -> bool:
+        """Whether a line names the columns."""
+        return self._layout.header > 0
+
+    def line_number(self, row: int) -> int:
+        """Return the number of the line, from 1, that a row was read from."""
+        return self._lines[row]
+
+    def read_columns(self, columns: Sequence[int], may_be_unknown: Sequence[int] = ()) -> Array:
+        """Return columns of numbers.
+
+        Args:
+            columns: indices.
+            may_be_unknown: columns in which `?` is UNKNOWN.
+
+        Returns:
+            (R, n), NaN where a value is missing; dates as seconds since 1970, or since midnight without a day.
+        """
+        layout, width = self._layout, len(self.names)
+        numbers, self._lines, self.notes = array("d"), array("q"), []
+        dates: dict[int, list[str]] = {column: [] for column in columns if column in layout.dates}
+        words: dict[int, dict[int, str]] = {column: {} for column in columns}  # by column and line, what is no number
+        torn: list[tuple[int, int]] = []
+        n_headers, last = 0, 0
+        garbled: list[int] = []
+        for line, row in _split(_iterate_lines(self.path, self.encoding, garbled=garbled), layout.separator):
+            if line < layout.first:
+                continue
+            last = line
+            cells = [cell.strip() for cell in row]
+            if len(cells) != width and not any(cells[width:]):
+                cells = cells[:width]
+            if len(cells) != width:
+                torn.append((line, len(cells)))
+            elif self.has_header and cells[: len(self.names)] in (self.names, self.units):
+                n_headers += 1
+            else:
+                self._lines.append(line)
+                for column in columns:
+                    if column in dates:
+                        dates[column].append(cells[column])
+                        numbers.append(np.nan)
+                        continue
+                    try:
+                        value = float(cells[column])  # most cells
+                        is_plain = "_" not in cells[column] and value - value == 0
+                    except ValueError:
+                        is_plain = False
+                    if not is_plain or (layout.decimal_comma and "." in cells[column]):
+                        value = _parse(cells[column], layout, column in may_be_unknown)
+                        if value is None:
+                            words[column][line], value = cells[column], np.nan
+                    numbers.append(value)
+        self._report(words, torn, n_headers, last)
+        if garbled:
+            self.notes.append(f"{name_lines(garbled)} read without bytes that are no text")
+        if self.encoding == FALLBACK:
+            self.notes.append(f"its text is no UTF-8 and was read as {FALLBACK} (--encoding names another)")
+        values = np.frombuffer(numbers, np.float64).reshape(-1, len(columns))
+        for column, texts in dates.items():
+            values[:, list(columns).index(column)] = _parse_dates(texts, f"{self.path}: {self.names[column]}")
+        return values
+
+    def _report(self, words: dict[int, dict[int, str]], torn: list[tuple[int, int]], n_headers: int, last: int) -> None:
+        """Note what was left out; raise InputError if it is too much."""
+        limit = max(_MIN_BAD, _MAX_BAD_SHARE * len(self._lines))
+        if len(torn) > limit:
+            line, found = torn[0]
+            raise InputError(f"{self.path}: line {line} has {found} values, expected {len(self.names)}")
+        if torn and torn[-1][0] == last:
+            self.notes.append(f"line {torn.pop()[0]}, the last, is cut off and left out")
+        if torn:
+            counts = ", ".join(dict.fromkeys(str(found) for _, found in torn))
+            what = f"{counts} values, expected {len(self.names)}"
+            self.notes.append(f"{name_lines([line for line, _ in torn])} left out: {what}")
+        if n_headers:
+            self.notes.append(f"{n_headers} repeated header lines are left out")
+        for column, cells in words.items():
+            if cells:
+                line, word = next(iter(cells.items()))
+                what = f"column {short_repr(self.names[column])} holds no number but {short_repr(word)}"
+                if len(cells) > limit:
+                    raise InputError(f"{self.path}: line {line}: {what}")
+                self.notes.append(f"{name_lines(list(cells))} a value missing: {what}")
+
+
+def name_lines(lines: Sequence[int]) -> str:
+    """Name lines by their numbers and how many more there are, as "line 3 is" or "lines 3, 4 and 2 more are"."""
+    named = ", ".join(map(str, lines[:_MAX_NAMED]))
+    more = f" and {len(lines) - _MAX_NAMED} more" if len(lines) > _MAX_NAMED else ""
+    return f"lines {named}{more} are" if len(lines) > 1 else f"line {named} is"
+
+
+def read_table(path: Path, encoding: str = "") -> Table:
+    """Open a table; its columns are read by `Table.read_columns`.
+
+    Args:
+        path: of the file.
+        encoding: of its text; by default by its byte order mark, else UTF-8, else Windows' cp1252.
+
+    Raises:
+        InputError: it cannot be read, or is no text.
+    """
+    encoding = encoding or _find_encoding(check_file(path, MAX_BYTES))
+    sample = list(islice(_iterate_lines(path, encoding, comments=True), _N_SAMPLED))
+    layout = _find_layout(sample)
+    rows = [row for line, row in _split(iter(sample), layout.separator) if line >= layout.first]
+    return Table(path, encoding, layout.names, layout.units, rows, _layout=layout)
+
+
+@contextmanager
+def _readable(path: Path) -> Iterator[None]:
+    try:
+        yield
+    except LookupError as error:
+        raise InputError(f"--encoding: {error}") from error
+    except (UnicodeError, csv.Error) as error:
+        raise InputError(f"{path}: no table of text ({error}); --encoding names another encoding") from error
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror})") from error
+
+
+def _find_encoding(path: Path) -> str:
+    with _readable(path), path.open("rb") as file:
+        start = file.read(400)
+        for mark, encoding in _BYTE_ORDER_MARKS.items():
+            if start.startswith(mark):
+                return encoding
+        if len(start) > 3 and not any(start[1::2]):
+            return "utf-16-le"
+        file.seek(0)
+        decoder = codecs.getincrementaldecoder("utf-8")()
+        try:
+            while piece := file.read(2**20):
+                decoder.decode(piece)
+        except UnicodeDecodeError:
+            return FALLBACK
+    return "utf-8"
+
+
+def _iterate_lines(
+    path: Path, encoding: str, comments: bool = False, garbled: list[int] | None = None
+) -> Iterator[tuple[int, str]]:
+    """Yield the lines of a file that hold anything, with their numbers from 1; comments begin with #.
+
+    Bytes that are no text, of a board that boots or a card that lost power, are left out; `garbled` gets their lines.
+    """
+    errors = "replace" if encoding == FALLBACK else "strict"  # a few of its bytes are nothing
+    with _readable(path), path.open(encoding=encoding, errors=errors) as file:
+        for number, line in enumerate(file, 1):
+            text = _GARBAGE.sub("", line).replace("\0", "")
+            if garbled is not None and text != line:
+                garbled.append(number)
+            line = text.rstrip("\n")
+            if line.strip() and (comments or not line.startswith("#")):
+                yield number, line
+
+
+def _split(lines: Iterator[tuple[int, str]], separator: str) -> Iterator[tuple[int, list[str]]]:
+    """Yield the cells of lines, with the number of the last line of each row: a quoted cell may go over several."""
+    number = 0
+
+    def texts() -> Iterator[str]:
+        nonlocal number
+        for number, line in lines:
+            line = _MONITOR.sub(rf"\1{separator}", line)
+            yield " ".join(line.split()) if separator == " " else line
+
+    for row in csv.reader(texts(), delimiter=separator):
+        yield number, row
+
+
+def _find_layout(sample: list[tuple[int, str]]) -> _Layout:
+    comments = [(number, line.lstrip("# ")) for number, line in sample if line.startswith("#")]
+    lines = [(number, line) for number, line in sample if not line.startswith("#")]
+    separator, first = "", 0
+    if lines and re.fullmatch(r"\W?sep=.\W*", lines[0][1]):  # Excel writes it, in quotes or not
+        separator, first = lines[0][1].strip('"')[4], 1
+    lines = lines[first:]
+    split = {each: list(_split(iter(lines), each)) for each in separator or SEPARATORS}
+    separator = max(split, key=lambda each: _n_values([row for _, row in split[each]]))
+    rows = [(number, [cell.strip() for cell in row]) for number, row in split[separator]]
+    # 1. columns of values, and the first line that holds nothing else in them
+    width = _width([row for _, row in rows])
+    table = [row for _, row in rows if len(row) == width]
+    shares = [np.mean([_is_value(cell) for cell in cells if cell] or [True]) for cells in zip(*table, strict=True)]
+    is_first = (len(row) == width and any(map(_is_number, row)) and _fits(row, shares) for _, row in rows)
+    start = next((i for i, is_data in enumerate(is_first) if is_data), len(rows))
+    number = rows[start][0] if start < len(rows) else (rows[-1][0] + 1 if rows else 1)
+    # 2. the lines of names and units before it
+    above = [(line, row) for line, row in rows[:start] if 2 * sum(map(bool, row)) >= width]
+    while above and len(above[-1][1]) == width != len(above[0][1]):
+        above.pop(0)
+    if not above and comments and comments[-1][0] < number:
+        commented = [(line, row) for line, row in _split(iter(comments[-1:]), _most(comments[-1][1], separator))]
+        above = [(line, [cell.strip() for cell in row]) for line, row in commented if len(row) in (width, 1)]
+        above = above if len(rows) == 0 or (above and len(above[0][1]) == width) else []
+    header, names = max(above, key=lambda item: sum(map(bool, item[1])), default=(0, []))
+    units = above[-1][1] if above and above[-1][0] > header else []
+    names = [*names, *("" if not any(column) else str(i) for i, column in _columns(table, len(names)))]
+    if not above:
+        names = [str(i + 1) for i in range(width)]
+    if names and _CLOCK.fullmatch(names[0]):
+        names[0] = "received"  # the monitor stamped the header as well
+    # 3. how numbers are written
+    values = [cell for _, row in rows[start:] for cell in row]
+    has_comma = any(re.fullmatch(r"[-+]?\d*,\d+", cell) for cell in values)
+    has_point = any(re.fullmatch(r"[-+]?\d*\.\d+", cell) for cell in values)
+    columns = zip(*[row for _, row in rows[start:] if len(row) == width], strict=True)
+    dates = frozenset(
+        i for i, cells in enumerate(columns) if 2 * sum(bool(_DATE.fullmatch(c)) for c in cells) > len(cells)
+    )
+    return _Layout(
+        separator,
+        has_comma and not has_point,
+        header,
+        number,
+        names,
+        [*units, *[""] * (len(names) - len(units))],
+        dates,
+    )
+
+
+def _columns(table: list[list[str]], first: int) -> list[tuple[int, tuple[str, ...]]]:
+    """Return the columns from `first` on, with their numbers from 1."""
+    columns = list(zip(*table, strict=True))
+    return [(i + 1, columns[i]) for i in range(first, len(columns))]
+
+
+def _most(line: str, separator: str) -> str:
+    """Return the separator that a header has most of, or the table's."""
+    return separator if separator in line else max(SEPARATORS, key=line.count)
+
+
+def _n_values(rows: list[list[str]]) -> int:
+    """Return the number of values in the rows of usual width; 0 of one column."""
+    width = _width(rows)
+    return sum(_is_number(cell) for row in rows if len(row) == width for cell in row) if width > 1 else 0
+
+
+def _width(rows: list[list[str]]) -> int:
+    """Return the usual number of cells of rows that hold numbers."""
+    widths = Counter(len(row) for row in rows if any(map(_is_number, row))) or Counter(map(len, rows))
+    return widths.most_common(1)[0][0] if widths else 0
+
+
+def _fits(row: list[str], shares: Sequence[float]) -> bool:
+    return all(not cell or _is_value(cell) for cell, share in zip(row, shares, strict=True) if share > 0.5)
+
+
+def _is_number(cell: str) -> bool:
+    try:
+        float(cell.strip().replace(",", "."))
+    except ValueError:
+        return bool(_THOUSANDS.fullmatch(cell.strip()))
+    return "_" not in cell
+
+
+def _is_value(cell: str) -> bool:
+    word = cell.strip().lower()
+    return word in MISSING or word in _TRUTH or word == "?" or _is_number(word) or bool(_DATE.fullmatch(cell.strip()))
+
+
+def _parse(cell: str, layout: _Layout, may_be_unknown: bool) -> float | None:
+    """Return the number of a cell, NaN of one that is missing; None of one that is neither."""
+    word = cell.lower()
+    if word in MISSING:
+        return np.nan
+    if word in _TRUTH:
+        return _TRUTH[word]
+    if word == "?" and may_be_unknown:
+        return UNKNOWN
+    if layout.decimal_comma:
+        cell = cell.replace(".", "").replace(",", ".")
+    elif _THOUSANDS.fullmatch(cell) and (layout.separator == "," or "." in cell):
+        cell = cell.replace(",", "")
+    elif layout.separator != ",":
+        cell = cell.replace(",", ".")
+    try:
+        return float(cell) if "_" not in cell else None
+    except ValueError:
+        return None
+
+
+def _parse_dates(texts: list[str], what: str) -> Array:
+    """Return (R,) dates in s since 1970, or times of day in s since midnight; NaN where one is missing."""
+    texts = [text.replace(",", ".") for text in texts]
+    clocks = [_CLOCK.fullmatch(text) for text in texts]
+    if any(clocks):
+        parts = [[float(part or 0) for part in clock.groups()] if clock else [np.nan] * 3 for clock in clocks]
+        return np.array(parts) @ [3600.0, 60.0, 1.0]
+    try:
+        times = np.array([text.removesuffix("Z") or "NaT" for text in texts], "datetime64[ns]")
+    except ValueError:  # not as ISO 8601 has them
+        try:
+            import pandas
+        except ImportError as error:
+            raise InputError(
+                f"{what}: dates such as {texts[0]!r} need pandas: pip install 'padforge[tables]'"
+            ) from error
+        is_european = bool(re.match(r"\d{1,2}\.", texts[0]))
+        dates = pandas.to_datetime(
+            pandas.Series(texts), format="mixed", dayfirst=is_european, errors="coerce", utc=True
+        )
+        times = dates.dt.tz_localize(None).to_numpy("datetime64[ns]")
+    seconds = times.astype(np.int64) / 1e9
+    return np.where(np.isnat(times), np.nan, seconds)
