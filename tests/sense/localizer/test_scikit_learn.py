@@ -33,7 +33,7 @@ def test_any_regressor_follows_the_windows(recording: Recording) -> None:
     pipeline = make_pipeline(PressWindows(), KNeighborsRegressor())
     predicted = cross_val_predict(pipeline, recording, recording.presses_mm, cv=KFold(2))
     guess = np.abs(recording.presses_mm - recording.presses_mm.mean(axis=0)).mean()
-    assert distances(predicted, recording.presses_mm).mean() < 0.5 * guess
+    assert distances(np.asarray(predicted), recording.presses_mm).mean() < 0.5 * guess
 
 
 def test_windows_need_positions_and_a_fit(recording: Recording) -> None:
