@@ -25,14 +25,19 @@ def write_report(folder: Path) -> Path:
         Fault: some results are of another pad or recording; the first section of the page lists them.
     """
     from padforge.common.page import PageSection, collapsible, page, paragraph, table
-    from padforge.design.report import FORMAT as DESIGN_FORMAT
-    from padforge.design.report import contact_sections, design_sections, press_sections
+    from padforge.design import contact_comparison
+    from padforge.design import report as design
+    from padforge.fabricate import export
     from padforge.fabricate.outputs.report import fabrication_sections
+    from padforge.sense.localizer import evaluation
+    from padforge.sense.recording import run_directory
+    from padforge.sense.report import identification
     from padforge.sense.report import sections as sense
-    from padforge.sense.report.identification import identification_sections
+    from padforge.sense.studies import fibre_loss
 
     def write_design(folder: Path, document: Mapping[str, Any]) -> list[PageSection]:
-        return [*design_sections(folder, document), *press_sections(document, _max_strain(folder))]
+        max_strain = _max_strain(folder, export.FORMAT)
+        return [*design.design_sections(folder, document), *design.press_sections(document, max_strain)]
 
     folder = check_path("folder", folder)
     recording = cache(lambda: sense.recording_digest(folder))
@@ -40,13 +45,13 @@ def write_report(folder: Path) -> Path:
     provenance: list[list[object]] = []
     mismatches: list[str] = []
     for format_, file, write_sections in (
-        (DESIGN_FORMAT, "design.json", write_design),
-        ("padforge-fabrication/1", "fabrication.json", fabrication_sections),
-        ("padforge-recording/1", "recording/start.json", sense.recording_sections),
-        ("padforge-identification/1", "identification.json", identification_sections),
-        ("padforge-calibration/1", "calibration.json", sense.calibration_sections),
-        ("padforge-fibre-loss/1", "fibre_loss.json", sense.fibre_loss_sections),
-        ("padforge-contacts/1", "contacts.json", contact_sections),
+        (design.FORMAT, "design.json", write_design),
+        (export.FORMAT, "fabrication.json", fabrication_sections),
+        (run_directory.FORMAT, "recording/start.json", sense.recording_sections),
+        (identification.FORMAT, "identification.json", identification.identification_sections),
+        (evaluation.FORMAT, "calibration.json", sense.calibration_sections),
+        (fibre_loss.FORMAT, "fibre_loss.json", sense.fibre_loss_sections),
+        (contact_comparison.FORMAT, "contacts.json", design.contact_sections),
     ):
         if (path := folder / file).exists():
             document, name = read_json(path, format_), format_.removeprefix("padforge-").partition("/")[0]
@@ -76,13 +81,13 @@ def write_report(folder: Path) -> Path:
     return folder / "report.html"
 
 
-def _max_strain(folder: Path) -> float | None:
+def _max_strain(folder: Path, format_: str) -> float | None:
     """Return the elongation that the fibres of the mould in a folder bear; None if there is none, or it is unknown."""
     path = folder / "fabrication.json"
     if not path.exists():
         return None
     with reraise_as_input_error(path):
-        max_strain = read_json(path, "padforge-fabrication/1")["fibre"]["max_strain"]
+        max_strain = read_json(path, format_)["fibre"]["max_strain"]
         return None if max_strain is None else float(max_strain)
 
 
