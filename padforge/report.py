@@ -32,7 +32,7 @@ def write_report(folder: Path) -> Path:
     from padforge.sense.report.identification import identification_sections
 
     def write_design(folder: Path, document: Mapping[str, Any]) -> list[PageSection]:
-        return [*design_sections(folder, document), *press_sections(document, _max_strain(folder))]
+        return [*design_sections(folder, document), *press_sections(document, *_materials(folder))]
 
     folder = check_path("folder", folder)
     recording = cache(lambda: sense.recording_digest(folder))
@@ -76,14 +76,16 @@ def write_report(folder: Path) -> Path:
     return folder / "report.html"
 
 
-def _max_strain(folder: Path) -> float | None:
-    """Return the elongation that the fibres of the mould in a folder bear; None if there is none, or it is unknown."""
+def _materials(folder: Path) -> tuple[Any, ...]:
+    """Return what `press_sections` asks of the materials of the mould in a folder; of the strain alone without one."""
     path = folder / "fabrication.json"
     if not path.exists():
-        return None
+        return (None,)
     with reraise_as_input_error(path):
-        max_strain = read_json(path, "padforge-fabrication/2")["fibre"]["max_strain"]
-        return None if max_strain is None else float(max_strain)
+        document = read_json(path, "padforge-fabrication/2")
+        max_strain, silicone = document["fibre"]["max_strain"], document["silicone"]
+        strain = None if max_strain is None else float(max_strain)
+        return (strain, (silicone["name"], float(silicone["modulus_kpa"]))) if silicone["modulus_kpa"] else (strain,)
 
 
 def _find_mismatches(
