@@ -31,7 +31,15 @@ MODELS = (PadSettings, Contact, SearchSettings, RulesSettings)  # what a design 
 WINDOWS_DEVICE = re.compile(r"(con|prn|aux|nul|com\d|lpt\d)(\.|$)", re.IGNORECASE)
 # makes the mould of a pad into a folder, and returns its costs by the keys of COSTS
 MakePad = Callable[[Morphology, Spec, Path], Mapping[str, Any]]
-COSTS = {"mould_ml": "mould (ml)", "silicone_ml": "silicone (ml)", "failed": "failed checks"}
+# columns that not every pad has, with their units
+COSTS = {
+    "half_width_mm": ("width", "mm"),
+    "force_n": ("force", "N"),
+    "strain_percent": ("strain", "%"),
+    "mould_ml": ("mould", "ml"),
+    "silicone_ml": ("cast", "ml"),
+    "failed": ("faults", ""),
+}
 
 
 @dataclass(frozen=True)
@@ -147,6 +155,7 @@ def _evaluate(variant: Variant, pad: Morphology, seed: int | None) -> dict[str, 
         results = errors_by_contact(beside_straight(pad), contacts, pad_settings, search)
     errors_mm = {name: {r.pad: list(r.errors_mm) for r in results if r.contact == name} for name in contacts}
     main, *others = errors_mm
+    straight = Morphology.straight(pad.layout)
     return {
         "name": variant.name,
         "fibres": list(pad.layout.counts),
@@ -154,6 +163,8 @@ def _evaluate(variant: Variant, pad: Morphology, seed: int | None) -> dict[str, 
         "knots": pad.knots.shape[1] - 2,
         "length_mm": float(lengths(pad).sum() * pad.unit_mm),
         "crossings": len(crossings(pad)),
+        "straight_length_mm": float(lengths(straight).sum() * pad.unit_mm),
+        "straight_crossings": len(crossings(straight)),
         "errors_mm": errors_mm[main]["designed"],
         "straight_mm": errors_mm[main]["straight"],
         "others": {
@@ -165,27 +176,30 @@ def _evaluate(variant: Variant, pad: Morphology, seed: int | None) -> dict[str, 
 
 
 def comparison_lines(document: Mapping[str, Any]) -> list[str]:
-    """Format a comparison as a table of text.
+    """Format a comparison as two tables of text, of costs and of errors, within 100 columns for short names.
 
-    Below a pad that differs from straight fibres are rows of these, under the assumed contact and under others.
+    Widths are half widths of a press, strains the greatest stretch of a fibre under it, cast the silicone, and faults
+    failed checks of the mould. Below a pad that differs from straight fibres are the errors of these, and of both under
+    other contacts.
     """
     rows = document["rows"]
+    costs = {key: heads for key, heads in COSTS.items() if any(key in row for row in rows)}
+    names, units = zip(("fibre", "m"), ("crossings", ""), *costs.values(), strict=True)
+    table = [["pad", "fibres", "knots", *names], ["", "", "", *units]]
     n_errors = max(len(row["errors_mm"]) for row in rows)
-    columns = {"half_width_mm": "half width (mm)", **COSTS}
-    costs = {key: name for key, name in columns.items() if any(key in row for row in rows)}
-    header = ["pad", "fibres", "knots", "fibre (m)", "crossings", *costs.values()]
-    table = [[*header, *(f"{n} failed (mm)" for n in range(n_errors))]]
+    errors = [["error (mm) with failed fibres", *map(str, range(n_errors))]]
     for row in rows:
         cells = [row["name"], "{} + {}".format(*row["fibres"]), str(row["knots"]), f"{row['length_mm'] / 1000:.2f}"]
-        cells += [str(row["crossings"]), *(f"{row[key]:.3g}" if key in row else "-" for key in costs)]
-        table.append([*cells, *(f"{error:.2f}" for error in row["errors_mm"])])
+        table.append([*cells, str(row["crossings"]), *(f"{row[key]:.3g}" if key in row else "-" for key in costs)])
+        errors.append([row["name"], *(f"{error:.2f}" for error in row["errors_mm"])])
         if row["errors_mm"] != row["straight_mm"]:
-            blank = [""] * (len(header) - 1)
-            table.append(["  straight fibres", *blank, *(f"{error:.2f}" for error in row["straight_mm"])])
+            cells = ["  straight fibres", "", "", f"{row['straight_length_mm'] / 1000:.2f}"]
+            table.append([*cells, str(row["straight_crossings"]), *[""] * len(costs)])
+            errors.append(["  straight fibres", *(f"{error:.2f}" for error in row["straight_mm"])])
             for contact, other in row["others"].items():
                 pairs = zip(other["errors_mm"], other["straight_mm"], strict=True)
-                table.append([f"  {contact}", *blank, *(f"{a:.2f} / {b:.2f}" for a, b in pairs)])
-    return text_table(table)
+                errors.append([f"  {contact}", *(f"{a:.2f} / {b:.2f}" for a, b in pairs)])
+    return [*text_table(table), "", *text_table(errors)]
 
 
 def _draw_comparison(rows: Sequence[Mapping[str, Any]], path: Path) -> None:

@@ -414,6 +414,22 @@ def contact_press(contact: Contact) -> LayerPress:
     return solve_press(contact.tool, contact.tool_radius_mm, contact.depth_mm, contact.thickness_mm, contact.base)
 
 
+def fibre_strains(contact: Contact) -> list[tuple[float, float]]:
+    """Compute the greatest strains of the horizontal and of the vertical fibres under a press.
+
+    Args:
+        contact: a layer.
+
+    Returns:
+        By how much fibres are pressed flat and stretched, relative to their size.
+    """
+    press = contact_press(contact)
+    distances_mm = np.linspace(0, 2 * press.contact_radius_mm, 100)
+    heights_mm = [contact.thickness_mm - depth_mm for depth_mm in contact.fibre_depths_mm]
+    strains = [press.strains(distances_mm, height_mm, FIBRE_BLUR_MM) for height_mm in heights_mm]
+    return [(float(s.compressive.max()), float(max(s.radial.max(), s.hoop.max()))) for s in strains]
+
+
 def describe_large_strain(contact: Contact) -> str:
     """Say that the linear layer is strained by more than 1, which no real one can be; return "" if it is not.
 

@@ -22,6 +22,7 @@ from padforge.design.optimize.search import (
     settings_for_twin,
     state_folders,
 )
+from padforge.design.paths.curves import crossings, lengths
 from padforge.design.report import FORMAT, draw_plan
 from padforge.design.settings import Contact, PadSettings, RulesSettings, SearchSettings
 
@@ -164,9 +165,19 @@ def summary_lines(result: SearchResult, out: Path) -> list[str]:
         f"design: {len(result.morphology.knots)} fibres in {result.seconds:.1f} s{stopped}"
         f" -> {out / 'morphology.json'}",
         *_error_lines(result),
+        _amount_line(result.morphology),
         *(violations or ["  all rules hold" if result.enforced else "  rules are not enforced"]),
         *([f"  ... and {remaining} more"] if remaining > 0 else []),
     ]
+
+
+def _amount_line(pad: Morphology) -> str:
+    """State the length of fibre between the pad's edges, and the crossings, beside those of straight fibres."""
+    designed, straight = (
+        f"{lengths(fibres).sum() * pad.unit_mm / 1000:.2f} m, {len(crossings(fibres))} crossings"
+        for fibres in (pad, Morphology.straight(pad.layout))
+    )
+    return f"  fibre           {designed}; straight fibres {straight}"
 
 
 def _error_lines(result: SearchResult) -> list[str]:

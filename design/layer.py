@@ -33,8 +33,14 @@ from padforge.design.settings import Base, Tool
 
 Array = NDArray[np.float64]
 
-REDUCED_MODULUS_KPA = 55 / (1 - 0.5**2)
-"""E* of EcoFlex 00-20, kPa: modulus 55 kPa at 100 % strain (manufacturer's data sheet), incompressible."""
+
+def reduced_modulus_kpa(modulus_kpa: float) -> float:
+    """Return E* = E / (1 - nu^2) of an incompressible material, nu = 1/2, from its Young's modulus E, kPa."""
+    return modulus_kpa / (1 - 0.5**2)
+
+
+REDUCED_MODULUS_KPA = reduced_modulus_kpa(55)
+"""E* of EcoFlex 00-20, kPa: modulus at 100 % strain by the manufacturer's data sheet."""
 FINGER_COMPLIANCE = 1.0
 """Compliance of a fingertip's pulp as a multiple of the pad's: both are tens of kPa soft."""
 TERMS = 16

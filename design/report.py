@@ -20,8 +20,15 @@ from padforge.common.plotting import (
     style_axes,
 )
 from padforge.common.validation import InputError, check_array, check_type
-from padforge.design.contact import FIBRE_BLUR_MM, contact_press, half_width_mm, half_widths_mm, profile_weights
-from padforge.design.layer import LayerPress
+from padforge.design.contact import (
+    FIBRE_BLUR_MM,
+    contact_press,
+    fibre_strains,
+    half_width_mm,
+    half_widths_mm,
+    profile_weights,
+)
+from padforge.design.layer import LayerPress, reduced_modulus_kpa
 from padforge.design.settings import Contact, Corners, PadSettings, RulesSettings
 
 if TYPE_CHECKING:
@@ -257,31 +264,32 @@ def _sink(press: LayerPress, r: "Array", height_mm: float, steps: int = 6) -> "A
     return np.sum([press.strains(r, z, FIBRE_BLUR_MM).compressive for z in heights], axis=0) * height_mm / steps
 
 
-def press_sections(document: Mapping[str, Any], max_strain: float | None) -> list[PageSection]:
+def press_sections(
+    document: Mapping[str, Any], max_strain: float | None, silicone: tuple[str, float] = ("EcoFlex 00-20", 55)
+) -> list[PageSection]:
     """Return the section on the press that a pad is designed for, with its picture; none unless a layer.
 
     Args:
         document: its `design.json`; a damaged one raises any of the built-in errors.
         max_strain: elongation that the fibres bear, relative to their length; None if unknown.
+        silicone: name and Young's modulus, kPa.
     """
     settings = document["provenance"]["settings"]
     contact = Contact(**settings["contact"])
     if contact.model != "layer":
         return []
     press = contact_press(contact)
-    distances = np.linspace(0, 2 * press.contact_radius_mm, 100)
+    force_n = press.force_n(reduced_modulus_kpa(silicone[1]))
     rows = []
-    for (name, _), depth, width in zip(FAMILIES, contact.fibre_depths_mm, half_widths_mm(contact), strict=True):
-        strains = press.strains(distances, contact.thickness_mm - depth, FIBRE_BLUR_MM)
-        stretch = float(max(strains.radial.max(), strains.hoop.max()))
+    families = zip(FAMILIES, contact.fibre_depths_mm, half_widths_mm(contact), fibre_strains(contact), strict=True)
+    for (name, _), depth, width, (squeeze, stretch) in families:
         result = "-" if max_strain is None else "pass" if stretch <= max_strain else "warn"
         bears = "-" if max_strain is None else f"{max_strain:.0%}"
-        squeeze = float(strains.compressive.max())
         rows.append([name, depth, f"{width:.1f}", f"{squeeze:.0%}", f"{stretch:.0%}", bears, result])
     lead = (
         f"A {contact.tool} of {contact.tool_radius_mm:g} mm, pressed {contact.depth_mm:g} mm deep into silicone of"
         f" {contact.thickness_mm:g} mm, touches it within {press.contact_radius_mm:.1f} mm and takes"
-        f" {press.force_n():.1f} N on EcoFlex 00-20. Fibres respond to being pressed flat and stretched, by the strains"
+        f" {force_n:.1f} N on {silicone[0]}. Fibres respond to being pressed flat and stretched, by the strains"
         " of an elastic layer, which are small ones: large presses exceed what it says."
     )
     caption = "The press in section, true to scale, and the weight of an element of a fibre by its distance from it."

@@ -160,7 +160,13 @@ def _line(finding: dict[str, Any]) -> str:
 
 
 def mould_costs(pad: "Morphology", spec: "Spec", folder: Path) -> dict[str, float]:
-    """Build the mould of a pad, write fabrication.json and .stl to `folder`, and count ml and failed checks."""
+    """Build the mould of a pad, write fabrication.json and .stl to `folder`, and return what it costs.
+
+    That is ml, failed checks, and of a layer the force of a press and the greatest stretch of a fibre under it.
+    """
+    from padforge.design.contact import contact_press, fibre_strains
+    from padforge.design.layer import reduced_modulus_kpa
+    from padforge.design.settings import read_contact
     from padforge.fabricate.export import build as build_files
 
     from .settings import FabricationSettings
@@ -168,4 +174,10 @@ def mould_costs(pad: "Morphology", spec: "Spec", folder: Path) -> dict[str, floa
     settings = FabricationSettings.from_spec(spec)
     result = build_files(pad, folder, ("stl",), settings)
     failed = sum(finding.status == "fail" for finding in result.findings)
-    return {"mould_ml": result.mould_volume_ml, "silicone_ml": result.silicone_volume_ml, "failed": failed}
+    costs = {"mould_ml": result.mould_volume_ml, "silicone_ml": result.silicone_volume_ml, "failed": failed}
+    contact, modulus_kpa = read_contact(spec), settings.silicone.material.modulus_kpa
+    if contact.model == "layer":
+        costs["strain_percent"] = 100 * max(stretch for _, stretch in fibre_strains(contact))
+        if modulus_kpa:
+            costs["force_n"] = contact_press(contact).force_n(reduced_modulus_kpa(modulus_kpa))
+    return costs

@@ -38,9 +38,9 @@ from padforge.fabricate.fibre_placement import Step, check_toolpath, gcode, plan
 from padforge.fabricate.materials import PLASTICS
 from padforge.fabricate.mesh import build_mesh, mesh_arrays, write_3mf, write_stl
 from padforge.fabricate.mould import Body, bed_frame, lid_holes, printed_bodies, sizes
-from padforge.fabricate.outputs.drawings import ORIENTATION_FILE, tracks_dxf, tracks_svg
+from padforge.fabricate.outputs.drawings import CROSSING_FILE, ORIENTATION_FILE, tracks_dxf, tracks_svg
 from padforge.fabricate.outputs.laying_page import laying_document, laying_page, pad_document
-from padforge.fabricate.outputs.pictures import draw_mould, draw_orientation, draw_toolpath, draw_tracks
+from padforge.fabricate.outputs.pictures import draw_crossing, draw_mould, draw_orientation, draw_toolpath, draw_tracks
 from padforge.fabricate.plan import Plan
 from padforge.fabricate.settings import DEFAULTS, FabricationSettings
 
@@ -106,6 +106,7 @@ class Build:
         findings: of all checks.
         silicone: to mix.
         adhesive: volume of the tracks that it seals, by step of laying.
+        order: amounts to order, and estimated hours of work.
         fibre: material of the fibres.
         fibres: one entry per fibre, in the order of their numbers.
         laying_order: numbers of the fibres laid in each step.
@@ -126,6 +127,7 @@ class Build:
     findings: list[Finding]
     silicone: dict[str, Any]
     adhesive: dict[str, Any]
+    order: dict[str, Any]
     fibre: dict[str, Any]
     fibres: list[dict[str, Any]]
     laying_order: list[list[int]]
@@ -254,6 +256,8 @@ def build(
             fabrication.findings.append(_describe_cad(fabrication))
     result = _compile_build(fabrication, list(writers), origin)
     writers[ORIENTATION_FILE] = partial(draw_orientation, plan)
+    if plan.crossings:
+        writers[CROSSING_FILE] = partial(draw_crossing, plan)
     writers["laying.md"] = partial(_write_utf8, text=laying_page(result.to_dict()))
     return _write_files(out, writers, result)
 

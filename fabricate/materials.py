@@ -28,6 +28,7 @@ class Silicone:
         pot_life_min: time in which the mix can be poured.
         cure_h: time until the casting can be demoulded.
         shrinkage: relative difference in length between the mould and the cured casting.
+        modulus_kpa: stress over strain at 100 % strain; None is unknown.
     """
 
     name: str
@@ -36,6 +37,7 @@ class Silicone:
     pot_life_min: float
     cure_h: float
     shrinkage: float
+    modulus_kpa: float | None = None
 
 
 @dataclass(frozen=True)
@@ -61,15 +63,15 @@ _EQUAL = (1.0, 1.0)
 _SHRINKAGE = 0.001
 """The bulletins say "< 0.001 in/in" for every grade here: the maximum."""
 _GRADES = (
-    Silicone("EcoFlex 00-10", 1.04, _EQUAL, 30, 4, _SHRINKAGE),
-    Silicone("EcoFlex 00-20", 1.07, _EQUAL, 30, 4, _SHRINKAGE),
-    Silicone("EcoFlex 00-30", 1.07, _EQUAL, 45, 4, _SHRINKAGE),
-    Silicone("EcoFlex 00-50", 1.07, _EQUAL, 18, 3, _SHRINKAGE),
-    Silicone("Dragon Skin 10 fast", 1.07, _EQUAL, 8, 1.25, _SHRINKAGE),
-    Silicone("Dragon Skin 10 medium", 1.07, _EQUAL, 20, 5, _SHRINKAGE),
-    Silicone("Dragon Skin 10 slow", 1.07, _EQUAL, 45, 7, _SHRINKAGE),
-    Silicone("Dragon Skin 20", 1.08, _EQUAL, 25, 4, _SHRINKAGE),
-    Silicone("Dragon Skin 30", 1.08, _EQUAL, 45, 16, _SHRINKAGE),
+    Silicone("EcoFlex 00-10", 1.04, _EQUAL, 30, 4, _SHRINKAGE, 55),
+    Silicone("EcoFlex 00-20", 1.07, _EQUAL, 30, 4, _SHRINKAGE, 55),
+    Silicone("EcoFlex 00-30", 1.07, _EQUAL, 45, 4, _SHRINKAGE, 69),
+    Silicone("EcoFlex 00-50", 1.07, _EQUAL, 18, 3, _SHRINKAGE, 83),
+    Silicone("Dragon Skin 10 fast", 1.07, _EQUAL, 8, 1.25, _SHRINKAGE, 151),
+    Silicone("Dragon Skin 10 medium", 1.07, _EQUAL, 20, 5, _SHRINKAGE, 151),
+    Silicone("Dragon Skin 10 slow", 1.07, _EQUAL, 45, 7, _SHRINKAGE, 151),
+    Silicone("Dragon Skin 20", 1.08, _EQUAL, 25, 4, _SHRINKAGE, 338),
+    Silicone("Dragon Skin 30", 1.08, _EQUAL, 45, 16, _SHRINKAGE, 593),
 )
 SILICONES = {PUBLISHED: replace(_GRADES[1], shrinkage=0.0), **{grade.name: grade for grade in _GRADES}}
 """Presets by name; "published": EcoFlex 00-20 in moulds of the pad's size, as the published pads were cast."""
@@ -80,6 +82,21 @@ FIBRES = {PUBLISHED: Fibre("carbon-black TPE", 0.3, max_strain=0.8), _CORD.name:
 
 PLASTICS = {False: ("PLA", 1.24), True: ("resin", 1.1)}
 """Common material of a filament (False) and a resin printer (True), and its density, g/ml."""
+
+PRODUCTS = {
+    "fibre": ("conductive and elastic", "Adafruit 519, cord of 2 mm; thinner ones are extruded from carbon-black TPE"),
+    "silicone": ("two parts, cures at room temperature", "grades of Smooth-On EcoFlex and Dragon Skin"),
+    "adhesive": ("one part, sticks to cured silicone", "Smooth-On Sil-Poxy, DOWSIL 732"),
+    "filament": ("1.75 mm", "Prusament PLA"),
+    "resin": ("for 405 nm; test that silicone cures on it", "Formlabs Clear"),
+    "connectors": ("crimped on both ends of a fibre, to wire of 0.14 mm²", "ferrules of 0.25 mm², Weidmüller H0,25"),
+    "resistors": ("metal film, 1 %, 0.25 W", "Yageo MFR-25"),
+    "board": (
+        "12 or more bits; an input a fibre, 3.3 V",
+        "Arduino Due (12 fibres); Teensy 4.1 or ESP32 with a 74HC4067 multiplexer (16)",
+    ),
+}
+"""What to order, by kind: properties, and products that have them."""
 
 Name = Annotated[str, Field(min_length=1, max_length=100, pattern=r"^[^|\x00-\x1f]*$")]
 """One line, and a cell of a table."""
@@ -156,6 +173,10 @@ class SiliconeSettings(_MaterialSettings):
     )
     shrinkage: AnyOrPreset = Field(
         default=None, ge=0, le=0.2, description='by which share of its length it shrinks; or "preset"'
+    )
+
+    modulus_kpa: PositiveOrPreset = Field(
+        default=None, description='modulus at 100 % strain, kPa, by which presses take force; or "preset"'
     )
 
     @property

@@ -19,10 +19,13 @@ from padforge.fabricate.mould import BODY_COLOURS, Body, Prism, mould_body
 from padforge.fabricate.plan import Plan, polygon_rings
 
 Numbers = NDArray[np.int64]
+_log = logging.getLogger(__name__)
 
 _STL_HEADER = b"padforge, mm".ljust(80)
 _STL_RECORD = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
 
+_STL_HEAD_BYTES = 84
+"""Header of a binary STL, and the number of its triangles."""
 SEPARATION_MM = 1e-4
 """Distance by which coincident vertices are separated: far below what prints, far above the resolution of a float."""
 
@@ -148,6 +151,18 @@ def read_mesh(path: Path) -> tuple[Array, Numbers]:
     return vertices, triangles
 
 
+def _without_tail(path: Path) -> BytesIO:
+    """Return a file without the stray bytes at the end of a binary STL, for which trimesh takes it for text."""
+    content = path.read_bytes()
+    if path.suffix.lower() == ".stl":
+        n_bytes = _STL_HEAD_BYTES + _STL_RECORD.itemsize * int.from_bytes(content[80:_STL_HEAD_BYTES], "little")
+        stray = len(content) - n_bytes
+        if n_bytes > _STL_HEAD_BYTES and 0 < stray < _STL_RECORD.itemsize:
+            _log.warning("%s: %d stray bytes at its end are left out", path, stray)
+            content = content[:n_bytes]
+    return BytesIO(content)
+
+
 def _read_by_trimesh(path: Path) -> tuple[Array, Numbers]:
     """Read vertices and triangles of a file by trimesh."""
     import trimesh
@@ -155,7 +170,8 @@ def _read_by_trimesh(path: Path) -> tuple[Array, Numbers]:
     logging.getLogger("trimesh").setLevel(logging.CRITICAL)  # what it logs on top of raising
     try:
         with np.errstate(all="ignore"):
-            scene = trimesh.load_scene(path, process=False)  # processing would drop triangles with NaN
+            # processing would drop triangles with NaN
+            scene = trimesh.load_scene(_without_tail(path), file_type=path.suffix[1:].lower(), process=False)
             if scene.units:
                 scene = scene.convert_units("millimeters")
             mesh = scene.to_mesh()

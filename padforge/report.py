@@ -36,8 +36,8 @@ def write_report(folder: Path) -> Path:
     from padforge.sense.studies import fibre_loss
 
     def write_design(folder: Path, document: Mapping[str, Any]) -> list[PageSection]:
-        max_strain = _max_strain(folder, export.FORMAT)
-        return [*design.design_sections(folder, document), *design.press_sections(document, max_strain)]
+        materials = _materials(folder, export.FORMAT)
+        return [*design.design_sections(folder, document), *design.press_sections(document, *materials)]
 
     folder = check_path("folder", folder)
     recording = cache(lambda: sense.recording_digest(folder))
@@ -81,14 +81,14 @@ def write_report(folder: Path) -> Path:
     return folder / "report.html"
 
 
-def _max_strain(folder: Path, format_: str) -> float | None:
-    """Return the elongation that the fibres of the mould in a folder bear; None if there is none, or it is unknown."""
+def _materials(folder: Path, format_: str) -> tuple[Any, ...]:
+    """Return what `press_sections` asks of the materials of the mould in a folder; of the strain alone without one."""
     path = folder / "fabrication.json"
     if not path.exists():
-        return None
+        return (None,)
     with reraise_as_input_error(path):
-        max_strain = read_json(path, format_)["fibre"]["max_strain"]
-        return None if max_strain is None else float(max_strain)
+        materials = _materials(folder, export.FORMAT)
+        return [*design.design_sections(folder, document), *design.press_sections(document, *materials)]
 
 
 def _find_mismatches(

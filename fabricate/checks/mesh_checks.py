@@ -32,6 +32,20 @@ from padforge.fabricate.settings import DEFAULTS, PrinterSettings
 
 SOLID_CHECKS = ("manifold", "watertight", "bodies", "volume", "genus")
 """The checks that any solid must pass."""
+_MIN_SIDE_MM = 5.0
+"""Longest side of a mesh that may be a mould: what is smaller is in another unit."""
+_MAX_METRES_MM = 0.5
+"""Longest side, read as mm, of a mesh that is in metres; a larger one that is too small is in inches."""
+_POSES = {
+    "down": np.diag([1, -1, -1]),
+    "left": np.array([[0, 0, 1], [0, 1, 0], [-1, 0, 0]]),
+    "right": np.array([[0, 0, -1], [0, 1, 0], [1, 0, 0]]),
+    "near": np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]]),
+    "far": np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]]),
+}
+"""Sides that a mould may be open to by mistake, and the rotations that right it."""
+_MIN_CAST_SHARE = 0.3
+"""Share of a mould's footprint that is cast in; funnels and holes of other bodies have less."""
 _MAX_SHELLS = 100  # shells that are classified as bodies or hollows; more are debris, and all count as bodies
 
 
@@ -76,17 +90,23 @@ def check_triangles(
 
     Returns:
         SOLID_CHECKS and bed; for a solid that can be cut, wall_thickness, floor_thickness, overhang and undercut; and
-        without a plan self_intersection, ridge_width, silicone_wall and tight.
+        without a plan self_intersection, ridge_width, silicone_wall and tight. A mesh too small to be in mm has unit
+        alone, and a mould that is turned has pose in place of what cannot be judged.
     """
     check_type("printer", printer, PrinterSettings)
     min_silicone_mm = check_float("min_silicone_mm", min_silicone_mm, 0, 10)
     genus = None if genus is None else check_int("genus", genus, 0, 10**6)
     mesh = TriangleMesh.weld(vertices, triangles)
+    if not has_plan and (unit := _check_unit(mesh)).status == "fail":
+        return [unit]  # nothing else can be judged
     findings = [*check_solid(mesh, genus), _check_bed(mesh, printer)]
     if any(finding.name in ("manifold", "volume") and finding.status == "fail" for finding in findings):
         return findings
     slabs, size = build_slabs(mesh, printer.layer_mm), float(np.ptp(mesh.bounds, axis=0).max())
     cast = [slab for slab in slabs if slab.void.area]
+    if not has_plan and (side := _find_open_side(mesh, slabs, printer.layer_mm)):
+        message = f"its open side is the {side} one: turn it up"
+        return [*findings, check_result("pose", False, side, "up", message)]  # nothing else can be judged
     findings += [
         _check_wall_thickness(cast, printer, size),
         _check_floor_thickness(mesh, printer),
@@ -101,6 +121,32 @@ def check_triangles(
             _check_leaks(slabs),
         ]
     return findings
+
+
+def _check_unit(mesh: TriangleMesh) -> Finding:
+    """Check that a mesh is as large as a mould can be: most files do not state their unit."""
+    sides = np.ptp(mesh.bounds, axis=0)
+    side = float(sides.max())
+    unit, factor = ("metres", 1000) if side < _MAX_METRES_MM else ("inches", 25.4)
+    size = " x ".join(f"{length:.3g}" for length in sides)
+    message = f"{size} mm is too small for a mould; in {unit} it would be {factor * side:.3g} mm: export it in mm"
+    return check_result("unit", not 0 < side < _MIN_SIDE_MM, side, _MIN_SIDE_MM, message)
+
+
+def _find_open_side(mesh: TriangleMesh, slabs: Sequence[Slab], layer_mm: float) -> str:
+    """Return the side that a mould is open to if it is turned; "" for one that is not, and for other bodies."""
+
+    def is_tray(mesh: TriangleMesh, slabs: Sequence[Slab]) -> bool:
+        width, depth, _ = np.ptp(mesh.bounds, axis=0)
+        return max(slab.void.area for slab in slabs) > _MIN_CAST_SHARE * width * depth
+
+    if is_tray(mesh, slabs):
+        return ""
+    for side, rotation in _POSES.items():
+        turned = TriangleMesh.weld(mesh.vertices @ rotation.T, mesh.triangles)
+        if is_tray(turned, build_slabs(turned, layer_mm)):
+            return side
+    return ""
 
 
 def check_solid(mesh: TriangleMesh, genus: int | None = None) -> list[Finding]:

@@ -9,8 +9,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
 from typing import Any
 
-from padforge.fabricate.materials import PLASTICS, divider_ohm
-from padforge.fabricate.outputs.drawings import ORIENTATION_LINK, orientation_sentence
+from padforge.fabricate.materials import PLASTICS, PRODUCTS, divider_ohm
+from padforge.fabricate.outputs.drawings import CROSSING_LINK, ORIENTATION_LINK, orientation_sentence
 from padforge.fabricate.plan import Plan, fibre_layers, fibre_name, overlap
 from padforge.fabricate.settings import MouldSettings, PrinterSettings
 
@@ -18,6 +18,12 @@ Document = Mapping[str, Any]
 
 SURPLUS_PERCENT = 10
 """Silicone that stays in the cup and on the stick."""
+WASTE_PERCENT = 20
+"""Fibre that breaks, or is cut too short."""
+PRINT_MM_S, RESIN_LAYER_S = 50.0, 12.0
+"""Speed along lines of filament, in the mean over a print, and time for a layer of resin: rules of thumb."""
+LAY_MIN_PER_M, LAY_MIN_PER_CROSSING = 60.0, 2.0
+"""Time to lay and seal a metre of fibre by hand, and longer for every crossing; estimates, not measured."""
 PRINT_SETTINGS_HEAD = ("PrusaSlicer", "OrcaSlicer, Bambu Studio", "Cura", "because")
 _PRINT_SETTINGS = """\
 Layer height: {layer} | Layer height: {layer} | Layer Height: {layer} \
@@ -76,6 +82,7 @@ def laying_document(plan: Plan, mould_mm3: float) -> dict[str, Any]:
     Returns:
         "silicone": to mix.
         "adhesive": volume of the tracks that it seals, by step of laying.
+        "order": amounts to order, and estimated hours of work.
         "fibre": their material.
         "fibres": one entry per fibre, in the order of their numbers.
         "laying_order": the numbers laid in each step, deep first.
@@ -86,6 +93,7 @@ def laying_document(plan: Plan, mould_mm3: float) -> dict[str, Any]:
     document = {
         "silicone": _silicone(plan, mould_mm3),
         "adhesive": _adhesive(plan),
+        "order": _order(plan, mould_mm3),
         "fibre": asdict(plan.settings.fibre.material),
         "fibres": _fibres(plan),
         "laying_order": [[fibre + 1 for fibre in layer.fibres] for layer in fibre_layers(plan)],
@@ -152,6 +160,23 @@ def _fibres(plan: Plan) -> list[dict[str, Any]]:
     return entries
 
 
+def _order(plan: Plan, mould_mm3: float) -> dict[str, Any]:
+    printer, mould = plan.settings.printer, plan.settings.mould
+    fibre_m = float(plan.lengths_mm.sum() + 2 * mould.lead_mm * plan.pad.layout.fibres) / 1000
+    minutes = LAY_MIN_PER_M * plan.lengths_mm.sum() / 1000 + LAY_MIN_PER_CROSSING * len(plan.crossings)
+    if printer.resin:
+        seconds = RESIN_LAYER_S * (mould.floor_mm + plan.shrinkage_compensated.silicone_mm) / printer.layer_mm
+    else:
+        seconds = mould_mm3 / (printer.nozzle_mm * printer.layer_mm * PRINT_MM_S)
+    return {
+        "fibre_m": round(fibre_m * (1 + WASTE_PERCENT / 100), 3),
+        "waste_percent": WASTE_PERCENT,
+        "plastic_g": round(mould_mm3 / 1000 * PLASTICS[printer.resin][1], 1),
+        "print_h": round(seconds / 3600, 2),
+        "laying_h": round(float(minutes) / 60, 2),
+    }
+
+
 def _crossings(plan: Plan) -> dict[str, Any]:
     table: list[list[Any]] = []
     for crossing in plan.crossings:
@@ -188,6 +213,7 @@ def _common_tracks(plan: Plan) -> list[dict[str, Any]]:
 def laying_page(document: Document) -> str:
     """Write `laying.md`, a page to print for the bench, from a fabrication document."""
     sections = {
+        "Order": _order_lines(document),
         "Print": _print_lines(document),
         "Mix": _mix_lines(document["silicone"]),
         "Cast": _cast_lines(document),
@@ -204,6 +230,29 @@ def laying_page(document: Document) -> str:
 def _table_lines(head: Sequence[object], rows: Sequence[Sequence[object]]) -> Iterator[str]:
     for row in (head, ["---"] * len(head), *rows):
         yield f"| {' | '.join(map(str, row))} |"
+
+
+def _order_lines(document: Document) -> Iterator[str]:
+    order, fibre, silicone = document["order"], document["fibre"], document["silicone"]
+    n_fibres, resin = len(document["fibres"]), document["settings"]["printer"]["resin"]
+    amounts = {
+        "fibre": f"{order['fibre_m']:.2f} m of {fibre['name']}, {fibre['diameter_mm']:g} mm",
+        "silicone": f"{silicone['mass_g']:.0f} g of {silicone['name']}",
+        "adhesive": f"{sum(document['adhesive']['steps_ml']):.2f} ml",
+        "resin" if resin else "filament": f"{order['plastic_g']:.0f} g of {PLASTICS[resin][0]}",
+        "connectors": f"{2 * n_fibres}",
+        "resistors": f"{n_fibres}, of the values below",
+        "board": f"for {n_fibres} fibres",
+    }
+    rows = [(kind, amount, *PRODUCTS[kind]) for kind, amount in amounts.items()]
+    yield from _table_lines(("kind", "amount", "properties", "for example"), rows)
+    yield ""
+    yield (
+        f"Of the fibre, {order['waste_percent']:g} % are waste. The mould prints in about {order['print_h']:.1f} h, by"
+        f" rules of thumb; a slicer knows better. Laying and sealing by hand takes about {order['laying_h']:.1f} h, an"
+        f" estimate of {LAY_MIN_PER_M:g} minutes a metre and {LAY_MIN_PER_CROSSING:g} minutes a crossing, without the"
+        " time in which silicone and adhesive cure."
+    )
 
 
 def _print_lines(document: Document) -> Iterator[str]:
@@ -393,7 +442,7 @@ def _crossing_lines(document: Document) -> Iterator[str]:
     gap_mm, is_short = crossings["gap_mm"], crossings["total"] <= _MAX_ROWS
     gaps = f"At least {gap_mm:g} mm lie between two fibres." if gap_mm > 0 else "Some touch."
     yield f"{crossings['total']} crossings, {crossings['same_family']} of them within a family. {gaps}"
-    yield ""
+    yield from ("", CROSSING_LINK, "")
     if is_short or document["common_tracks"]:
         yield "Positions are from the centre of the pad. As it lies, x runs to the left and y away from you."
         yield ""

@@ -19,7 +19,13 @@ from padforge.common.plotting import ALARM, FAINT, INK, PAPER
 from padforge.design.morphology import Array
 from padforge.fabricate.checks import Finding
 from padforge.fabricate.fibre_placement import Step, mirror_x
-from padforge.fabricate.outputs.drawings import ORIENTATION_CAPTION, SCALE_MM, Bounds, orientation_sentence
+from padforge.fabricate.outputs.drawings import (
+    CROSSING_CAPTION,
+    ORIENTATION_CAPTION,
+    SCALE_MM,
+    Bounds,
+    orientation_sentence,
+)
 from padforge.fabricate.plan import (
     FAMILIES,
     FAMILY_COLOURS,
@@ -298,6 +304,46 @@ def _draw_sides(picture: "_Picture", plan: Plan, panels: Sequence[_Panel]) -> No
     probe = np.column_stack([x + 2 * np.cos(turn), top + 2 + 2 * np.sin(turn)])
     picture.axes.fill(*np.vstack([(x - 2, top + 5), probe, (x + 2, top + 5)]).T, color=INK)
     picture.axes.plot([x - half - 6, x + half + 6], [bottom] * 2, color=INK, linewidth=1.2)
+
+
+# Crossing
+
+
+def draw_crossing(plan: Plan, path: Path) -> None:
+    """Draw the narrowest crossing of a pad in section across the deeper fibre, the pad turned over, to scale.
+
+    The upper fibre comes to lie along its track, which is cut lengthwise; adhesive covers both.
+    """
+    fibre_mm, width = plan.settings.fibre.material.diameter_mm, plan.settings.mould.ridge_width_mm
+    depths = [[(plan.depths_mm[plan.layer_indices[k]], k) for k in (c.first, c.second)] for c in plan.crossings]
+    (upper, above), (lower, below) = sorted(min(depths, key=lambda pair: abs(pair[0][0] - pair[1][0])))
+    half, bottom = 4 * width, -plan.thickness_mm
+    picture = _Picture((-2 * half, bottom, 2 * half, -bottom / 6), CROSSING_CAPTION, 4)
+    axes, seal = picture.axes, "#e9dfb8"
+    axes.set(xlabel="along the upper fibre (mm)", ylabel="height over the face (mm)")
+    shapes = {
+        f"silicone, {plan.thickness_mm:g} mm": ((-2 * half, bottom, 4 * half, -bottom), PAPER),
+        "adhesive": ((-2 * half, -upper, 4 * half, upper), seal),
+        "": ((-width / 2, -lower, width, lower), seal),
+        f"fibre {above + 1}, in a track {upper:.3g} mm deep": (
+            (-2 * half, -upper, 4 * half, fibre_mm),
+            FAMILY_COLOURS[plan.family(above)],
+        ),
+    }
+    handles = []
+    for label, ((x, y, wide, high), colour) in shapes.items():
+        corners = [(x, y), (x + wide, y), (x + wide, y + high), (x, y + high)]
+        (area,) = axes.fill(*np.transpose(corners), facecolor=colour, edgecolor=_EDGE, linewidth=0.5, label=label)
+        handles += [area] if label else []
+    turn = np.linspace(0, 2 * np.pi, 60)
+    round_ = fibre_mm / 2 * np.column_stack([np.cos(turn), np.sin(turn)]) + (0, fibre_mm / 2 - lower)
+    label, colour = f"fibre {below + 1}, in a track {lower:.3g} mm deep", FAMILY_COLOURS[plan.family(below)]
+    handles += axes.fill(*round_.T, facecolor=colour, edgecolor=_EDGE, linewidth=0.5, label=label)
+    gap_mm = lower - upper - fibre_mm
+    if gap_mm > 0:
+        axes.plot([width, width], [-upper, -lower + fibre_mm], "|-", color=INK, linewidth=1)
+        axes.text(1.3 * width, (fibre_mm - upper - lower) / 2, f"{gap_mm:.2g} mm", va="center", color=INK)
+    picture.save(path, handles)
 
 
 # Toolpath

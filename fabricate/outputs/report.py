@@ -24,7 +24,14 @@ from padforge.common.page import (
 )
 from padforge.common.validation import InputError
 from padforge.fabricate.mesh import read_mesh
-from padforge.fabricate.outputs.drawings import ORIENTATION_CAPTION, ORIENTATION_FILE, ORIENTATION_LINK
+from padforge.fabricate.outputs.drawings import (
+    CROSSING_CAPTION,
+    CROSSING_FILE,
+    CROSSING_LINK,
+    ORIENTATION_CAPTION,
+    ORIENTATION_FILE,
+    ORIENTATION_LINK,
+)
 from padforge.fabricate.outputs.laying_page import laying_page
 from padforge.fabricate.plan import FAMILIES, FAMILY_COLOURS
 
@@ -34,7 +41,7 @@ _STEPS = np.iinfo(np.uint16).max
 """Steps of a coordinate along a side of the box around a mesh."""
 _TOLERANCES_MM = (0.01, 0.02, 0.05, 0.1, 0.2)
 """Tolerances to simplify a large mesh to, the last half of a common nozzle."""
-_PICTURES = ("mould.stl", "mould.png", "tracks.png", "toolpath.svg", ORIENTATION_FILE)
+_PICTURES = ("mould.stl", "mould.png", "tracks.png", "toolpath.svg", ORIENTATION_FILE, CROSSING_FILE)
 _MAX_POSITIONS = 3
 _VIEW = """\
 <figure class="view" id="mould-view" hidden>
@@ -199,11 +206,16 @@ def _mould_section(folder: Path, names: Collection[str], document: Mapping[str, 
 
 
 def _bench_section(folder: Path, names: Collection[str], document: Mapping[str, Any]) -> PageSection:
-    """Build the section of `laying.md`, with the drawing of the orientation where the page links it."""
+    """Build the section of `laying.md`, with drawings where the page links them."""
     guide, _, _ = laying_page(document).partition("\n## Checks\n")  # which the mould's section lists in full
-    before, _, after = guide.partition(ORIENTATION_LINK)
-    drawing = [figures([(folder / ORIENTATION_FILE, ORIENTATION_CAPTION)])] if ORIENTATION_FILE in names else []
-    return PageSection("Making the pad", [*render_markdown(before), *drawing, *render_markdown(after)])
+    body = []
+    for link, name, caption in (
+        (ORIENTATION_LINK, ORIENTATION_FILE, ORIENTATION_CAPTION),
+        (CROSSING_LINK, CROSSING_FILE, CROSSING_CAPTION),
+    ):
+        before, _, guide = guide.partition(link)
+        body += [*render_markdown(before), *([figures([(folder / name, caption)])] if name in names else [])]
+    return PageSection("Making the pad", [*body, *render_markdown(guide)])
 
 
 def _findings_table(findings: Sequence[Mapping[str, Any]]) -> str:

@@ -23,7 +23,7 @@ from padforge.design.objectives.bayes_error import expected_errors
 from padforge.design.objectives.expected_error import straight_full_scale
 from padforge.design.objectives.rules import Violation
 from padforge.design.optimize.search import SearchResult, settings_for_twin, state_folders
-from padforge.design.paths.curves import crossings
+from padforge.design.paths.curves import crossings, lengths
 from padforge.design.settings import PadSettings, Scatter, SearchSettings
 from padforge.design.twin import PlanTransform, TwinChannel, TwinScatter
 from tests.helpers.less import compare_little
@@ -64,7 +64,9 @@ def test_design_summary_compares_with_straight_fibres_and_is_loaded_again(here):
     assert summary_lines(result, Path("out/pad"))[1:] == printed[1:]
     first, second = (document["terms"][f"expected_error_mm_{failed}"] for failed in range(2))
     assert printed[1].startswith(f"  expected error  {first:.2f} / {second:.2f} mm with 0 / 1 failed fibres")
-    assert printed[4:] == ["  all rules hold"]
+    pads = result.morphology, pad
+    counts = [f"{lengths(p).sum() * p.unit_mm / 1000:.2f} m, {len(crossings(p))} crossings" for p in pads]
+    assert printed[-2:] == [f"  fibre           {counts[0]}; straight fibres {counts[1]}", "  all rules hold"]
     for candidate, said in (
         ("straight fibres", "the search found no better pad"),
         ("start 1", "not significantly better"),

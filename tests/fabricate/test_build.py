@@ -32,7 +32,16 @@ PAD = Morphology.random(1, 2, seed=7)
 FILES = {
     *(f"{body}.{suffix}" for body in ("mould", "lid", "conductive", "holder") for suffix in ("stl", "3mf")),
     "mould.step",
-    *("tracks.svg", "tracks.dxf", "mould.png", "tracks.png", "laying.md", "orientation.svg", "fabrication.json"),
+    *(
+        "tracks.svg",
+        "tracks.dxf",
+        "mould.png",
+        "tracks.png",
+        "laying.md",
+        "orientation.svg",
+        "crossing.svg",
+        "fabrication.json",
+    ),
     *("laying.gcode", "toolpath.svg"),
 }
 SETTINGS = with_settings({"lid": True, "pins": True, "conductive": True, "holder": True})
@@ -49,7 +58,7 @@ def built(tmp_path_factory) -> tuple[Path, Build]:
 def test_build_writes_all_files_with_their_digests_and_no_others(built):
     out, result = built
     assert {path.name for path in out.iterdir()} == FILES
-    assert {*result.files} == FILES - {"fabrication.json", "laying.md", "orientation.svg"}
+    assert {*result.files} == FILES - {"fabrication.json", "laying.md", "orientation.svg", "crossing.svg"}
     assert json.loads((out / "fabrication.json").read_text()) == result.to_dict()
     assert result.sha256 == {name: sha256(out / name) for name in FILES - {"fabrication.json"}}
 
@@ -262,7 +271,7 @@ def test_build_deletes_earlier_files_unless_they_were_changed(tmp_path, caplog):
     result = build(Morphology.straight(2), tmp_path, ["stl"])
     left = {"mine.stl", "mould.step", "tracks.dxf"}
     assert {path.name for path in tmp_path.iterdir()} == {*result.sha256, "fabrication.json"} | left
-    assert result.sha256.keys() == {"mould.stl", "laying.md", "orientation.svg"}
+    assert result.sha256.keys() == {"mould.stl", "laying.md", "orientation.svg", "crossing.svg"}
     gone = "is gone: it was of the mould before this one"
     assert caplog.messages == [
         *(f"{tmp_path / name} {gone}" for name in ("mould.3mf", "tracks.svg")),

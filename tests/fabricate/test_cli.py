@@ -11,7 +11,7 @@ from padforge.fabricate.cli import fabricate, mould_lines
 from tests.fabricate.planted import level_pad
 from tests.helpers.less import blank_pictures
 
-FILES = {"mould.stl", "tracks.svg", "fabrication.json", "laying.md", "orientation.svg"}
+FILES = {"mould.stl", "tracks.svg", "fabrication.json", "laying.md", "orientation.svg", "crossing.svg"}
 
 
 @pytest.fixture(autouse=True)

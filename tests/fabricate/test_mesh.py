@@ -39,6 +39,14 @@ def require_line(error: BaseException, name: str = "") -> None:
     assert len(str(error).splitlines()) == 1
 
 
+def test_read_mesh_leaves_stray_bytes_of_an_stl_out_with_a_warning(tmp_path, caplog):
+    vertices, triangles = np.eye(4)[:, :3], np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]])
+    write_stl(path := tmp_path / "tail.stl", vertices, triangles)
+    path.write_bytes(path.read_bytes() + b"\r\n")
+    assert len(read_mesh(path)[1]) == 4
+    assert caplog.messages == [f"{path}: 2 stray bytes at its end are left out"]
+
+
 @pytest.mark.parametrize("suffix", [".stl", ".3mf"])
 def test_read_mesh_returns_what_was_written(tmp_path, suffix):
     moved = VERTICES + np.array([0.1, -123.456, 7])

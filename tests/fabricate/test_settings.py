@@ -153,7 +153,7 @@ def test_custom_materials_need_all_required_keys():
 
 
 def test_default_materials_are_those_of_the_published_pads():
-    assert SiliconeSettings().material == Silicone("EcoFlex 00-20", 1.07, (1, 1), 30, 4, 0)
+    assert SiliconeSettings().material == Silicone("EcoFlex 00-20", 1.07, (1, 1), 30, 4, 0, 55)
     assert FibreSettings().material.diameter_mm == 0.3
     assert {grade.shrinkage for name, grade in SILICONES.items() if name != "published"} == {0.001}
 

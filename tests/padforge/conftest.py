@@ -3,6 +3,7 @@
 import shutil
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -40,11 +41,11 @@ def pressed() -> dict[str, list[PageSection]]:
 def press_drawn_once(monkeypatch: pytest.MonkeyPatch, pressed: dict[str, list[PageSection]]) -> None:
     """A report draws a press only if no other has drawn the same: that is most of what it takes."""
 
-    def remembered(document: Mapping, max_strain: float | None) -> list[PageSection]:
+    def remembered(document: Mapping, *materials: Any) -> list[PageSection]:
         settings = document["provenance"]["settings"]
-        key = repr((settings["contact"], settings["pad"], max_strain))
+        key = repr((settings["contact"], settings["pad"], materials))
         if key not in pressed:
-            pressed[key] = press_sections(document, max_strain)
+            pressed[key] = press_sections(document, *materials)
         return list(pressed[key])
 
     monkeypatch.setattr("padforge.design.report.press_sections", remembered)

@@ -10,7 +10,7 @@ from padforge import Spec
 from padforge.common.plotting import save_figure
 from padforge.design import Contact, Morphology
 from padforge.design import compare as comparison
-from padforge.design.contact import half_width_mm
+from padforge.design.contact import contact_press, fibre_strains, half_width_mm
 from padforge.design.settings import read_contact
 from padforge.fabricate import FabricationSettings
 from tests.helpers.door import called
@@ -36,6 +36,9 @@ def test_compare_evaluates_finished_pads(tmp_path, monkeypatch):
     assert all(other["errors_mm"] == other["straight_mm"] for other in plain["others"].values())
     assert [name.split(",")[0] for name in bent["others"]] == ["isotropic", "isotropic"]
     assert plain["mould_ml"] > 0
+    assert plain["force_n"] == pytest.approx(contact_press(Contact()).force_n(), rel=1e-9)  # EcoFlex 00-20
+    assert plain["strain_percent"] == pytest.approx(100 * max(s for _, s in fibre_strains(Contact())))
+    assert (plain["straight_length_mm"], plain["straight_crossings"]) == (pytest.approx(plain["length_mm"]), 6)
     assert plain["half_width_mm"] == pytest.approx(half_width_mm(Contact()))
     assert plain["contact"]["model"] == "layer"
     assert (tmp_path / "both" / "plain" / "mould.stl").exists()
@@ -59,12 +62,19 @@ def test_comparison_is_a_table_in_metres_with_straight_fibres_below_a_pad_that_d
     flat = {"errors_mm": [0.4, 2.0], "straight_mm": [0.8, 1.0]}
     plain |= {"errors_mm": [1.0, 1.5], "straight_mm": [1.0, 1.5], "others": {"flat": flat}}
     bent = plain | {"name": "bent", "knots": 4, "errors_mm": [0.5, 0.75], "half_width_mm": 5.678}
+    bent |= {"force_n": 1.234, "strain_percent": 45.6, "straight_length_mm": 900.0, "straight_crossings": 5}
     lines = comparison.comparison_lines({"rows": [plain, bent]})
-    costs = "half width (mm)", "mould (ml)", "0 failed (mm)", "1 failed (mm)"
+    assert max(map(len, lines)) <= 100
     assert [re.split(r"\s\s+", line.strip()) for line in lines] == [
-        ["pad", "fibres", "knots", "fibre (m)", "crossings", *costs],
-        ["plain", "2 + 3", "0", "1.23", "6", "-", "12.3", "1.00", "1.50"],
-        ["bent", "2 + 3", "4", "1.23", "6", "5.68", "12.3", "0.50", "0.75"],
+        ["pad", "fibres", "knots", "fibre", "crossings", "width", "force", "strain", "mould"],
+        ["m", "mm", "N", "%", "ml"],
+        ["plain", "2 + 3", "0", "1.23", "6", "-", "-", "-", "12.3"],
+        ["bent", "2 + 3", "4", "1.23", "6", "5.68", "1.23", "45.6", "12.3"],
+        ["straight fibres", "0.90", "5"],
+        [""],
+        ["error (mm) with failed fibres", "0", "1"],
+        ["plain", "1.00", "1.50"],
+        ["bent", "0.50", "0.75"],
         ["straight fibres", "1.00", "1.50"],
         ["flat", "0.40 / 0.80", "2.00 / 1.00"],
     ]
@@ -81,7 +91,8 @@ def test_compare_designs_every_variant_in_its_folder(tmp_path, monkeypatch):
     folders = sorted(path.name for path in (tmp_path / "c").iterdir() if path.is_dir())
     assert folders == ["grid-1-pitch_mm-8-x-12", "grid-1-pitch_mm-9"]
     assert "grid 1, pitch_mm 8 x 12" in result.out
-    assert "1 failed (mm)" in result.out
+    assert "error (mm) with failed fibres" in result.out
+    assert max(map(len, result.out.splitlines())) <= 100
     pad = Morphology.load(tmp_path / "c" / folders[0] / "morphology.json")
     assert (pad.layout.counts, pad.pitch_mm) == ((1, 1), (8.0, 12.0))
 

@@ -6,9 +6,13 @@ import shapely
 import trimesh
 from manifold3d import Manifold, OpType
 
+from padforge.design.morphology import Morphology
 from padforge.fabricate.checks import Finding
 from padforge.fabricate.checks.mesh_checks import SOLID_CHECKS, check_solid, check_triangles
 from padforge.fabricate.checks.surface import TriangleMesh
+from padforge.fabricate.mesh import build_mesh, mesh_arrays
+from padforge.fabricate.mould import mould_body
+from padforge.fabricate.plan import Plan
 from padforge.fabricate.settings import PrinterSettings
 from tests.fabricate.checks.trays import CROSS, FLOOR, block, check_body, failures, has_position_near, line, prism, tray
 
@@ -163,6 +167,32 @@ def _hole(side: float, x: float = 0, y: float = 0) -> Manifold:
 def _pot(outer: float) -> Manifold:
     plate = Manifold.cube((outer, outer, 2.0), True).translate((0, 0, 1))
     return Manifold.batch_boolean([tray(draft_deg=0), plate], OpType.Add) - _hole(2, 3, 3)
+
+
+@pytest.mark.parametrize(("scale", "unit"), [(1e-3, "metres"), (1 / 25.4, "inches")])
+def test_mesh_in_another_unit_has_one_finding_that_says_so(scale, unit):
+    vertices, triangles = mesh_arrays(build_mesh(mould_body(Plan(Morphology.straight(2)))))
+    [finding] = check_triangles(scale * vertices, triangles)
+    assert (finding.name, finding.status) == ("unit", "fail")
+    assert f"in {unit} it would be 42.2 mm" in finding.message
+
+
+@pytest.mark.parametrize(
+    ("axes", "signs", "side"),
+    [
+        ((0, 1, 2), (1, -1, -1), "down"),
+        ((2, 1, 0), (-1, 1, 1), "left"),
+        ((2, 1, 0), (1, 1, -1), "right"),
+        ((0, 2, 1), (1, -1, 1), "near"),
+        ((0, 2, 1), (1, 1, -1), "far"),
+    ],
+)
+def test_mould_that_is_turned_fails_and_is_judged_no_further(axes, signs, side):
+    vertices, triangles = mesh_arrays(build_mesh(mould_body(Plan(Morphology.straight(2)))))
+    findings = {finding.name: finding for finding in check_triangles(vertices[:, axes] * signs, triangles)}
+    assert findings["pose"].status == "fail"
+    assert findings["pose"].message == f"its open side is the {side} one: turn it up"
+    assert not findings.keys() & {"wall_thickness", "silicone_wall", "tight"}
 
 
 class TestLeaks:

@@ -12,7 +12,7 @@ from scipy.integrate import quad
 from padforge.design.morphology import Morphology
 from padforge.fabricate.export import build
 from padforge.fabricate.mesh import mould_mesh
-from padforge.fabricate.outputs.drawings import ORIENTATION_FILE, orientation_sentence
+from padforge.fabricate.outputs.drawings import CROSSING_LINK, ORIENTATION_FILE, orientation_sentence
 from padforge.fabricate.outputs.laying_page import (
     PRINT_SETTINGS_HEAD,
     laying_document,
@@ -238,7 +238,13 @@ def test_solid_layers_hide_the_infill_below_them(layer, layers):
 
 def bench_document(**changes: object) -> dict:
     """A document whose every number is another one, so that none can stand in the place of another."""
-    fibre = {"name": "soft thread", "ohm_per_mm": 20.0, "max_strain": 0.45, "min_bend_radius_mm": 1.5}
+    fibre = {
+        "name": "soft thread",
+        "diameter_mm": 0.35,
+        "ohm_per_mm": 20.0,
+        "max_strain": 0.45,
+        "min_bend_radius_mm": 1.5,
+    }
     entry = {"in_pad_mm": 50.04, "cut_mm": 90.06, "resistance_ohm": 1801.2, "divider_ohm": 1800.0}
     fibres = [
         entry | {"number": 1, "fibre": "horizontal 1", "depth_mm": 1.75},
@@ -256,9 +262,17 @@ def bench_document(**changes: object) -> dict:
         "mould_volume_ml": 10.0,
         "findings": [],
         "settings": settings,
-        "silicone": {"name": "Goo", "part_a_g": 3.04, "part_b_g": 1.96, "volume_ml": 4.56, "thickness_mm": 6.125}
-        | {"surplus_percent": 12, "shrinkage": 0.013, "pot_life_min": 91, "cure_h": 1.5},
+        "silicone": {
+            "name": "Goo",
+            "part_a_g": 3.04,
+            "part_b_g": 1.96,
+            "volume_ml": 4.56,
+            "thickness_mm": 6.125,
+            "mass_g": 5.0,
+        }
+        | {"mass_g": 5.0, "surplus_percent": 12, "shrinkage": 0.013, "pot_life_min": 91, "cure_h": 1.5},
         "adhesive": {"name": "glue", "volume_ml": 0.6, "steps_ml": [0.4, 0.2]},
+        "order": {"fibre_m": 0.234, "waste_percent": 17, "plastic_g": 13.4, "print_h": 1.34, "laying_h": 2.26},
         "fibre": fibre,
         "fibres": fibres,
         "laying_order": [[1], [2]],
@@ -277,7 +291,7 @@ def section(document: dict, title: str) -> list[str]:
 def test_page_has_the_amounts_of_the_document():
     document = bench_document()
     titles = [line for line in laying_page(document).splitlines() if line.startswith("#")]
-    names = ["Print", "Mix", "Cast", "Orientation", "Lay", "Wire", "Crossings", "Checks"]
+    names = ["Order", "Print", "Mix", "Cast", "Orientation", "Lay", "Wire", "Crossings", "Checks"]
     assert titles == ["# How to make the pad", *(f"## {name}" for name in names)]
     lines = section(document, "Print")
     assert lines[:2] == [
@@ -302,6 +316,32 @@ def test_page_has_the_amounts_of_the_document():
         "5. Free the casting all along the walls, then pull it out from a corner.",
     ]
     assert section(document, "Checks") == ["0 of 0 checks passed."]
+
+
+def test_page_orders_materials_by_kind_and_estimates_the_work():
+    order = section(bench_document(), "Order")
+    assert [row.split(" | ")[:2] for row in order[2:9]] == [
+        ["| fibre", "0.23 m of soft thread, 0.35 mm"],
+        ["| silicone", "5 g of Goo"],
+        ["| adhesive", "0.60 ml"],
+        ["| filament", "13 g of PLA"],
+        ["| connectors", "4"],
+        ["| resistors", "2, of the values below"],
+        ["| board", "for 2 fibres"],
+    ]
+    assert order[9].startswith("Of the fibre, 17 % are waste. The mould prints in about 1.3 h, by rules of thumb")
+    assert "Laying and sealing by hand takes about 2.3 h, an estimate of 60 minutes a metre and 2 minutes a" in order[9]
+
+
+@pytest.mark.parametrize(("resin", "hours"), [(False, 4.0 * 1000 / (0.4 * 0.1 * 50) / 3600), (True, 80 * 12 / 3600)])
+def test_order_follows_lengths_crossings_and_the_printer(resin, hours):
+    plan = Plan(Morphology.straight(2, 10.0), with_settings({"lead_mm": 25.0}, {"resin": resin}))
+    order = laying_document(plan, 4000.0)["order"]
+    in_pad_m = 4 * (30 + 2 * 2) / 1000
+    assert order["fibre_m"] == pytest.approx(1.2 * (in_pad_m + 4 * 2 * 0.025), abs=1e-3)
+    assert order["laying_h"] == pytest.approx(in_pad_m * 1 + 4 * 2 / 60, abs=0.01)
+    assert order["print_h"] == pytest.approx(hours, abs=0.01)
+    assert order["plastic_g"] == pytest.approx(4.0 * (1.1 if resin else 1.24), abs=0.1)
 
 
 def test_page_lays_and_wires_every_fibre_by_its_own_numbers():
@@ -339,6 +379,7 @@ def test_page_lays_and_wires_every_fibre_by_its_own_numbers():
 def test_page_lists_crossings_as_they_are_and_counts_many():
     lines = section(bench_document(), "Crossings")
     assert lines[0] == "1 crossings, 0 of them within a family. At least 1.2 mm lie between two fibres."
+    assert lines.pop(1) == CROSSING_LINK
     assert lines[1] == "Positions are from the centre of the pad. As it lies, x runs to the left and y away from you."
     assert lines[3:6] == [
         "| tracks | x | y | in common |",

@@ -47,7 +47,7 @@ def test_every_stage_has_a_linked_section(page: Path) -> None:
     names = ["Fibres", "Press", "Mould", "Making the pad", "Recording", "Calibration", "Fibre loss", "Contact model"]
     assert [title for _, title in titles] == [*names, "Studies", "Provenance"]
     assert all(f'<a href="#{anchor}">{title}</a>' in text for anchor, title in titles)
-    assert text.count("data:image/") == 6  # plan, press, mould, tracks, which way round, and the study's figure
+    assert text.count("data:image/") == 7  # plan, press, mould, tracks, orientation, crossing, and the study's figure
     assert page.stat().st_size < MOST_PAGE_BYTES
 
 
@@ -349,6 +349,8 @@ def test_press_section_states_what_the_press_does_to_each_family(monkeypatch: py
         squeeze, stretch = strains.compressive.max(), max(strains.radial.max(), strains.hoop.max())
         assert f"|{name}|{depth:g}|{width:.1f}|{squeeze:.0%}|{stretch:.0%}|50%|pass|" in text
     assert "|-|-|" in words(press_sections(document, None)[0].body)
+    stiffer = words(press_sections(document, 0.5, ("Dragon Skin 30", 550))[0].body)
+    assert f"takes {10 * press.force_n():.1f} N on Dragon Skin 30." in stiffer
 
 
 def test_press_is_drawn_with_weights_lengthwise_and_crosswise() -> None:
