@@ -16,8 +16,15 @@ from numpy.typing import NDArray
 from padforge.common.validation import InputError
 from padforge.sense.arrays import MAX_VOLTS, Array, Indices, Mask, check_numbers
 from padforge.sense.formats.columns import ColumnEntry, naming_file
-from padforge.sense.recording.doubts import suggest_unit
-from padforge.sense.recording.recording import FIBRE_NAMES, NOTE, PRESSES_DETECTED, Recording, detect_commands
+from padforge.sense.recording.doubts import rate_doubts, suggest_unit
+from padforge.sense.recording.recording import (
+    FIBRE_NAMES,
+    NOTE,
+    PRESSES_DETECTED,
+    Recording,
+    detect_commands,
+    median_rate_hz,
+)
 from padforge.sense.recording.tables import UNKNOWN, name_lines
 
 Arrays = Sequence[tuple[ColumnEntry, NDArray[Any]]]
@@ -128,7 +135,10 @@ def _assemble(content: ForeignArrays, presses: Arrays) -> Recording:
     commands = _find_presses(columns, None if is_held else positions, len(times), jitter_mm)
     source = {**content.source, FIBRE_NAMES: names}
     if commands is None:
-        commands, source = detect_commands(readings, times, source), {**source, **PRESSES_DETECTED}
+        try:
+            commands, source = detect_commands(readings, times, source), {**source, **PRESSES_DETECTED}
+        except InputError as error:
+            raise InputError("; ".join([str(error), *rate_doubts(median_rate_hz(times), source)])) from error
     down, up = commands
 
     def at_presses(name: str, values: Array) -> Array:

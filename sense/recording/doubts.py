@@ -55,7 +55,8 @@ def suggest_unit(source: Mapping[str, Any], quantity: str, readings: Array | Non
         stated = [
             (quantity, re.sub(r":[^:\]]*$", "", name)) for quantity, name in names if quantity.strip() in quantities
         ]
-        return ",".join(f"{quantity.strip()}={name}:{unit}" for quantity, name in stated or [(quantities[0], "NAME")])
+        unnamed = [(quantity, "NAME") for quantity in quantities]
+        return ",".join(f"{quantity.strip()}={name}:{unit}" for quantity, name in stated or unnamed)
 
     if quantity == "time":
         return f"ms ({entry(['time'], 'ms')})"
@@ -67,6 +68,15 @@ def suggest_unit(source: Mapping[str, Any], quantity: str, readings: Array | Non
     return f"counts ({volts}), or mV ({entry(['fibres'], 'mV')})"
 
 
+def rate_doubts(rate_hz: float, source: Mapping[str, Any]) -> list[str]:
+    """Return what makes a number of readings a second doubtful, by the mapping in the source of a recording."""
+    if rate_hz < MIN_RATE_HZ:
+        return [f"there are {rate_hz:.2g} readings a second; is time in {suggest_unit(source, 'time')}?"]
+    if rate_hz > MAX_RATE_HZ:
+        return [f"there are {rate_hz:.4g} readings a second; is time in s (time=NAME:s)?"]
+    return []
+
+
 def _unit_doubts(recording: Recording) -> list[str]:
     doubts, source = [], recording.source
     area, rate_hz = area_mm(recording), recording.rate_hz
@@ -75,10 +85,7 @@ def _unit_doubts(recording: Recording) -> list[str]:
         doubts.append(f"positions span {area[0]:.4g} x {area[1]:.4g} mm; are they {suggest_unit(source, 'positions')}?")
     if area is not None and area.max() > MAX_SPAN_MM:
         doubts.append(f"positions span {area[0]:.4g} x {area[1]:.4g} mm; are they in another unit (x=NAME:UNIT)?")
-    if rate_hz < MIN_RATE_HZ:
-        doubts.append(f"there are {rate_hz:.2g} readings a second; is time in {suggest_unit(source, 'time')}?")
-    if rate_hz > MAX_RATE_HZ:
-        doubts.append(f"there are {rate_hz:.4g} readings a second; is time in s (time=NAME:s)?")
+    doubts += rate_doubts(rate_hz, source)
     if rest_v > MAX_REST_V:
         doubts.append(f"fibres rest at {rest_v:.4g} V; are they {suggest_unit(source, 'fibres', recording.readings)}?")
     return doubts
