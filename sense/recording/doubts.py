@@ -40,13 +40,16 @@ def name_presses(recording: Recording, mask: Mask) -> str:
     return ", ".join([*named[:MAX_NAMED], *more])
 
 
-def suggest_unit(source: Mapping[str, Any], quantity: str, readings: Array | None = None) -> str:
+def suggest_unit(
+    source: Mapping[str, Any], quantity: str, readings: Array | None = None, rate_hz: float = MIN_RATE_HZ / 1000
+) -> str:
     """Return the unit that a quantity may be in, and the entry of the mapping that says so.
 
     Args:
         source: of the recording, with its mapping as `columns`.
         quantity: `time`, `positions` or `fibres`.
         readings: as they were taken, V; whether they are counts of a converter, and of how many bits.
+        rate_hz: as times were taken, Hz; whether they are ms, us or ns.
     """
     columns = str(source.get("columns", ""))
     names = [piece.partition("=")[::2] for piece in columns.split(",")] if columns else []
@@ -59,7 +62,9 @@ def suggest_unit(source: Mapping[str, Any], quantity: str, readings: Array | Non
         return ",".join(f"{quantity.strip()}={name}:{unit}" for quantity, name in stated or unnamed)
 
     if quantity == "time":
-        return f"ms ({entry(['time'], 'ms')})"
+        units = {"ms": 1e3, "us": 1e6}
+        unit = next((unit for unit, factor in units.items() if rate_hz * factor >= MIN_RATE_HZ), "ns")
+        return f"{unit} ({entry(['time'], unit)})"
     if quantity == "positions":
         return f"in m ({entry(['x', 'y'] if 'x=' in columns or not columns else ['positions'], 'm')})"
     highest = float(np.nanmax(readings)) if readings is not None else 0.0
@@ -71,7 +76,9 @@ def suggest_unit(source: Mapping[str, Any], quantity: str, readings: Array | Non
 def rate_doubts(rate_hz: float, source: Mapping[str, Any]) -> list[str]:
     """Return what makes a number of readings a second doubtful, by the mapping in the source of a recording."""
     if rate_hz < MIN_RATE_HZ:
-        return [f"there are {rate_hz:.2g} readings a second; is time in {suggest_unit(source, 'time')}?"]
+        return [
+            f"there are {rate_hz:.2g} readings a second; is time in {suggest_unit(source, 'time', rate_hz=rate_hz)}?"
+        ]
     if rate_hz > MAX_RATE_HZ:
         return [f"there are {rate_hz:.4g} readings a second; is time in s (time=NAME:s)?"]
     return []
