@@ -87,8 +87,10 @@ def _materials(folder: Path, format_: str) -> tuple[Any, ...]:
     if not path.exists():
         return (None,)
     with reraise_as_input_error(path):
-        materials = _materials(folder, export.FORMAT)
-        return [*design.design_sections(folder, document), *design.press_sections(document, *materials)]
+        document = read_json(path, format_)
+        max_strain, silicone = document["fibre"]["max_strain"], document["silicone"]
+        strain = None if max_strain is None else float(max_strain)
+        return (strain, (silicone["name"], float(silicone["modulus_kpa"]))) if silicone["modulus_kpa"] else (strain,)
 
 
 def _find_mismatches(

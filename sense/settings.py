@@ -103,7 +103,7 @@ class RigSettings(Settings):
         default="due",
         min_length=1,
         max_length=100,
-        description='name of the board: "due", "line", or another that is installed',
+        description='name of the board: "due", "line", "csv", or another that is installed',
     )
     port: str = Field(default="auto", min_length=1, max_length=4096, description='serial port of the board, or "auto"')
     baud: int = Field(
@@ -116,6 +116,12 @@ class RigSettings(Settings):
         default=115_200, ge=9600, le=2_000_000, description="speed of the 3D printer's port, baud"
     )
     board_rate_hz: float = Field(default=1000.0, ge=1, le=10_000, description="samples a second, averaged to rate_hz")
+    count_v: float = Field(
+        default=1.0,
+        gt=0,
+        le=1000,
+        description='board "csv": volts of 1 in its lines, such as 0.00489 for 5 V of 10 bits',
+    )
     channels: Annotated[tuple[Input, ...], BeforeValidator(as_tuple)] = Field(
         default=(), max_length=512, description="input of the board that each fibre is on, from 0; [] in order"
     )

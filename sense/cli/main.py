@@ -91,7 +91,7 @@ def import_(
     """
     from padforge.common.files import provenance
     from padforge.sense.formats.columns import join_names
-    from padforge.sense.formats.import_export import describe_file, import_file
+    from padforge.sense.formats.import_export import describe_file, find_reader, import_file
     from padforge.sense.recording.doubts import find_doubts
     from padforge.sense.recording.recording import PRESSES_DETECTED
     from padforge.sense.recording.run_directory import check_new_folder
@@ -100,6 +100,7 @@ def import_(
         for line in describe_file(file, encoding):
             echo(line)
         return
+    find_reader(file)  # refuses a file of another kind before its folder
     folder = out or pad_folder(file) / "recording"
     check_new_folder(folder)
     recording = import_file(file, columns, encoding, presses, press_columns)

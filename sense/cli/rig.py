@@ -1,6 +1,5 @@
 """The commands `padforge sense record` and `doctor`."""
 
-from collections.abc import Sequence
 from contextlib import ExitStack, closing
 from functools import partial
 from pathlib import Path
@@ -17,7 +16,6 @@ if TYPE_CHECKING:
     from padforge.design.settings import PadSettings
     from padforge.sense.recording.recording import Recording
     from padforge.sense.rig.config import RigConfig
-    from padforge.sense.rig.doctor import Diagnosis
 
 
 _RIG_SETTINGS = "padforge.sense.settings:RigSettings"
@@ -239,6 +237,7 @@ def doctor(ctx: click.Context, rig: str, morphology: Path | None, spec: Path | N
     from padforge.design.settings import PadSettings, read_contact
     from padforge.sense.rig.config import RigConfig
     from padforge.sense.rig.devices import check_platform
+    from padforge.sense.rig.operation import diagnose
     from padforge.sense.settings import read_rig
 
     check_rig(rig, simulated=False)
@@ -248,17 +247,9 @@ def doctor(ctx: click.Context, rig: str, morphology: Path | None, spec: Path | N
     inputs = options.inputs(len(pad.knots)) if morphology else options.channels
     contact, folder = read_contact(settings), common.pad_folder(morphology)
     config = RigConfig(pad, contact, options, Path(), "padforge sense doctor", folder=folder)
-    diagnoses = _diagnose(rig, config, inputs)
+    diagnoses = diagnose(rig, config, inputs)
     passed = all(diagnosis.status != "fail" for diagnosis in diagnoses)
     lines = [f"{diagnosis.status:<4} {diagnosis.name}: {diagnosis.message}" for diagnosis in diagnoses]
     rows = [asdict(diagnosis) for diagnosis in diagnoses]
     common.show_result({"passed": passed, "diagnoses": rows}, lines, as_json)
     ctx.exit(0 if passed else 1)
-
-
-def _diagnose(rig: str, config: "RigConfig", inputs: Sequence[int]) -> "list[Diagnosis]":
-    from padforge.sense.rig.operation import diagnose, make_arm, make_board
-
-    if rig == "hand":
-        return diagnose(lambda: make_board(config.rig, inputs))
-    return diagnose(lambda: make_board(config.rig, inputs), lambda: make_arm(rig, config, inputs))

@@ -16,8 +16,15 @@ from numpy.typing import NDArray
 from padforge.common.validation import InputError
 from padforge.sense.arrays import MAX_VOLTS, Array, Indices, Mask, check_numbers
 from padforge.sense.formats.columns import ColumnEntry, naming_file
-from padforge.sense.recording.doubts import suggest_unit
-from padforge.sense.recording.recording import FIBRE_NAMES, NOTE, PRESSES_DETECTED, Recording, detect_commands
+from padforge.sense.recording.doubts import rate_doubts, suggest_unit
+from padforge.sense.recording.recording import (
+    FIBRE_NAMES,
+    NOTE,
+    PRESSES_DETECTED,
+    Recording,
+    detect_commands,
+    median_rate_hz,
+)
 from padforge.sense.recording.tables import UNKNOWN, name_lines
 
 Arrays = Sequence[tuple[ColumnEntry, NDArray[Any]]]
@@ -27,6 +34,7 @@ MEASURES = {"depth": "depths_mm", "reached": "reached_mm", "force": "forces_n"}
 MAX_GAP = 3  # readings without a position that are bridged within a press
 MAX_JITTER_MM = 0.5  # between two readings, of a position that an arm or camera measures within a press
 MAX_NOISE_SHARE = 0.1  # of the largest force, below 0: a load cell that is not quite at 0
+MAX_UNTIMED_SHARE = 0.05  # of readings without a time that are left out
 MAX_LATE_SHARE = 0.01  # of readings whose times go back and that are left out
 WRAPS_S = (2**32 / 1e6, 2**32 / 1e3, 2**16 / 1e3, 2**16 / 1e6, 86400.0, 43200.0)
 """After which the clocks of boards begin anew: counters of us and ms with 32 and 16 bits, and times of day."""
@@ -120,6 +128,11 @@ def _assemble(content: ForeignArrays, presses: Arrays) -> Recording:
     columns = _within(columns, len(times), notes) if presses else columns
     positions, rows = _join_positions(columns), np.arange(len(times))
     jitter_mm = 0.0 if content.is_own else MAX_JITTER_MM
+    if positions is not None and not content.is_own:
+        is_half = np.isnan(positions).any(axis=1)
+        if n_half := int((is_half & ~np.isnan(positions).all(axis=1)).sum()):
+            notes.append(f"{n_half} positions have one of x and y, and count as missing")
+            positions = np.where(is_half[:, None], np.nan, positions)
     if positions is not None and len(positions) == len(times) and not {"press", "down_command"} & columns.keys():
         rows = _bridge_gaps(positions, jitter_mm)
         positions, n_bridged = positions[rows], int((rows != np.arange(len(rows))).sum())
@@ -128,7 +141,10 @@ def _assemble(content: ForeignArrays, presses: Arrays) -> Recording:
     commands = _find_presses(columns, None if is_held else positions, len(times), jitter_mm)
     source = {**content.source, FIBRE_NAMES: names}
     if commands is None:
-        commands, source = detect_commands(readings, times, source), {**source, **PRESSES_DETECTED}
+        try:
+            commands, source = detect_commands(readings, times, source), {**source, **PRESSES_DETECTED}
+        except InputError as error:
+            raise InputError("; ".join([str(error), *rate_doubts(median_rate_hz(times), source)])) from error
     down, up = commands
 
     def at_presses(name: str, values: Array) -> Array:
@@ -222,7 +238,7 @@ def repair_times(
     rows = np.flatnonzero(~np.isnan(times_s))
     if n_untimed := int(readings.sum()) - len(rows):
         notes.append(f"{name_rows(np.flatnonzero(readings & np.isnan(times_s)))} left out: no time")
-        if n_untimed > max(3, MAX_LATE_SHARE * len(times_s)):
+        if n_untimed > max(3, MAX_UNTIMED_SHARE * len(times_s)):
             raise InputError(f"time is missing in {n_untimed} of {int(readings.sum())} readings, expected it in each")
     times = times_s[rows]
     steps = np.diff(times)
@@ -233,7 +249,8 @@ def repair_times(
     offsets, n_wraps = np.zeros(len(times)), 0
     for row in np.flatnonzero(steps < 0):
         for wrap in WRAPS_S:
-            if 0 < steps[row] + wrap <= 5 * usual:
+            # A counter was below its wrap and nearly there, and many readings fit in: not two lines that were swapped.
+            if 0 < steps[row] + wrap <= 5 * usual < 0.1 * wrap and 0 <= times[row] < wrap:
                 offsets[row + 1 :] += wrap
                 n_wraps += 1
                 break
@@ -304,6 +321,9 @@ def _upright(entry: ColumnEntry, values: Array, notes: list[str]) -> Array:
         factor = -1 if entry.factor is None else -entry.factor
         what = f"{entry.quantity} is below 0 in most presses, such as {np.nanmin(values):g}"
         raise InputError(f"{what}; does it point the other way ({entry.quantity}={entry.name}:{factor:g})?")
+    if entry.quantity == "depth" and (values == 0).any():
+        notes.append(f"{(values == 0).sum()} depths of presses are 0, and count as missing")
+        return np.where(values == 0, np.nan, values)
     is_noise = (values < 0) & (values > -MAX_NOISE_SHARE * np.nanmax(values, initial=0))
     if entry.quantity == "force" and is_noise.any():
         notes.append(f"{is_noise.sum()} forces are little below 0, the least {values[is_noise].min():g} N; they are 0")

@@ -221,14 +221,17 @@ def decode(raw: RawMessages, paths: Sequence[str]) -> TopicSeries:
 def get_field(message: Any, path: str) -> Any:
     """Return the field at a path; of a list of messages, the list of theirs."""
     for name in path.split("."):
-        message = [getattr(item, name) for item in message] if isinstance(message, list) else getattr(message, name)
+        try:
+            message = [getattr(item, name) for item in message] if isinstance(message, list) else getattr(message, name)
+        except AttributeError as error:
+            raise InputError(f"{path!r} is no field, expected a path of names such as header.stamp.sec") from error
     return message
 
 
 def _numbers(message: Any, path: str, msgtype: str) -> Array:
     try:
         return np.asarray(get_field(message, path), np.float64).ravel()
-    except (AttributeError, TypeError, ValueError) as error:
+    except (TypeError, ValueError) as error:
         raise InputError(f"{msgtype} has no numbers at {path!r}") from error
 
 

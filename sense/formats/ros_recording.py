@@ -288,17 +288,19 @@ def _decode_entry(entry: ColumnEntry, field: str, raw: Mapping[str, RawMessages]
     what = f"{entry.quantity} is {short_repr(name)}"
     if name not in raw:
         raise InputError(f"{what}, which has no messages")
+    topic = raw[name]
+    kind = topic.msgtype
     with naming_file(what):
-        topic = raw[name]
-        kind = topic.msgtype
         if field:
-            kind = getattr(ros_messages.get_field(topic.deserialize(topic.messages[0]), field), "__msgtype__", "")
+            value = ros_messages.get_field(topic.deserialize(topic.messages[0]), field)
+            kind = getattr(value, "__msgtype__", "")
         if kind in types:
             return ros_messages.decode(topic, [f"{field}.{path}".lstrip(".") for path in types[kind]])
         if field and not kind:
             return ros_messages.decode(topic, [field])
         fields = join_names(list(_number_fields(topic)))
-        raise InputError(f"of {short_repr(kind)}, which has numbers in fields; name one of {fields} as {name}.FIELD")
+    has = f"name one of its fields as {name}.FIELD: {fields}" if fields != "nothing" else "which holds no numbers"
+    raise InputError(f"{what} of {short_repr(kind)}, {has}")
 
 
 def _number_fields(topic: RawMessages) -> dict[str, int]:

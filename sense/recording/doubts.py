@@ -40,13 +40,16 @@ def name_presses(recording: Recording, mask: Mask) -> str:
     return ", ".join([*named[:MAX_NAMED], *more])
 
 
-def suggest_unit(source: Mapping[str, Any], quantity: str, readings: Array | None = None) -> str:
+def suggest_unit(
+    source: Mapping[str, Any], quantity: str, readings: Array | None = None, rate_hz: float = MIN_RATE_HZ / 1000
+) -> str:
     """Return the unit that a quantity may be in, and the entry of the mapping that says so.
 
     Args:
         source: of the recording, with its mapping as `columns`.
         quantity: `time`, `positions` or `fibres`.
         readings: as they were taken, V; whether they are counts of a converter, and of how many bits.
+        rate_hz: as times were taken, Hz; whether they are ms, us or ns.
     """
     columns = str(source.get("columns", ""))
     names = [piece.partition("=")[::2] for piece in columns.split(",")] if columns else []
@@ -55,16 +58,30 @@ def suggest_unit(source: Mapping[str, Any], quantity: str, readings: Array | Non
         stated = [
             (quantity, re.sub(r":[^:\]]*$", "", name)) for quantity, name in names if quantity.strip() in quantities
         ]
-        return ",".join(f"{quantity.strip()}={name}:{unit}" for quantity, name in stated or [(quantities[0], "NAME")])
+        unnamed = [(quantity, "NAME") for quantity in quantities]
+        return ",".join(f"{quantity.strip()}={name}:{unit}" for quantity, name in stated or unnamed)
 
     if quantity == "time":
-        return f"ms ({entry(['time'], 'ms')})"
+        units = {"ms": 1e3, "us": 1e6}
+        unit = next((unit for unit, factor in units.items() if rate_hz * factor >= MIN_RATE_HZ), "ns")
+        return f"{unit} ({entry(['time'], unit)})"
     if quantity == "positions":
         return f"in m ({entry(['x', 'y'] if 'x=' in columns or not columns else ['positions'], 'm')})"
     highest = float(np.nanmax(readings)) if readings is not None else 0.0
     bits = next((bits for bits in COMMON_BITS if highest < 2**bits), 24)
     volts = f"{entry(['fibres'], format(REFERENCE_V / (2**bits - 1), '.3g'))} for {bits} bits of {REFERENCE_V:g} V"
     return f"counts ({volts}), or mV ({entry(['fibres'], 'mV')})"
+
+
+def rate_doubts(rate_hz: float, source: Mapping[str, Any]) -> list[str]:
+    """Return what makes a number of readings a second doubtful, by the mapping in the source of a recording."""
+    if rate_hz < MIN_RATE_HZ:
+        return [
+            f"there are {rate_hz:.2g} readings a second; is time in {suggest_unit(source, 'time', rate_hz=rate_hz)}?"
+        ]
+    if rate_hz > MAX_RATE_HZ:
+        return [f"there are {rate_hz:.4g} readings a second; is time in s (time=NAME:s)?"]
+    return []
 
 
 def _unit_doubts(recording: Recording) -> list[str]:
@@ -75,10 +92,7 @@ def _unit_doubts(recording: Recording) -> list[str]:
         doubts.append(f"positions span {area[0]:.4g} x {area[1]:.4g} mm; are they {suggest_unit(source, 'positions')}?")
     if area is not None and area.max() > MAX_SPAN_MM:
         doubts.append(f"positions span {area[0]:.4g} x {area[1]:.4g} mm; are they in another unit (x=NAME:UNIT)?")
-    if rate_hz < MIN_RATE_HZ:
-        doubts.append(f"there are {rate_hz:.2g} readings a second; is time in {suggest_unit(source, 'time')}?")
-    if rate_hz > MAX_RATE_HZ:
-        doubts.append(f"there are {rate_hz:.4g} readings a second; is time in s (time=NAME:s)?")
+    doubts += rate_doubts(rate_hz, source)
     if rest_v > MAX_REST_V:
         doubts.append(f"fibres rest at {rest_v:.4g} V; are they {suggest_unit(source, 'fibres', recording.readings)}?")
     return doubts

@@ -51,6 +51,7 @@ class _Layout:
     decimal_comma: bool
     header: int  # number of the line of names; 0 without one
     first: int  # number of the first line of values
+    width: int  # usual number of values in a line; a header may name more
     names: list[str]
     units: list[str]
     dates: frozenset[int]  # columns of dates or times of day
@@ -62,9 +63,11 @@ class Table:
 
     Attributes:
         path: of the file.
+        encoding: of its text.
         names: of the columns; numbers from 1 without a header.
         units: of the columns, from a line below the header; "" without.
         rows: first cells of the table, for people.
+        layout: how it is written.
         notes: what was left out in reading, each in one line.
     """
 
@@ -73,14 +76,14 @@ class Table:
     names: list[str]
     units: list[str]
     rows: list[list[str]]
+    layout: _Layout
     notes: list[str] = field(default_factory=list)
-    _layout: _Layout = field(repr=False, default=None)  # type: ignore[assignment]
-    _lines: "array[int]" = field(repr=False, default_factory=lambda: array("q"))
+    _lines: "array[int]" = field(default_factory=lambda: array("q"))
 
     @property
     def has_header(self) -> bool:
         """Whether a line names the columns."""
-        return self._layout.header > 0
+        return self.layout.header > 0
 
     def line_number(self, row: int) -> int:
         """Return the number of the line, from 1, that a row was read from."""
@@ -96,7 +99,7 @@ class Table:
         Returns:
             (R, n), NaN where a value is missing; dates as seconds since 1970, or since midnight without a day.
         """
-        layout, width = self._layout, len(self.names)
+        layout, width = self.layout, len(self.names)
         numbers, self._lines, self.notes = array("d"), array("q"), []
         dates: dict[int, list[str]] = {column: [] for column in columns if column in layout.dates}
         words: dict[int, dict[int, str]] = {column: {} for column in columns}  # by column and line, what is no number
@@ -109,10 +112,12 @@ class Table:
             last = line
             cells = [cell.strip() for cell in row]
             if len(cells) != width and not any(cells[width:]):
-                cells = cells[:width]
+                cells = cells[:width] if len(cells) != layout.width else cells + [""] * (width - layout.width)
             if len(cells) != width:
                 torn.append((line, len(cells)))
-            elif self.has_header and cells[: len(self.names)] in (self.names, self.units):
+            elif not any(cells):
+                continue
+            elif self.has_header and cells in (self.names, self.units):
                 n_headers += 1
             else:
                 self._lines.append(line)
@@ -121,16 +126,12 @@ class Table:
                         dates[column].append(cells[column])
                         numbers.append(np.nan)
                         continue
-                    try:
-                        value = float(cells[column])  # most cells
-                        is_plain = "_" not in cells[column] and value - value == 0
-                    except ValueError:
-                        is_plain = False
-                    if not is_plain or (layout.decimal_comma and "." in cells[column]):
-                        value = _parse(cells[column], layout, column in may_be_unknown)
-                        if value is None:
-                            words[column][line], value = cells[column], np.nan
+                    value = _parse(cells[column], layout, column in may_be_unknown)
+                    if value is None:
+                        words[column][line], value = cells[column], np.nan
                     numbers.append(value)
+        if not self._lines:
+            raise InputError(f"{self.path}: has no line of values below its header")
         self._report(words, torn, n_headers, last)
         if garbled:
             self.notes.append(f"{name_lines(garbled)} read without bytes that are no text")
@@ -184,8 +185,10 @@ def read_table(path: Path, encoding: str = "") -> Table:
     encoding = encoding or _find_encoding(check_file(path, MAX_BYTES))
     sample = list(islice(_iterate_lines(path, encoding, comments=True), _N_SAMPLED))
     layout = _find_layout(sample)
-    rows = [row for line, row in _split(iter(sample), layout.separator) if line >= layout.first]
-    return Table(path, encoding, layout.names, layout.units, rows, _layout=layout)
+    blank = [""] * len(layout.names)
+    lines = _split(iter(sample), layout.separator)
+    rows = [[*row, *blank][: len(blank)] for line, row in lines if line >= layout.first]
+    return Table(path, encoding, layout.names, layout.units, rows, layout)
 
 
 @contextmanager
@@ -268,20 +271,9 @@ def _find_layout(sample: list[tuple[int, str]]) -> _Layout:
     start = next((i for i, is_data in enumerate(is_first) if is_data), len(rows))
     number = rows[start][0] if start < len(rows) else (rows[-1][0] + 1 if rows else 1)
     # 2. the lines of names and units before it
-    above = [(line, row) for line, row in rows[:start] if 2 * sum(map(bool, row)) >= width]
-    while above and len(above[-1][1]) == width != len(above[0][1]):
-        above.pop(0)
-    if not above and comments and comments[-1][0] < number:
-        commented = [(line, row) for line, row in _split(iter(comments[-1:]), _most(comments[-1][1], separator))]
-        above = [(line, [cell.strip() for cell in row]) for line, row in commented if len(row) in (width, 1)]
-        above = above if len(rows) == 0 or (above and len(above[0][1]) == width) else []
-    header, names = max(above, key=lambda item: sum(map(bool, item[1])), default=(0, []))
-    units = above[-1][1] if above and above[-1][0] > header else []
-    names = [*names, *("" if not any(column) else str(i) for i, column in _columns(table, len(names)))]
-    if not above:
-        names = [str(i + 1) for i in range(width)]
-    if names and _CLOCK.fullmatch(names[0]):
-        names[0] = "received"  # the monitor stamped the header as well
+    header, names, units = _find_names(rows[:start], width, [item for item in comments if item[0] < number], separator)
+    unnamed = list(zip(*table, strict=True))[len(names) :]
+    names += ["" if header and not any(cells) else str(len(names) + i) for i, cells in enumerate(unnamed, 1)]
     # 3. how numbers are written
     values = [cell for _, row in rows[start:] for cell in row]
     has_comma = any(re.fullmatch(r"[-+]?\d*,\d+", cell) for cell in values)
@@ -295,21 +287,29 @@ def _find_layout(sample: list[tuple[int, str]]) -> _Layout:
         has_comma and not has_point,
         header,
         number,
+        width,
         names,
         [*units, *[""] * (len(names) - len(units))],
         dates,
     )
 
 
-def _columns(table: list[list[str]], first: int) -> list[tuple[int, tuple[str, ...]]]:
-    """Return the columns from `first` on, with their numbers from 1."""
-    columns = list(zip(*table, strict=True))
-    return [(i + 1, columns[i]) for i in range(first, len(columns))]
-
-
-def _most(line: str, separator: str) -> str:
-    """Return the separator that a header has most of, or the table's."""
-    return separator if separator in line else max(SEPARATORS, key=line.count)
+def _find_names(
+    rows: list[tuple[int, list[str]]], width: int, comments: list[tuple[int, str]], separator: str
+) -> tuple[int, list[str], list[str]]:
+    """Return the line of names among the rows above the values, or the last comment, its names, and units below it."""
+    above = [(line, row) for line, row in rows if 2 * sum(map(bool, row)) >= width]
+    while above and len(above[-1][1]) == width != len(above[0][1]):
+        above.pop(0)
+    if not above and comments:
+        text = comments[-1][1]
+        split = _split(iter(comments[-1:]), separator if separator in text else max(SEPARATORS, key=text.count))
+        above = [(line, [cell.strip() for cell in row]) for line, row in split if len(row) == width]
+    header, names = max(above, key=lambda item: sum(map(bool, item[1])), default=(0, []))
+    units = above[-1][1] if above and above[-1][0] > header else []
+    if names and _CLOCK.fullmatch(names[0]):
+        names[0] = "received"  # the monitor stamped the header as well
+    return header, list(names), units
 
 
 def _n_values(rows: list[list[str]]) -> int:
@@ -343,6 +343,12 @@ def _is_value(cell: str) -> bool:
 
 def _parse(cell: str, layout: _Layout, may_be_unknown: bool) -> float | None:
     """Return the number of a cell, NaN of one that is missing; None of one that is neither."""
+    try:
+        value = float(cell)
+        if value - value == 0 and "_" not in cell and not (layout.decimal_comma and "." in cell):
+            return value  # most cells
+    except ValueError:
+        pass
     word = cell.lower()
     if word in MISSING:
         return np.nan
@@ -376,7 +382,7 @@ def _parse_dates(texts: list[str], what: str) -> Array:
             import pandas
         except ImportError as error:
             raise InputError(
-                f"{what}: dates such as {texts[0]!r} need pandas: pip install 'padforge[tables]'"
+                f"{what}: dates such as {texts[0]!r} need pandas: pip install 'padforge[formats]'"
             ) from error
         is_european = bool(re.match(r"\d{1,2}\.", texts[0]))
         dates = pandas.to_datetime(

@@ -31,6 +31,7 @@ from padforge.sense.recording.press_plan import (
 )
 from padforge.sense.recording.run_directory import FORMAT, START, Recorder
 from padforge.sense.rig.devices import Pose, RigFault
+from padforge.sense.rig.safety import check_probe
 from padforge.sense.settings import SIMULATED, Millimetres, RigSettings
 
 FABRICATION_FILE, FABRICATION_FORMAT = "fabrication.json", "padforge-fabrication/1"
@@ -114,11 +115,9 @@ def locate_on_bed(rig: RigSettings, folder: Path) -> RigSettings:
     The workspace is the pad seen from above, as far as the nozzle gets; down to `max_depth_mm`, but never below the top
     of the holder's walls. What `[rig]` sets takes precedence; what neither tells raises RigFault("refused").
     """
+    check_probe(rig)
     if None not in (rig.pad_mm, rig.contact_mm, rig.box_mm):
         return rig
-    if rig.tcp_mm is None:
-        message = "[rig] tcp_mm is unknown, allowed are x, y and z of the probe's tip from the nozzle"
-        raise RigFault("refused", message, "measure them with the probe in place")
     path = folder / FABRICATION_FILE
     stored = read_json(path, FABRICATION_FORMAT).get("frame") if path.is_file() else None
     if not isinstance(stored, Mapping):
@@ -133,7 +132,7 @@ def locate_on_bed(rig: RigSettings, folder: Path) -> RigSettings:
     if round(frame.angle_deg / 90) % 2:  # the pad lies turned by quarters on the bed
         half_x, half_y = half_y, half_x
     width, depth, height = frame.bed_mm
-    dx, dy, dz = rig.tcp_mm
+    dx, dy, dz = rig.tcp_mm or (0.0, 0.0, 0.0)
     box = (
         *(max(x - half_x, dx), min(x + half_x, width + dx)),
         *(max(y - half_y, dy), min(y + half_y, depth + dy)),

@@ -114,7 +114,7 @@ class Board(Protocol):
         """Open the link, start sampling and return the board's identity (name, versions, bits ...) as JSON.
 
         Of it are used: `rate_hz`, samples a second; `channels`, the number C; `inputs`, which of the board they are;
-        `supply_v`, the reading at full scale; and `warning`, which `doctor` shows.
+        `supply_v`, the reading at full scale, if that is known; and `warning`, which `doctor` shows.
         """
         ...
 

@@ -43,7 +43,7 @@ def examine_board(board: Board) -> list[Diagnosis]:
     rate_hz = (len(times_s) - 1) / (times_s[-1] - times_s[0]) if len(times_s) > 1 else 0.0
     nominal_hz = float(identity.get("rate_hz", rate_hz))
     is_on_rate = abs(rate_hz / nominal_hz - 1) < _RATE_TOLERANCE
-    inputs, supply_v = identity["inputs"], identity["supply_v"]
+    inputs, supply_v = identity["inputs"], identity.get("supply_v", np.inf)
     return [
         Diagnosis("board", "warn" if "warning" in identity else "ok", _identity_text(identity)),
         Diagnosis("rate", "ok" if is_on_rate else "fail", f"{rate_hz:.1f} Hz of {nominal_hz:g}"),

@@ -151,11 +151,17 @@ def opened_rig(kind: str, config: RigConfig, inputs: Sequence[int]) -> Iterator[
 
 def make_arm(kind: str, config: RigConfig, inputs: Sequence[int]) -> tuple[Arm, RigSettings]:
     """Return an arm by its name, not yet connected, and the settings for it, which name the inputs of the board."""
-    make = load_device("padforge.arms", kind)
     rig = config.rig.model_copy(update={"channels": tuple(inputs)})
     if kind == "printer":
+        _check_ports(rig)
         rig = locate_on_bed(rig, config.folder)
-    return make(rig), rig
+    return load_device("padforge.arms", kind)(rig), rig
+
+
+def _check_ports(rig: RigSettings) -> None:
+    if rig.printer_port is not None and Path(rig.printer_port).resolve() == Path(rig.port).resolve():
+        message = f"[rig] port and printer_port are the same, {rig.port}"
+        raise RigFault("refused", message, "the board and the printer each have a port of their own")
 
 
 def make_board(rig: RigSettings, inputs: Sequence[int]) -> Board:
@@ -210,24 +216,31 @@ def _make_planner(config: RigConfig, rig: RigSettings, model: Path | None) -> Ca
     return AdaptivePlanner(LocalizerModel.load(model), config.out, np.random.default_rng(rig.seed), free)
 
 
-def diagnose(
-    make_board: Callable[[], Board], make_arm: Callable[[], tuple[Arm, RigSettings]] | None = None
-) -> list[Diagnosis]:
-    """Diagnose a rig, or the board alone, before a long run; nothing moves.
+def diagnose(kind: str, config: RigConfig, inputs: Sequence[int]) -> list[Diagnosis]:
+    """Diagnose a rig before a long run, or with `hand` the board alone; nothing moves.
 
-    One device is examined even if the other cannot be made; a board alone that cannot raises RigFault.
+    One device is examined even if the other cannot be made; a board alone that cannot raises RigFault. A printer is
+    examined before it is asked where the pad lies.
     """
     ports = [f"{port.device} ({port.description})" for port in host_ports() if port.vid is not None]
     diagnoses = [Diagnosis("ports", "ok", ", ".join(ports) or "no board seen on USB")]
     try:
-        diagnoses += examine_board(make_board())
+        diagnoses += examine_board(make_board(config.rig, inputs))
     except RigFault as fault:
-        if make_arm is None:
+        if kind == "hand":
             raise
         diagnoses.append(Diagnosis("board", "fail", str(fault)))
-    if make_arm is not None:
-        try:
-            diagnoses += examine_arm(*make_arm())
-        except RigFault as fault:
-            diagnoses.append(Diagnosis("arm", "fail", str(fault)))
-    return diagnoses
+    if kind == "hand":
+        return diagnoses
+    rig, place = config.rig.model_copy(update={"channels": tuple(inputs)}), []
+    try:
+        if kind == "printer":
+            _check_ports(rig)
+            try:
+                rig = locate_on_bed(rig, config.folder)
+            except RigFault as fault:
+                place = [Diagnosis("place", "fail", str(fault))]
+        diagnoses += examine_arm(load_device("padforge.arms", kind)(rig), rig)
+    except RigFault as fault:
+        diagnoses.append(Diagnosis("arm", "fail", str(fault)))
+    return diagnoses + place

@@ -124,6 +124,13 @@ def check_finite_move(pose: Sequence[float], speed_mm_s: float, acceleration_mm_
             _refuse(f"the {name} {value}", "more than 0")
 
 
+def check_probe(rig: RigSettings) -> None:
+    """Raise RigFault("refused") unless `[rig]` says where the tip of a printer's probe is."""
+    if rig.tcp_mm is None:
+        message = "[rig] tcp_mm is unknown, allowed are x, y and z of the probe's tip from the nozzle"
+        raise RigFault("refused", message, "measure them with the probe in place")
+
+
 def check_target(pose: Sequence[float], speed_mm_s: float, acceleration_mm_s2: float, limits: Limits) -> None:
     """Raise RigFault("refused") if a target is out of limits: what, its value and what is allowed."""
     check_finite_move(pose, speed_mm_s, acceleration_mm_s2)

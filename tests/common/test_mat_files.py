@@ -36,7 +36,8 @@ CONTENT = {"para": np.sort(np.random.default_rng(0).uniform(0.5, 2.5, (3, 8)), a
 def test_load_mat_reads_every_version_and_refuses_torn_files(tmp_path: Path) -> None:
     scipy.io.savemat(tmp_path / "old.mat", CONTENT)
     old, new = load_mat(tmp_path / "old.mat", ("para",)), load_mat(newer(tmp_path / "new.mat", CONTENT), ("para",))
-    assert set(new) == {"para", "K"}
+    assert set(new) == {"para", "K", "text"}
+    assert isinstance(new["text"], str)
     assert np.array_equal(new["para"], old["para"])
     assert new["K"]["object_size"].item() == old["K"]["object_size"].item() == 0.6
     pads = [Morphology.load(tmp_path / name) for name in ("old.mat", "new.mat")]

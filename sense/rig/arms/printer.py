@@ -35,7 +35,7 @@ from padforge.sense.rig.arms.printer_link import (
     parse_position,
 )
 from padforge.sense.rig.devices import ArmState, Array, RigFault
-from padforge.sense.rig.safety import check_finite_move
+from padforge.sense.rig.safety import check_finite_move, check_probe
 from padforge.sense.settings import RigSettings
 
 CONNECT_S = 3.0  # longest wait for a printer that restarts as its port is opened
@@ -252,16 +252,13 @@ class Printer:
         """Open the port and set the printer up; nothing moves.
 
         RigFault("refused") where there is no printer with Marlin, it has not been homed, it restarts as its port is
-        opened, its axes are too slow for the presses, or a setting is missing.
+        opened, or its axes are too slow for the presses. Without `tcp_mm`, poses are of the nozzle and nothing moves.
         """
         self.close()
         rig = self._rig
         if rig.printer_port is None:
             raise RigFault("refused", "[rig] printer_port is unknown, allowed is a serial port such as /dev/ttyUSB0")
-        if rig.tcp_mm is None:
-            message = "[rig] tcp_mm is unknown, allowed are x, y and z of the probe's tip from the nozzle"
-            raise RigFault("refused", message, "measure them with the probe in place")
-        self._tcp = rig.tcp_mm
+        self._tcp = rig.tcp_mm or (0.0, 0.0, 0.0)
         self._link = link = MarlinLink(rig.printer_port, rig.printer_baud)
         try:
             link.handshake(CONNECT_S)
@@ -303,6 +300,7 @@ class Printer:
     def move(self, pose: Sequence[float], speed_mm_s: float, acceleration_mm_s2: float) -> None:
         """Start a straight move from rest, as fast as the axes can; RigFault("refused") also for a turn of the tool."""
         check_finite_move(pose, speed_mm_s, acceleration_mm_s2)
+        check_probe(self._rig)
         if not np.allclose(pose[3:], self._rig.tool_rad, atol=1e-6):
             raise RigFault("refused", f"a turn of the tool to {list(pose[3:])} rad; a printer cannot turn it")
         x, y, z = (float(value) - offset for value, offset in zip(pose, self._tcp, strict=False))

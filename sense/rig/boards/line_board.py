@@ -28,6 +28,9 @@ _LIMITS = {
 _ANSWER_S = 3.0  # opening their port resets many boards, and some wait for a new program before they start
 _RESEND_S = 0.5
 _RATE_TOLERANCE = 1e-3
+_MAX_RECEIVED = 1000  # bytes by which is judged what comes
+_MAX_SHOWN = 60  # characters of a line
+_MIN_TEXT = 0.9  # share of printable characters in what is text at the right speed
 _BAD_S, _MIN_BAD_LINES = 0.5, 5  # so much of nothing but damaged lines is no noise; reported before it is silence
 _MAX_GAP_US = 2_000_000  # a board that is silent for a second is stale, so no valid time jumps so far
 _SLOT_GAIN = 0.1  # share by which the slots to come follow a line that is a little early or late
@@ -144,6 +147,19 @@ def _parse_sample(line: bytes, header: LineHeader) -> LineSample:
     return LineSample(time_us, tuple(counts))
 
 
+def describe_lines(received: bytes) -> tuple[str, str]:
+    """Say what a port sends that is not the line protocol, and what to do about it."""
+    if not received:
+        return "nothing comes from it", "check that it is the board's port, its cable, and that its program runs"
+    text = sum(byte in b"\t\r\n" or 32 <= byte < 127 for byte in received)
+    if text < _MIN_TEXT * len(received):
+        return f"{len(received) - text} of {len(received)} bytes are no text", "is [rig] baud that of the board?"
+    lines = [line.strip() for line in received.split(b"\n")[1:-1] if line.strip()] or [received.strip()]
+    shown = repr(lines[-1][:_MAX_SHOWN].decode("ascii", "replace"))
+    what = f"it sends lines such as {shown} without the header of docs/howto-boards.md"
+    return what, 'add the header to its program, or set [rig] board = "csv", which is weaker'
+
+
 def find_line_port(rig: RigSettings) -> str:
     """Return the board's port: that of `[rig]`, or the only one on USB; RigFault("refused") if that is not one."""
     if rig.port != "auto":
@@ -222,14 +238,19 @@ class LineBoard:
 
     def _identify(self, stream: SerialStream) -> LineHeader:
         deadline, resend_s = clock.now() + _ANSWER_S, 0.0
+        received = b""
         while self._decoder.header is None:
             if (now := clock.now()) > deadline:
-                reason = self._decoder.error or "no board that speaks the line protocol answers"
-                raise RigFault("refused", f"{self._port}: {reason}", "check the port, the firmware and [rig] baud")
+                reason, advice = describe_lines(received)
+                if self._decoder.error:
+                    reason, advice = self._decoder.error, "check the port, the firmware and [rig] baud"
+                raise RigFault("refused", f"{self._port}: {reason}", advice)
             if now >= resend_s:
                 stream.send(HEADER_REQUEST)
                 resend_s = now + _RESEND_S
-            self._decoder.decode(stream.receive()[1])
+            data = stream.receive()[1]
+            received = (received + data)[-_MAX_RECEIVED:]
+            self._decoder.decode(data)
         header = self._decoder.header
         if abs(header.rate_hz / self._rate_hz - 1) > _RATE_TOLERANCE:
             message = f"{self._port}: the board takes {header.rate_hz:g} samples a second, [rig] says {self._rate_hz:g}"
@@ -296,7 +317,9 @@ class LineAssembler:
             self._n_misplaced += 1
             if self._n_misplaced >= _MAX_MISPLACED:
                 message = f"a line came {elapsed_us} us after another by the board's clock, not {self._period_us:g}"
-                raise RigFault("data", message, "it was reset, or its rate is not that of its header; connect again")
+                is_ms = 0.5 < 1000 * elapsed_us / self._n_misplaced / self._period_us < 2
+                advice = "it was reset, or its rate is not that of its header; connect again"
+                raise RigFault("data", message, "are its times ms? they must be us" if is_ms else advice)
             return None
         self._n_misplaced = max(self._n_misplaced - _FORGIVEN, 0.0)
         self._slot_us += steps * self._period_us

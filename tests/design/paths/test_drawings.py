@@ -66,7 +66,9 @@ def test_import_moves_ends_within_the_tolerance(tmp_path: Path) -> None:
     ways = [way.replace("20 -6", "20 -6.03") for way in WAYS]
     found = import_plan(svg(tmp_path, paths(*ways)), LAYOUT, 0.05)
     assert found.fibres[1].end_shift_mm == pytest.approx(0.03, abs=1e-4)
-    with pytest.raises(InputError, match=r"w0: runs from \(-20.0, 6.0\) mm to \(20.0, 6.0\) mm, 0.03 mm from") as told:
+    with pytest.raises(
+        InputError, match=r"w0: runs from \(-20, -6.03\) to \(20, -6.03\) in the drawing, 0.03 mm from"
+    ) as told:
         import_plan(svg(tmp_path, paths(*ways)), LAYOUT, 0.01)
     assert "--tolerance-mm" in str(told.value)
 
@@ -121,8 +123,8 @@ REFUSED = [
     (paths(*WAYS[:2], "M-10 18L-9-9-8 0-10-18", *WAYS[3:]), r"w2: turns back at \(-8.5, 4.5\) mm, .* along y"),
     (instead("M -20 -6 L -10 -6 L 0 -20 L 10 -6 L 20 -6"), r"w0: leaves the pad at"),
     (instead("M -20 -6 L 10 -6"), r"w0: runs from .*, 10 mm from where horizontal 2 ends"),
-    (paths(*WAYS[:4], "M 13 18 L 13 -18"), r"w4: runs from \(13.0, -18.0\) mm to \(13.0, 18.0\) mm, 3 mm from"),
-    (instead("M -20 -3 L 20 -3"), r"w0: runs from \(-20.0, 3.0\) mm to \(20.0, 3.0\) mm, 3 mm from"),
+    (paths(*WAYS[:4], "M 13 18 L 13 -18"), r"w4: runs from \(13, 18\) to \(13, -18\) in the drawing, 3 mm from"),
+    (instead("M -20 -3 L 20 -3"), r"w0: runs from \(-20, -3\) to \(20, -3\) in the drawing, 3 mm from"),
     ('<rect id="pad" width="1" height="7"/>' + PATHS, "pad is drawn 1 by 7, expected the shape of 40 by 36"),
     (PATHS + "".join(f'<line x1="-20" y1="-6" x2="{x}" y2="0"/>' for x in (-18, -17)), "more than two"),
     (
@@ -202,7 +204,7 @@ def test_import_restores_a_drawn_plan(tmp_path: Path) -> None:
     found = import_plan(tmp_path / "plan.svg", LAYOUT, 0.05)
     assert max_distance_mm(found.pad, pad) < 0.08
     assert found.pad.knots.shape[1] <= 6 + 3
-    assert found.placement == "the border is that named pad"
+    assert found.placement.startswith("the border is that named pad; open curves outside of 'horizontal-1'")
 
 
 def test_import_command_writes_morphology_and_reports_rules(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -223,3 +225,95 @@ def test_import_command_writes_morphology_and_reports_rules(tmp_path: Path, monk
     broken = CliRunner().invoke(design, ["import", "plan.svg", "--json"], catch_exceptions=False)
     assert broken.exit_code == 1
     assert json.loads(broken.output)["fibres"][1]["end_shift_mm"] == pytest.approx(0.03, abs=1e-4)
+
+
+HIDDEN = [
+    f'<g style="display:none" id="fibres_old"><path d="M-20 0H20"/></g>{PATHS}',
+    f'<style>.no {{visibility: hidden}}</style><g class="no"><path d="M-20 0H20"/></g>{PATHS}',
+    f'<g visibility="hidden"><path d="M-20 0H20"/><g visibility="visible">{PATHS}</g></g>',
+    f'<g display="none"><path style="display:inline" d="M-20 0H20"/></g>{PATHS}',
+    f'<g opacity="0"><path d="M-20 0H20"/></g>{PATHS}',
+]
+
+
+@pytest.mark.parametrize("drawn", HIDDEN, ids=range(len(HIDDEN)))
+def test_import_leaves_out_hidden_curves_of_svg(tmp_path: Path, plain: Morphology, drawn: str) -> None:
+    imported = import_plan(svg(tmp_path, drawn), LAYOUT, 0.4)
+    assert max_distance_mm(imported.pad, plain) < 0.02
+    assert imported.placement.endswith("hidden curves, which are left out: 1")
+
+
+def test_import_leaves_out_hidden_curves_of_dxf(tmp_path: Path) -> None:
+    document = new(units=units.MM)  # pyright: ignore[reportPrivateImportUsage]
+    space = document.modelspace()
+    straight_ones(space)
+    space.add_line((-20, -6), (20, -6))
+    for name in ("fibres off", "fibres frozen"):
+        layer = document.layers.add(name)
+        layer.off() if "off" in name else layer.freeze()
+        space.add_line((-20, 0), (20, 0), dxfattribs={"layer": name})
+    space.add_line((-20, 0), (20, 0), dxfattribs={"invisible": 1})
+    document.saveas(tmp_path / "plan.dxf")
+    found = import_plan(tmp_path / "plan.dxf", LAYOUT, 0.05)
+    assert found.placement.endswith("hidden curves, which are left out: 3")
+
+
+def test_import_says_which_open_curves_are_left_out(tmp_path: Path) -> None:
+    drawn = f'<g id="fibres">{PATHS}</g><path d="M-20 0H20"/>'
+    assert import_plan(svg(tmp_path, drawn), LAYOUT, 0.4).placement.endswith(
+        "open curves outside of 'fibres', which are left out: 1"
+    )
+
+
+def test_import_reads_blocks(tmp_path: Path) -> None:
+    document = new(units=units.MM)  # pyright: ignore[reportPrivateImportUsage]
+    inner, outer = document.blocks.new("LINES"), document.blocks.new("PAD")
+    straight_ones(inner)
+    inner.add_line((-20, -6), (20, -6))
+    outer.add_blockref("LINES", (1, 2))
+    document.modelspace().add_blockref("PAD", (-1, -2))
+    document.saveas(tmp_path / "plan.dxf")
+    assert len(import_plan(tmp_path / "plan.dxf", LAYOUT, 0.05).fibres) == 5
+    document.layers.add("away").off()
+    document.modelspace()[0].dxf.layer = "away"
+    document.saveas(tmp_path / "plan.dxf")
+    with pytest.raises(InputError, match="there is no open curve in it but 5 hidden ones"):
+        import_plan(tmp_path / "plan.dxf", LAYOUT, 0.05)
+
+
+@pytest.mark.parametrize("gap", [1e-4, 1e-3, 0.008])
+def test_import_joins_pieces_that_nearly_touch(tmp_path: Path, gap: float) -> None:
+    parts = [
+        f'<path d="M-20 -6H-5"/><path d="M{-5 + gap} -6H5"/><path d="M{5 - gap} {-6 + gap / 2}H20"/>',
+        '<line x1="-20" y1="6" x2="20" y2="6"/>',
+        *(f'<line x1="{x}" y1="18" x2="{x}" y2="-18"/>' for x in (-10, 0, 10)),
+    ]
+    imported = import_plan(svg(tmp_path, *parts), LAYOUT, 0.05)
+    assert imported.fibres[1].max_error_mm < 0.02
+
+
+def test_import_does_not_join_pieces_that_are_apart(tmp_path: Path) -> None:
+    parts = ('<path d="M-20 -6H-5"/><path d="M-4.9 -6H20"/>', paths(*WAYS[1:]))
+    with pytest.raises(InputError, match=r"path 1: runs from \(-20, -6\) to \(-5, -6\) in the drawing, 24 mm from"):
+        import_plan(svg(tmp_path, *parts), LAYOUT, 0.05)
+
+
+def test_import_replaces_entities_of_plain_text(tmp_path: Path, plain: Morphology) -> None:
+    path = svg(tmp_path, PATHS)
+    declared = '<!DOCTYPE svg [<!ENTITY ns "http://www.w3.org/2000/svg">]>'
+    path.write_text(declared + path.read_text().replace("http://www.w3.org/2000/svg", "&ns;"))
+    assert np.array_equal(import_plan(path, LAYOUT, 0.4).pad.knots, plain.knots)
+
+
+SCALED = {
+    0.75: "span 30 by 27 mm.*the pad 40 by 36 mm, a factor of 0.75 .points of 1/72 inch",
+    25.4: "span 1016 by 914.4 mm.*a factor of 25.4 .it states inches",
+    0.5: "a factor of 0.5; ",
+}
+
+
+@pytest.mark.parametrize("scale", SCALED)
+def test_import_says_by_which_factor_a_drawing_is_off(tmp_path: Path, scale: float) -> None:
+    lines = ('<path d="M-20 -6H20"/><path d="M-20 6H20"/>', *(f'<path d="M{x} -18V18"/>' for x in (-10, 0, 10)))
+    with pytest.raises(InputError, match=SCALED[scale]):
+        import_plan(svg(tmp_path, f'<g transform="scale({scale})">{"".join(lines)}</g>'), LAYOUT, 0.05)

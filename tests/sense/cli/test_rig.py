@@ -186,7 +186,13 @@ def test_doctor_examines_each_device_without_the_other(padforge_sense) -> None:
     code, out, err = padforge_sense("doctor", "--rig", "printer", "--spec", "rig.toml")
     assert (code, err) == (1, "")
     assert "fail board: no-such-port: there is no such port" in out
-    assert "fail arm: [rig] tcp_mm is unknown" in out
+    assert "fail arm: neither: there is no such port" in out
+    assert "fail place: [rig] tcp_mm is unknown" in out
+    Path("rig.toml").write_text('[rig]\nport = "it"\nprinter_port = "it"\n')
+    assert (
+        "fail arm: [rig] port and printer_port are the same, it"
+        in padforge_sense("doctor", "--rig", "printer", "--spec", "rig.toml")[1]
+    )
 
 
 @EMULATED
@@ -203,21 +209,19 @@ def test_doctor_prints_a_line_a_finding_and_ends_as_they_are(padforge_sense, mon
     said = [Diagnosis("board", "ok", "name it"), Diagnosis("rate", "warn", "slow")]
     examined = Mock(return_value=said)
     monkeypatch.setattr(operation, "diagnose", examined)
-    monkeypatch.setattr(operation, "make_board", lambda rig, inputs: list(inputs))
-    monkeypatch.setattr(operation, "make_arm", lambda name, config, inputs: (name, list(inputs)))
     Path("rig.toml").write_text("[pad]\ngrid = 2\n[rig]\nchannels = [3, 1, 4, 0]\n")
     assert padforge_sense("doctor", "--rig", "ur5", "--spec", "rig.toml") == (
         0,
         "ok   board: name it\nwarn rate: slow\n",
         "",
     )
-    make_board, make_arm = examined.call_args.args
-    assert (make_board(), make_arm()) == ([3, 1, 4, 0], ("ur5", [3, 1, 4, 0]))
+    kind, _, inputs = examined.call_args.args
+    assert (kind, list(inputs)) == ("ur5", [3, 1, 4, 0])
     said.append(Diagnosis("arm", "fail", "gone"))
     code, out, _ = padforge_sense("doctor", "--rig", "hand", "--spec", "rig.toml", "--json")
     assert (code, json.loads(out)["passed"]) == (1, False)
     assert json.loads(out)["diagnoses"][2] == {"name": "arm", "status": "fail", "message": "gone"}
-    assert len(examined.call_args.args) == 1  # a hand has no arm
+    assert examined.call_args.args[0] == "hand"
 
 
 def test_record_by_hand_takes_no_arm(padforge_sense) -> None:

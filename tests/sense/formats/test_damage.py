@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from padforge.common.validation import InputError
-from padforge.sense import Recorder, Recording, export_bag, export_csv, export_hdf5, import_bag
+from padforge.sense import Recorder, Recording, export_bag, export_csv, export_hdf5, import_bag, import_csv
 from padforge.sense.formats.import_export import import_file
 
 from .foreign import array, write_bag
@@ -17,7 +17,7 @@ from .foreign import array, write_bag
 RUN = ("readings.bin", "journal.ndjson", "start.json")
 
 
-@pytest.mark.parametrize("name", ["r.mat", "r.csv", "r.h5", "r.mcap", "packed.mcap", "r.db3"])
+@pytest.mark.parametrize("name", ["r.mat", "r.h5", "r.mcap", "packed.mcap", "r.db3"])
 def test_import_file_of_files_without_their_end(eight: Recording, bag: Path, tmp_path: Path, name: str) -> None:
     path = tmp_path / name
     if name in ("packed.mcap", "r.db3"):
@@ -26,7 +26,7 @@ def test_import_file_of_files_without_their_end(eight: Recording, bag: Path, tmp
     elif name == "r.mat":
         scipy.io.savemat(path, {"voltage": eight.readings, "tim": eight.times_s[None], "pos": eight.presses_mm.T})
     else:
-        {"r.csv": export_csv, "r.h5": export_hdf5, "r.mcap": export_bag}[name](eight, path)
+        {"r.h5": export_hdf5, "r.mcap": export_bag}[name](eight, path)
     content = path.read_bytes()
     for share in (0.2, 0.5, 0.9):
         path.write_bytes(content[: int(share * len(content))])
@@ -34,6 +34,17 @@ def test_import_file_of_files_without_their_end(eight: Recording, bag: Path, tmp
             import_file(path)
         assert "\n" not in str(refusal.value)
         assert name in str(refusal.value)
+
+
+def test_import_csv_of_a_file_without_its_end_reads_its_whole_lines(eight: Recording, tmp_path: Path) -> None:
+    export_csv(eight, tmp_path / "r.csv")
+    whole = (tmp_path / "r.csv").read_text()
+    lines = whole.splitlines()
+    (tmp_path / "r.csv").write_text("\n".join(lines[:200])[:-25])
+    recording = import_csv(tmp_path / "r.csv")
+    np.testing.assert_array_equal(recording.readings, eight.readings[: len(recording.readings)])
+    assert len(recording.readings) == 198
+    assert recording.source["note"] == "line 200, the last, is cut off and left out"
 
 
 def test_import_bag_refuses_damaged_messages(tmp_path: Path) -> None:

@@ -20,11 +20,15 @@ def test_plausible_recordings_are_not_doubted(recording: Recording) -> None:
 @pytest.mark.parametrize(
     ("name", "factor", "doubt"),
     [
-        ("presses_mm", 1e-3, r"presses span 0\.0\d+ x 0\.0\d+ mm: are positions in m \(x=NAME:m,y=NAME:m\)\?"),
-        ("presses_mm", 1e3, r"presses span 2\.\d+e\+04 x 2\.\d+e\+04 mm: are positions in another unit"),
-        ("times_s", 1e3, r"there are 0\.013 readings a second: are times in ms \(time=NAME:ms\)\?"),
-        ("times_s", 1e-3, r"there are 1\.3\d+e\+04 readings a second: are times in s "),
-        ("readings", 300, r"fibres read \d+(\.\d)? V: are they counts "),
+        ("presses_mm", 1e-3, r"positions span 0\.0\d+ x 0\.0\d+ mm; are they in m \(x=NAME:m,y=NAME:m\)\?"),
+        ("presses_mm", 1e3, r"positions span 2\.\d+e\+04 x 2\.\d+e\+04 mm; are they in another unit"),
+        ("times_s", 1e3, r"there are 0\.013 readings a second; is time in ms \(time=NAME:ms\)\?"),
+        ("times_s", 1e-3, r"there are 1\.3\d+e\+04 readings a second; is time in s "),
+        (
+            "readings",
+            300,
+            r"fibres rest at \d+(\.\d)? V; are they counts \(fibres=NAME:0\.00323 for 10 bits of 3\.3 V\)",
+        ),
     ],
 )
 def test_units_are_doubted(recording: Recording, name: str, factor: float, doubt: str) -> None:

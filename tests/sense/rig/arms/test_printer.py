@@ -157,7 +157,6 @@ def test_move_that_was_given_up_is_never_made(asked_s: float):
 @pytest.mark.parametrize(
     ("options", "settings", "match"),
     [
-        ({}, {"tcp_mm": None}, "tcp_mm is unknown"),
         ({"position": (0.0, 0.0, 0.0)}, {}, "has not been homed"),
         ({"max_mm_s": (500.0, 500.0, 3.0)}, {}, r"way down of 5 mm takes 1\.7 s, allowed is less than 1\.5 s"),
         (
@@ -175,6 +174,12 @@ def test_connect_refuses_unusable_printer(options, settings, match):
         assert fault_of(arm.connect, "refused", match) < 5
         fault_of(arm.state, "lost", "connect first")
         assert len(printer.firmware.moves) == 1
+
+
+def test_move_refuses_without_the_place_of_the_probe():
+    with EmulatedPrinter(position=AT, **QUICK) as printer, closing(driven(printer, tcp_mm=None)) as arm:
+        arm.connect()
+        fault_of(lambda: arm.move(pose(110, 110, 38), 50.0, 3000.0), "refused", "tcp_mm is unknown")
 
 
 def test_connect_refuses_other_firmware(monkeypatch):

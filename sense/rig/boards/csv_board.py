@@ -1,0 +1,166 @@
+"""A board that prints its own lines of numbers, as most sketches do: no header, no check, times by their arrival.
+
+Weaker than the line protocol: a damaged number passes for another, a line that is lost is not missed, and the rate is
+measured.
+"""
+
+import re
+from collections import Counter
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from padforge.sense.arrays import MAX_FIBRES, Array
+from padforge.sense.rig import clock
+from padforge.sense.rig.boards.board_reader import POLL_S, BlockReader, SampleClock, select_inputs
+from padforge.sense.rig.boards.line_board import describe_lines, find_line_port
+from padforge.sense.rig.devices import BoardSamples, RigFault, SerialStream
+from padforge.sense.settings import RigSettings
+
+LISTEN_S = 2.0  # in which the columns and the rate are found
+_START_S = 1.5  # opening their port resets many boards, which print of their start first
+_RATE_TOLERANCE = 0.05  # of a measured rate
+_MIN_LINES = 10
+_COUNTS_V = 50.0  # numbers beyond are counts of a converter
+_LABEL = re.compile(rb"[A-Za-z_]\w*[:=]")
+_SEPARATOR = re.compile(rb"[,;\t ]+")
+
+
+def parse_numbers(line: bytes) -> list[float] | None:
+    """Return the numbers of a line, separated by commas, semicolons or blanks, with or without labels; None of others."""
+    try:
+        return [
+            float(cell) for cell in _SEPARATOR.split(_LABEL.sub(b"", line).strip(b" ,;\t\r")) if cell != b""
+        ] or None
+    except ValueError:
+        return None
+
+
+class CsvBoard:
+    """A board at a serial port that prints lines of numbers; implements `Board`.
+
+    A first column that only ascends is the board's time, and no input.
+    """
+
+    def __init__(self, port: str, baud: int, rate_hz: float, inputs: Sequence[int] = (), count_v: float = 1.0) -> None:
+        """Take the settings; nothing is opened before `connect`, where about `rate_hz` lines a second must come.
+
+        Args:
+            port: its name.
+            baud: speed of the port.
+            rate_hz: lines a second.
+            inputs: column of each fibre, from 0, without that of the time; () for all.
+            count_v: volts of 1.
+        """
+        self._port, self._baud, self._rate_hz, self._inputs = port, baud, rate_hz, inputs
+        self._count_v = count_v
+        self._stream: SerialStream | None = None
+        self._reader: BlockReader | None = None
+        self._tail = b""
+
+    @classmethod
+    def from_settings(cls, rig: RigSettings, inputs: Sequence[int]) -> "CsvBoard":
+        """Return the board that `[rig]` names."""
+        return cls(find_line_port(rig), rig.baud, rig.board_rate_hz, inputs, rig.count_v)
+
+    def connect(self) -> dict[str, Any]:
+        """Open the port, find columns and rate, and return the board's identity; see `Board`."""
+        self.close()
+        self._stream = SerialStream(self._port, self._baud, POLL_S)
+        try:
+            return self._start(self._stream)
+        except BaseException:
+            self.close()
+            raise
+
+    def read(self) -> BoardSamples:
+        """Return all samples since the last call, volts; see `Board`."""
+        if self._reader is None:
+            raise RigFault("refused", f"{self._port}: not connected")
+        indices, rows = [], []
+        for arrival_s, block in self._reader.drain():
+            for numbers in block:
+                self._n_lines += 1
+                if len(numbers) == self._width:
+                    indices.append(self._n_lines)
+                    rows.append([numbers[column] for column in self._columns])
+            if indices:
+                self._clock.observe(indices[-1], arrival_s)
+        missing = np.diff(np.array([self._last, *indices])) - 1 if indices else np.empty(0, np.int64)
+        self._last = indices[-1] if indices else self._last
+        return BoardSamples(
+            self._clock.times(np.array(indices)) if indices else np.empty(0),
+            np.array(rows, np.float64).reshape(-1, len(self._columns)) * self._count_v,
+            missing,
+        )
+
+    def close(self) -> None:
+        """Close the port; never raises."""
+        if self._reader is not None:
+            self._reader.stop()
+        if self._stream is not None:
+            self._stream.close()
+        self._stream = self._reader = None
+
+    def _start(self, stream: SerialStream) -> dict[str, Any]:
+        self._tail = b""
+        received = bytearray()
+        lines: list[tuple[float, list[float]]] = []
+        start_s = clock.now()
+        while (elapsed_s := clock.now() - start_s) < _START_S + LISTEN_S:
+            now_s, data = stream.receive()
+            received += data[: _MIN_LINES * 100]
+            lines += [(now_s, numbers) for numbers in self._decode(data) if elapsed_s > _START_S and numbers]
+        if len(lines) < _MIN_LINES:
+            message, advice = describe_lines(bytes(received))
+            if "lines" in message:
+                advice = f"it must print numbers alone, {_MIN_LINES / LISTEN_S:g} lines a second or more"
+            raise RigFault("refused", f"{self._port}: {message}", advice)
+        self._width = Counter(len(numbers) for _, numbers in lines).most_common(1)[0][0]
+        table = np.array([numbers for _, numbers in lines if len(numbers) == self._width])
+        has_time = self._width > 1 and bool((np.diff(table[:, 0]) > 0).all())
+        n_inputs = self._width - has_time
+        if not 1 <= n_inputs <= MAX_FIBRES:
+            raise RigFault("refused", f"{self._port}: a line has {n_inputs} numbers, allowed is 1 to {MAX_FIBRES}")
+        inputs = select_inputs(self._inputs, n_inputs)
+        self._columns = [column + has_time for column in inputs]
+        rate_hz = _measure_rate(np.array([arrival_s for arrival_s, _ in lines]))
+        if abs(rate_hz / self._rate_hz - 1) > _RATE_TOLERANCE:
+            message = f"{self._port}: {rate_hz:.4g} lines come a second, [rig] says {self._rate_hz:g}"
+            raise RigFault("refused", message, f"set board_rate_hz = {rate_hz:.3g}")
+        self._clock = SampleClock(1 / rate_hz, _RATE_TOLERANCE)
+        self._n_lines = self._last = 0
+        self._reader = BlockReader(self._port, lambda: self._receive_blocks(stream), rate_hz)
+        self._reader.start_settled()
+        rest = float(np.median(np.abs(table[:, self._columns]))) * self._count_v
+        counts = (
+            f"; they rest at {rest:.4g}: if that are counts, [rig] count_v is the volts of one"
+            if rest > _COUNTS_V
+            else ""
+        )
+        return {
+            "channels": len(inputs),
+            "inputs": list(inputs),
+            "rate_hz": round(rate_hz, 3),
+            "port": self._port,
+            "time": "first column" if has_time else "none",
+            "warning": f"its lines have no header and no check: what is damaged or lost is not seen{counts}",
+        }
+
+    def _decode(self, data: bytes) -> list[list[float]]:
+        """Return the numbers of the lines that `data` completes; [] of a line of something else."""
+        *lines, self._tail = (self._tail + data).split(b"\n")
+        return [parse_numbers(line) or [] for line in lines if line.strip()]
+
+    def _receive_blocks(self, stream: SerialStream) -> tuple[float, list[list[list[float]]]]:
+        now_s, data = stream.receive()
+        lines = self._decode(data)
+        return now_s, [lines] if any(len(numbers) == self._width for numbers in lines) else []
+
+
+def _measure_rate(arrivals_s: Array) -> float:
+    """Return lines a second by the arrivals (n,) of lines, of which several may come at once."""
+    last_of_block = np.flatnonzero(np.append(np.diff(arrivals_s) > 0, True))
+    first, last = last_of_block[0], last_of_block[-1]
+    return float((last - first) / (arrivals_s[last] - arrivals_s[first])) if last > first else 0.0

@@ -1,0 +1,361 @@
+"""Files as other labs' programs write them, by the mapping that their page of errors suggests."""
+
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pytest
+import scipy.io
+
+from padforge.common.validation import InputError
+from padforge.sense import Recording, import_bag, import_csv, import_hdf5, import_mat
+from padforge.sense.formats.csv_recording import read_presses
+from padforge.sense.formats.import_export import describe_file, import_file
+from padforge.sense.recording.doubts import find_doubts
+
+from .foreign import array, make, pose, write_bag
+
+N = 156
+TIMES = np.arange(N) / 20
+PRESSED = np.arange(N) % 24 // 12 * (np.arange(N) < 144)
+"""6 presses of 12 readings, after 12 without."""
+SPOTS = np.array([[-10, -10], [10, -10], [10, 10], [-10, 10], [0, 5], [5, 0]])[np.minimum(np.arange(N) // 24, 5)]
+VOLTS = 1.8 + 0.1 * PRESSED[:, None] * [1.0, 0.7, 0.4, 0.2] + np.random.default_rng(0).normal(0, 0.002, (N, 4))
+VOLTS = VOLTS.round(4)
+MAPPING = "time=t,fibres=c*"
+
+
+def rows(time: Callable[[int], str] = lambda i: f"{TIMES[i]:.3f}", separator: str = ",") -> list[str]:
+    return [separator.join([time(i), *(f"{volt:.4f}" for volt in VOLTS[i])]) for i in range(N)]
+
+
+def table(header: str = "t,c0,c1,c2,c3", lines: list[str] | None = None) -> str:
+    return "\n".join([*filter(None, [header]), *(lines or rows())]) + "\n"
+
+
+def load(tmp_path: Path, content: str | bytes, mapping: str = MAPPING, **options: Any) -> Recording:
+    path = tmp_path / "lab.csv"
+    path.write_bytes(content.encode() if isinstance(content, str) else content)
+    return import_csv(path, mapping, **options)
+
+
+def check(recording: Recording) -> None:
+    """Check that a recording is the one of this page, with presses or as detected."""
+    assert recording.readings.shape == (N, 4)
+    np.testing.assert_allclose(recording.readings, VOLTS, atol=1e-9)
+    np.testing.assert_allclose(recording.times_s - recording.times_s[0], TIMES, atol=1e-5)
+    assert len(recording.down_command) == 6
+
+
+def with_commas(text: str) -> str:
+    return text.replace(",", ";").replace(".", ",")
+
+
+def clock(seconds: float) -> str:
+    return f"{int(seconds // 3600) % 24:02d}:{int(seconds // 60) % 60:02d}:{seconds % 60:06.3f}"
+
+
+def clocked(i: int) -> str:
+    return clock(36000 + i / 20)
+
+
+EVENLY: dict[str, tuple[str | bytes, str]] = {
+    "blanks": (table().replace(",", " "), MAPPING),
+    "runs of blanks, no header": (table("").replace(",", "   "), "time=1,fibres=2-5"),
+    "commas, no header": (table(""), "time=1,fibres=2-5"),
+    "sep line": ("sep=;\r\n" + with_commas(table()), MAPPING),
+    "quoted sep line": ('"sep=;"\n' + with_commas(table()), MAPPING),
+    "UTF-16": (("\ufeff" + table()).encode("utf-16-le"), MAPPING),
+    "UTF-16 without a mark": (table().encode("utf-16-le"), MAPPING),
+    "cp1252": (table("t [\xb5s],c0,c1,c2,c3", rows(lambda i: str(50000 * i))).encode("cp1252"), "time=t*,fibres=c*"),
+    "unit row": (table("t,c0,c1,c2,c3\nms,V,V,V,V", rows(lambda i: str(50 * i))), MAPPING),
+    "preamble": ("DAQ log\nRate,20 Hz\n\n" + table(), MAPPING),
+    "preamble of a sheet": ("DAQ log,,,,\nRate,20,,,\n,,,,\n" + table(), MAPPING),
+    "ISO dates": (table(lines=rows(lambda i: f"2026-03-01 {clocked(i)}")), MAPPING),
+    "ISO dates of UTC": (table(lines=rows(lambda i: f"2026-03-01T{clocked(i)}Z")), MAPPING),
+    "over midnight": (table(lines=rows(lambda i: clock(86397.45 + i / 20))), MAPPING),
+    "IDE monitor": (table("", [line.replace(",", " -> ", 1) for line in rows(clocked)]), "time=1,fibres=2-5"),
+    "no time": (table("c0,c1,c2,c3", [line.split(",", 1)[1] for line in rows()]), "rate=20,fibres=c*"),
+    "decimal commas in quotes": (
+        table(lines=[",".join(f'"{cell}"' for cell in with_commas(line).split(";")) for line in rows()]),
+        MAPPING,
+    ),
+    "thousands": (table(lines=rows(lambda i: f'"{1000 + i * 50:,}"')), "time=t:ms,fibres=c*"),
+    "comma at the end": (table(lines=[f"{line}," for line in rows()]), MAPPING),
+    "power cut": (table(lines=[*rows()[:70], "\0\0\0" + rows()[70], *rows()[71:]]), MAPPING),
+    "boot bytes": (b"\x00\xff" + table().encode(), MAPPING),
+    "boot lines": ("ets Jun 8 2016\nrst:0x1 (POWERON_RESET)\n" + table(), MAPPING),
+    "repeated header": (table(lines=[*rows()[:70], "t,c0,c1,c2,c3", *rows()[70:]]), MAPPING),
+    "torn end": (table() + "7.80,1.8,1.", MAPPING),
+    "clock wraps": (table(lines=rows(lambda i: str((4294000000 + 50000 * i) % 2**32))), "time=t:us,fibres=c*"),
+    "equal times": (table(lines=rows(lambda i: f"{TIMES[i - i % 4]:.3f}")), MAPPING),
+    "booleans": (
+        table("t,c0,c1,c2,c3,on", [f"{line},{bool(on)}" for line, on in zip(rows(), PRESSED, strict=True)]),
+        f"{MAPPING},press=on",
+    ),
+    "names in the header of a monitor": (
+        table("10:00:00.000 -> c0,c1,c2,c3", [line.replace(",", " -> ", 1) for line in rows(clocked)]),
+        "time=received,fibres=c*",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", EVENLY)
+def test_import_csv_reads_tables_of_other_programs(tmp_path: Path, name: str) -> None:
+    check(load(tmp_path, *EVENLY[name]))
+
+
+@pytest.mark.parametrize("form", ["{:%m/%d/%Y %I:%M:%S.%f %p}", "{:%d.%m.%Y %H:%M:%S,%f}"])
+def test_import_csv_reads_dates_of_other_countries(tmp_path: Path, form: str) -> None:
+    from datetime import datetime, timedelta
+
+    pytest.importorskip("pandas")
+    start = datetime(2026, 3, 1, 11, 59, 58)
+    lines = rows(lambda i: form.format(start + timedelta(seconds=i / 20)), ";")
+    check(load(tmp_path, table("t;c0;c1;c2;c3", lines)))
+
+
+def test_import_csv_says_what_is_left_out(tmp_path: Path) -> None:
+    def note(lines: list[str]) -> str:
+        return load(tmp_path, table(lines=lines)).source["note"]
+
+    assert note([*rows(), "7.8,1.8"]) == "line 158, the last, is cut off and left out"
+    assert note([*rows()[:70], rows()[70] + rows()[71], *rows()[72:]]) == "line 72 is left out: 9 values, expected 5"
+    back = rows()
+    back[70] = "0.000," + back[70].split(",", 1)[1]
+    assert note(back) == "line 72 is left out: times go back"
+    words = [*rows()[:30], "1.500,what,1.8,1.8,1.8", *rows()[31:]]
+    assert note(words) == "line 32 is a value missing: column 'c0' holds no number but 'what'"
+    assert (
+        load(tmp_path, table(lines=[*rows()[:30], "1.500,#N/A,ovf,inf,1.8", *rows()[31:]])).source.get("note") is None
+    )
+
+
+def test_import_csv_refuses_two_runs_by_their_line(tmp_path: Path) -> None:
+    with pytest.raises(
+        InputError, match=r"times go back from 7.75 to 0 s at line 158, .* are there several runs in it"
+    ):
+        load(tmp_path, table(lines=rows() + rows()))
+
+
+def test_import_csv_of_merged_sources_holds_positions(tmp_path: Path) -> None:
+    lines = []
+    for i, line in enumerate(rows()):
+        lines += [f"{line},,", f"{TIMES[i] + 0.013:.3f},,,,,{SPOTS[i, 0]},{SPOTS[i, 1]}"]
+    recording = load(tmp_path, table("t,c0,c1,c2,c3,x,y", lines), f"{MAPPING},x=x,y=y")
+    check(recording)
+    assert recording.presses_mm[4].tolist() == [0, 5]
+    assert recording.source["note"] == "156 lines without any reading are no readings"
+
+
+def positioned(scale: float = 1.0, jitter: float = 0.0, late: int = 0, held: bool = False) -> str:
+    noise = np.random.default_rng(1).normal(0, jitter, (N, 2)) if jitter else np.zeros((N, 2))
+    places = SPOTS * scale + noise
+    lines = [
+        f"{line},{x:.5f},{y:.5f}" if (i >= late if held else PRESSED[i]) else f"{line},,"
+        for i, (line, (x, y)) in enumerate(zip(rows(), places, strict=True))
+    ]
+    return table("t,c0,c1,c2,c3,px,py", lines)
+
+
+WITH_PLACES = f"{MAPPING},x=px,y=py"
+
+
+@pytest.mark.parametrize("content", [positioned(jitter=0.02), positioned(jitter=0.02, held=True, late=5)])
+def test_import_csv_of_measured_positions(tmp_path: Path, content: str) -> None:
+    recording = load(tmp_path, content, WITH_PLACES)
+    check(recording)
+    np.testing.assert_allclose(recording.presses_mm[0], [-10, -10], atol=0.1)
+
+
+def test_units_that_cannot_be_right_are_named_with_their_mapping(tmp_path: Path) -> None:
+    def doubt(content: str, mapping: str) -> str:
+        return " ".join(find_doubts(load(tmp_path, content, mapping)))
+
+    assert "are they in m (x=px:m,y=py:m)?" in doubt(positioned(scale=0.001), WITH_PLACES)
+    slow = positioned().replace("t,", "t [s],", 1)
+    slow = "\n".join(
+        [slow.split("\n")[0], *(re.sub(r"^[\d.]+", str(50 * i), line) for i, line in enumerate(slow.split()[2:]))]
+    )
+    assert "is time in ms (time=t*:ms)?" in doubt(slow, WITH_PLACES.replace("=t", "=t*", 1))
+    with pytest.raises(InputError, match=r"has no press: .*; is time in ms \(time=t:ms\)\?"):
+        load(tmp_path, table(lines=rows(lambda i: str(50 * i))))
+    assert "counts (fibres=c*:0.00323 for 10 bits of 3.3 V)" in doubt(table(), f"{MAPPING}:310")
+    with pytest.raises(
+        InputError, match=r"fibres rest at 9\d{3} V, .* are they counts \(fibres=c\*:0.000201 for 14 bits"
+    ):
+        load(tmp_path, table(), f"{MAPPING}:5000")
+
+
+@pytest.mark.parametrize(("force", "expected"), [(2.5, 2.5), (-0.02, 0.0)])
+def test_forces_below_zero(tmp_path: Path, force: float, expected: float) -> None:
+    lines = [f"{line},{force if 78 < i < 98 else 2.5}" for i, line in enumerate(rows())]
+    assert load(tmp_path, table("t,c0,c1,c2,c3,fz", lines), f"{MAPPING},force=fz").forces_n[3] == expected
+    turned = [f"{line},-2.5" for line in rows()]
+    with pytest.raises(InputError, match=r"force is below 0 in most presses, such as -2.5; .*\(force=fz:-1\)"):
+        load(tmp_path, table("t,c0,c1,c2,c3,fz", turned), f"{MAPPING},force=fz")
+    check(load(tmp_path, table("t,c0,c1,c2,c3,fz", turned), f"{MAPPING},force=fz:-1"))
+
+
+def test_presses_of_a_table_of_their_own(tmp_path: Path) -> None:
+    begin = np.flatnonzero(np.diff(PRESSED, prepend=0) == 1)
+    lines = [f"{TIMES[i]:.3f},{SPOTS[i, 0]},{SPOTS[i, 1]},0.6,2.5" for i in begin]
+    (tmp_path / "lab.csv").write_text(table())
+    for header, mapping in (
+        ("down_s,x_mm,y_mm,duration_s,force_n", ""),
+        ("at,px,py,for,f", "down=at,duration=for,x=px,y=py,force=f"),
+    ):
+        (tmp_path / "presses.csv").write_text(table(header, [*lines, "99,0,0,0.6,2.5"]))
+        recording = import_file(tmp_path / "lab.csv", MAPPING, presses=tmp_path / "presses.csv", press_columns=mapping)
+        check(recording)
+        assert recording.down_command.tolist() == begin.tolist()
+        assert recording.up_command.tolist() == (begin + 12).tolist()
+        assert recording.presses_mm.tolist() == SPOTS[begin].tolist()
+        assert (recording.forces_n == 2.5).all()
+        assert recording.source["note"] == "1 of 7 presses lie outside of the readings, and are left out"
+    (tmp_path / "presses.csv").write_text("x_mm,y_mm\n1,2\n")
+    with pytest.raises(InputError, match=r"expected down \(down_s\) and one of up \(up_s\) and duration"):
+        read_presses(tmp_path / "presses.csv")
+
+
+def test_recording_from_arrays(tmp_path: Path) -> None:
+    begin = np.flatnonzero(np.diff(PRESSED, prepend=0) == 1)
+    recording = Recording.from_arrays(
+        VOLTS, TIMES, down_s=TIMES[begin], up_s=TIMES[begin + 12], presses_mm=SPOTS[begin], forces_n=np.ones(6)
+    )
+    check(recording)
+    assert recording.down_command.tolist() == begin.tolist()
+    recording.save(tmp_path / "run")
+    assert Recording.open(tmp_path / "run") == recording
+    check(Recording.from_arrays(VOLTS, TIMES))
+
+
+MATRIX = np.column_stack([TIMES, VOLTS, PRESSED])
+
+
+def mat73(path: Path, content: dict[str, Any], kind: str = "double") -> Path:
+    with h5py.File(path, "w", userblock_size=512) as file:
+        for name, values in content.items():
+            dataset = file.create_dataset(name, data=np.atleast_2d(values).T)
+            dataset.attrs["MATLAB_class"] = np.bytes_(kind)
+    with path.open("r+b") as file:
+        file.write(b"MATLAB 7.3 MAT-file".ljust(116) + b" " * 8 + b"\x00\x02IM")
+    return path
+
+
+def test_import_mat_reads_structures_and_columns(tmp_path: Path) -> None:
+    old, new = tmp_path / "old.mat", tmp_path / "new.mat"
+    scipy.io.savemat(old, {"data": {"t": TIMES, "in": {"v": VOLTS}}, "x": MATRIX})
+    mat73(new, {"data/t": TIMES[:, None], "data/in/v": VOLTS, "x": MATRIX})
+    for path in (old, new):
+        check(import_mat(path, "time=data.t,fibres=data.in.v"))
+        check(import_mat(path, "time=/data/t,fibres=/data/in/v"))
+        check(import_mat(path, "time=x[0],fibres=x[1:5],press=x[5]"))
+        check(import_mat(path, "time=x[:,0],fibres=x[:,1:5]"))
+        with pytest.raises(InputError, match=r"no variable voltage, tim .*'x'.*; --columns says what others hold"):
+            import_mat(path)
+        with pytest.raises(InputError, match=r"press is x\[7\], expected columns from 0 to 5"):
+            import_mat(path, "time=x[0],fibres=x[1:5],press=x[7]")
+    assert import_mat(new, "time=x[0],fibres=x[1:5]").fibre_names == ("x[1]", "x[2]", "x[3]", "x[4]")
+
+
+def test_import_mat_names_timetables_and_cells(tmp_path: Path) -> None:
+    path = mat73(tmp_path / "tt.mat", {"data": np.ones((1, 6), np.uint32)}, "timetable")
+    for mapping in ("", "rate=20,fibres=data"):
+        with pytest.raises(
+            InputError, match=r"data is a timetable, which only MATLAB reads: writetimetable\(data, 'data.csv'\)"
+        ):
+            import_mat(path, mapping)
+    scipy.io.savemat(tmp_path / "cells.mat", {"t": TIMES, "v": np.array([VOLTS, 1], dtype=object)})
+    with pytest.raises(InputError, match="v is a cell array, expected a full matrix"):
+        import_mat(tmp_path / "cells.mat", "time=t,fibres=v")
+
+
+def test_import_hdf5_reads_columns_of_tables_and_frames(tmp_path: Path) -> None:
+    with h5py.File(tmp_path / "lab.h5", "w") as file:
+        kinds = [("t", "f8"), *((f"c{i}", "f4" if i else "f8") for i in range(4)), ("on", "u1")]
+        records = np.array([tuple(row) for row in MATRIX], kinds)
+        file["log/table"] = records
+        file["data"], file["t_ns"] = MATRIX, (TIMES * 1e9).astype(np.int64)
+        file["frames"] = VOLTS.reshape(N, 2, 2)
+        file["last"] = np.moveaxis(VOLTS.reshape(N, 2, 2), 0, -1)
+    path = tmp_path / "lab.h5"
+    tabled = import_hdf5(path, "time=log/table/t,fibres=log/table/c*,press=log/table/on")
+    np.testing.assert_allclose(tabled.readings, VOLTS, rtol=1e-6)
+    check(import_hdf5(path, "time=/data[0],fibres=/data[1:5]"))
+    check(import_hdf5(path, "time=t_ns:ns,fibres=frames"))
+    check(import_hdf5(path, "time=t_ns:1e-9,fibres=last"))
+    check(import_hdf5(path, "rate=20,fibres=frames"))
+
+
+@pytest.mark.parametrize("kind", ["csv", "h5", "mat", "mat73", "mcap"])
+def test_fibres_are_in_the_order_of_their_numbers_and_it_is_said(tmp_path: Path, kind: str) -> None:
+    levels = 1 + np.arange(1, 13) / 100
+    volts = np.where(PRESSED[:, None], levels + 0.1, levels) + np.random.default_rng(0).normal(0, 1e-4, (N, 12))
+    names = sorted((f"c{i}" for i in range(1, 13)), key=lambda name: name[::-1])
+    content = {"t": TIMES} | {name: volts[:, int(name[1:]) - 1] for name in names}
+    path = tmp_path / f"lab.{kind}"
+    if kind == "csv":
+        lines = [",".join(str(content[name][i]) for name in content) for i in range(N)]
+        path.write_text(table(",".join(content), lines))
+    elif kind == "h5":
+        with h5py.File(path, "w") as file:
+            for name, values in content.items():
+                file[name] = values
+    elif kind == "mat":
+        scipy.io.savemat(path, content)
+    elif kind == "mat73":
+        path = mat73(tmp_path / "lab.mat", content)
+    else:
+        messages = [(f"/{name}", TIMES[i], make("Float64", content[name][i])) for i in range(N) for name in names]
+        path = write_bag(tmp_path / "bag", messages)
+    recording = import_file(path, "fibres=/c*" if kind == "mcap" else MAPPING)
+    np.testing.assert_allclose(recording.readings[0], levels, atol=0.01)
+    assert [name.strip("/") for name in recording.fibre_names] == [f"c{i}" for i in range(1, 13)]
+    assert "fibre 2 = " in recording.source["note"]
+    assert "fibre 12 = " in recording.source["note"]
+
+
+def test_import_bag_holds_late_poses_and_spreads_bursts(tmp_path: Path) -> None:
+    messages = []
+    for i in range(N):
+        messages.append(("/skin", TIMES[i - i % 2], array("Float64MultiArray", VOLTS[i])))
+        if i >= 5:
+            jitter = np.random.default_rng(i).normal(0, 1e-5, 2)
+            messages.append(("/pose", TIMES[i] + 0.001, pose(*(SPOTS[i] / 1000 + jitter))))
+    recording = import_bag(write_bag(tmp_path / "bag", messages), "fibres=/skin,positions=/pose")
+    check(recording)
+    np.testing.assert_allclose(recording.presses_mm[3], [-10, 10], atol=0.1)
+
+
+def test_import_bag_reads_fields_of_messages(tmp_path: Path) -> None:
+    messages = []
+    for i in range(N):
+        place = make("Pose", make("Point", *SPOTS[i] / 1000, 0.0), make("Quaternion", *VOLTS[i]))
+        messages.append(("/all", TIMES[i], place))
+    path = write_bag(tmp_path / "bag", messages)
+    with pytest.raises(InputError, match=r"fibres is '/all' of .*name one of its fields as /all.FIELD: 'position.x'"):
+        import_bag(path, "fibres=/all")
+    mapping = ",".join(f"fibres=/all.orientation.{axis}" for axis in "xyzw")
+    recording = import_bag(path, f"{mapping},positions=/all.position")
+    check(recording)
+    np.testing.assert_allclose(recording.presses_mm[4], [0, 5], atol=1e-9)
+    with pytest.raises(InputError, match="'position.q' is no field"):
+        import_bag(path, "fibres=/all.position.q")
+
+
+def test_describe_file_shows_what_a_mapping_may_name(tmp_path: Path) -> None:
+    (tmp_path / "lab.csv").write_text(table("t,c0,c1,c2,c3\nms,V,V,V,V"))
+    assert describe_file(tmp_path / "lab.csv")[1] == "t [ms]: 0.000, 0.050, 0.100, ..."
+    scipy.io.savemat(tmp_path / "lab.mat", {"data": {"t": TIMES}, "name": "pad"})
+    assert describe_file(tmp_path / "lab.mat") == ["data.t: (1, 156) float64, begins 0, 0.05, 0.1", "name: text"]
+    with h5py.File(tmp_path / "lab.h5", "w") as file:
+        file["x"] = MATRIX
+    assert describe_file(tmp_path / "lab.h5")[0].startswith("/x: (156, 6) float64, begins 0, 1.")
+    bag = write_bag(tmp_path / "bag", [("/skin", 0.0, array("Float64MultiArray", VOLTS[0]))])
+    assert describe_file(bag)[0].startswith(
+        "/skin: std_msgs/msg/Float64MultiArray, fields layout.dim (0), layout.data_offset, data (4)"
+    )
