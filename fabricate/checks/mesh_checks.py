@@ -38,12 +38,12 @@ _MAX_METRES_MM = 0.5
 """Longest side, read as mm, of a mesh that is in metres; a larger one that is too small is in inches."""
 _POSES = {
     "down": np.diag([1, -1, -1]),
-    "left": np.array([[0, 0, 1], [0, 1, 0], [-1, 0, 0]]),
-    "right": np.array([[0, 0, -1], [0, 1, 0], [1, 0, 0]]),
-    "near": np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]]),
-    "far": np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]]),
+    "to the left": np.array([[0, 0, 1], [0, 1, 0], [-1, 0, 0]]),
+    "to the right": np.array([[0, 0, -1], [0, 1, 0], [1, 0, 0]]),
+    "to the near side": np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]]),
+    "to the far side": np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]]),
 }
-"""Sides that a mould may be open to by mistake, and the rotations that right it."""
+"""Ways that the open side of a mould may face by mistake, and the rotations that right it."""
 _MIN_CAST_SHARE = 0.3
 """Share of a mould's footprint that is cast in; funnels and holes of other bodies have less."""
 _MAX_SHELLS = 100  # shells that are classified as bodies or hollows; more are debris, and all count as bodies
@@ -105,7 +105,7 @@ def check_triangles(
     slabs, size = build_slabs(mesh, printer.layer_mm), float(np.ptp(mesh.bounds, axis=0).max())
     cast = [slab for slab in slabs if slab.void.area]
     if not has_plan and (side := _find_open_side(mesh, slabs, printer.layer_mm)):
-        message = f"its open side is the {side} one: turn it up"
+        message = f"it lies with its open side {side}: turn it up"
         return [*findings, check_result("pose", False, side, "up", message)]  # nothing else can be judged
     findings += [
         _check_wall_thickness(cast, printer, size),
@@ -134,7 +134,7 @@ def _check_unit(mesh: TriangleMesh) -> Finding:
 
 
 def _find_open_side(mesh: TriangleMesh, slabs: Sequence[Slab], layer_mm: float) -> str:
-    """Return the side that a mould is open to if it is turned; "" for one that is not, and for other bodies."""
+    """Return where the open side of a mould faces if it is turned; "" if it is not, and for other bodies."""
 
     def is_tray(mesh: TriangleMesh, slabs: Sequence[Slab]) -> bool:
         width, depth, _ = np.ptp(mesh.bounds, axis=0)

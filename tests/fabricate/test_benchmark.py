@@ -6,8 +6,7 @@ import pytest
 from padforge.benchmarks import mould as bench
 from padforge.design.morphology import Morphology
 from padforge.fabricate.cad.curves import FINE_MM
-from padforge.fabricate.cad.model import FIT_TOLERANCES_MM, build_mould_model
-from padforge.fabricate.plan import Plan
+from padforge.fabricate.cad.model import FIT_TOLERANCES_MM, build_mould
 from padforge.fabricate.settings import DEFAULTS, MouldSettings
 
 
@@ -26,5 +25,5 @@ def test_deviation_is_within_tolerance_and_detects_shifted_walls(monkeypatch):
         assert row["file_bytes"] > 10_000
     wider = MouldSettings(number_mm=0, ridge_width_mm=DEFAULTS.mould.ridge_width_mm + 0.01)
     pad = Morphology.random(1, 1, bench.SEED)
-    strayed = build_mould_model(Plan(pad, replace(DEFAULTS, mould=wider)), "mould").shape
+    strayed = build_mould(pad, replace(DEFAULTS, mould=wider))
     assert trials["curved CAD"].evaluate(strayed)["error"] == pytest.approx(0.005, abs=FIT_TOLERANCES_MM[0] + FINE_MM)

@@ -9,6 +9,7 @@ import shapely
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from shapely import affinity
+from shapely.geometry.base import BaseGeometry
 
 from padforge.common.plotting import HORIZONTAL, VERTICAL
 from padforge.common.settings import Spec
@@ -187,7 +188,7 @@ def test_numbers_of_the_mould_are_legible_on_the_pad():
             assert (shapely.contains_xy(floor, *places[:, :2].T) == is_raised).all(), number
 
 
-def bays(outline: shapely.Geometry) -> np.ndarray:
+def bays(outline: BaseGeometry) -> np.ndarray:
     """Points (n, 2) within the box around an outline, clear of its strokes."""
     x_min, y_min, x_max, y_max = outline.bounds
     grid = np.stack(np.meshgrid(np.linspace(x_min, x_max, 25), np.linspace(y_min, y_max, 25)), axis=-1).reshape(-1, 2)

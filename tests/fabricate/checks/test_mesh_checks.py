@@ -181,17 +181,17 @@ def test_mesh_in_another_unit_has_one_finding_that_says_so(scale, unit):
     ("axes", "signs", "side"),
     [
         ((0, 1, 2), (1, -1, -1), "down"),
-        ((2, 1, 0), (-1, 1, 1), "left"),
-        ((2, 1, 0), (1, 1, -1), "right"),
-        ((0, 2, 1), (1, -1, 1), "near"),
-        ((0, 2, 1), (1, 1, -1), "far"),
+        ((2, 1, 0), (-1, 1, 1), "to the left"),
+        ((2, 1, 0), (1, 1, -1), "to the right"),
+        ((0, 2, 1), (1, -1, 1), "to the near side"),
+        ((0, 2, 1), (1, 1, -1), "to the far side"),
     ],
 )
 def test_mould_that_is_turned_fails_and_is_judged_no_further(axes, signs, side):
     vertices, triangles = mesh_arrays(build_mesh(mould_body(Plan(Morphology.straight(2)))))
     findings = {finding.name: finding for finding in check_triangles(vertices[:, axes] * signs, triangles)}
     assert findings["pose"].status == "fail"
-    assert findings["pose"].message == f"its open side is the {side} one: turn it up"
+    assert findings["pose"].message == f"it lies with its open side {side}: turn it up"
     assert not findings.keys() & {"wall_thickness", "silicone_wall", "tight"}
 
 
