@@ -170,5 +170,5 @@ def test_export_lerobot_writes_all_or_nothing(
     with pytest.raises(InputError, match="no position of a press is known"):
         export_lerobot(unknown, tmp_path / "other")
     monkeypatch.setitem(__import__("sys").modules, "pyarrow", None)
-    with pytest.raises(InputError, match=r"more: LeRobot needs pyarrow: pip install 'padforge\[lerobot\]'"):
+    with pytest.raises(InputError, match=r"more: LeRobot needs pyarrow: pip install 'padforge\[formats\]'"):
         export_lerobot(eight, tmp_path / "more")

@@ -159,7 +159,7 @@ def test_export_bag_refuses_what_cannot_be_read_or_written(
     assert [file.name for file in tmp_path.iterdir()] == ["there.mcap"]
     monkeypatch.setitem(__import__("sys").modules, "rosbags.typesys", None)
     for run in (lambda: export_bag(eight, tmp_path / "r.mcap"), lambda: import_bag(tmp_path / "r.mcap")):
-        with pytest.raises(InputError, match=r"r\.mcap: .* needs rosbags: pip install 'padforge\[ros\]'"):
+        with pytest.raises(InputError, match=r"r\.mcap: .* needs rosbags: pip install 'padforge\[formats\]'"):
             run()
 
 
