@@ -154,7 +154,13 @@ def _load_matrices(path: Path) -> dict[str, Any]:
 
     with warnings.catch_warnings(action="ignore"):  # variables of one name
         variables = scipy.io.loadmat(path, appendmat=False)
-    return {name: _to_plain(value, name) for name, value in variables.items() if not name.startswith("__")}
+    content = dict[str, Any]()
+    for name, value in variables.items():
+        if isinstance(value, scipy.io.matlab.MatlabOpaque):  # which SciPy names "None"
+            name = value["s0"][0].decode("ascii", "replace")
+        if not name.startswith("__"):
+            content[name] = _to_plain(value, name)
+    return content
 
 
 def _to_plain(value: Any, name: str) -> Any:

@@ -6,6 +6,7 @@ JSON. The states of an arm stay in the run directory. Other files are named by a
 """
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -112,9 +113,7 @@ def import_mat(path: str | Path, columns: str = "", presses: Arrays = ()) -> Rec
     with naming_file(path):
         if not columns:
             if missing := [name for name in ("voltage", "tim") if name not in content]:
-                for name in content:  # a timetable says what to do with it
-                    if isinstance(content[name], str) and "only MATLAB" in content[name]:
-                        _matrix(content, name)
+                _refuse_tables(content, list(content))
                 there = f"has no variable {', '.join(missing)} (found {join_names(sorted(content))})"
                 raise InputError(
                     f"{there}; --columns says what others hold, as time=data.t,fibres=data.v or fibres=x[1:5]"
@@ -124,10 +123,18 @@ def import_mat(path: str | Path, columns: str = "", presses: Arrays = ()) -> Rec
         entries = [
             entry._replace(name=entry.name.removeprefix("/").replace("/", ".")) for entry in parse_columns(columns)
         ]
+        _refuse_tables(content, [entry.name.partition(".")[0] for entry in entries])
         matched = match_columns(entries, names := list(content))
         arrays = read_entries(matched, lambda i: _matrix(content, names[i]))
     source = {"kind": "mat", "file": path.name, "columns": columns}
     return assemble_recording(ForeignArrays(path, arrays, source, order_notes(matched)), presses)
+
+
+def _refuse_tables(content: dict[str, Any], names: Sequence[str]) -> None:
+    """Raise InputError for a table of MATLAB among the variables of these names, with the way out."""
+    for name, value in content.items():
+        if name in names and isinstance(value, str) and "only MATLAB" in value:
+            raise InputError(f"{name} is {value}")
 
 
 def check_no_presses(path: Path, presses: Arrays) -> None:

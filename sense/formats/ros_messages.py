@@ -90,6 +90,13 @@ class RawMessages(NamedTuple):
     stamps: list[int]
     messages: list[bytes]
 
+    def decode(self, index: int) -> Any:
+        """Return a message; raise InputError if it is damaged."""
+        try:
+            return self.deserialize(self.messages[index])
+        except Exception as error:  # of damaged messages, rosbags raises many kinds
+            raise InputError(f"message {index} of {self.msgtype} is damaged ({error})") from error
+
 
 class TopicSeries(NamedTuple):
     """Numbers of a topic: stamps (n,), ns, ascending, and values (n, k), in the order of the paths."""
@@ -201,11 +208,8 @@ def encode(store: "Typestore", topic: str, series: TopicSeries) -> list[memoryvi
 def decode(raw: RawMessages, paths: Sequence[str]) -> TopicSeries:
     """Return the numbers at the paths, attributes of the messages, in the order of stamps; refuse damaged messages."""
     rows, width = bytearray(), 0
-    for index, content in enumerate(raw.messages):
-        try:
-            message = raw.deserialize(content)
-        except Exception as error:  # of damaged messages, rosbags raises many kinds
-            raise InputError(f"message {index} of {raw.msgtype} is damaged ({error})") from error
+    for index in range(len(raw.messages)):
+        message = raw.decode(index)
         row = b"".join(_numbers(message, path, raw.msgtype).tobytes() for path in paths)
         if not row:
             raise InputError(f"message {index} has no {paths[0]}")
@@ -238,8 +242,8 @@ def _numbers(message: Any, path: str, msgtype: str) -> Array:
 def decode_text(raw: RawMessages) -> str:
     """Return the text of the last message of RECORDING; "" if it is damaged."""
     try:
-        return raw.deserialize(raw.messages[-1]).data
-    except Exception:  # of damaged messages, rosbags raises many kinds
+        return raw.decode(-1).data
+    except InputError:
         return ""
 
 

@@ -292,7 +292,7 @@ def _decode_entry(entry: ColumnEntry, field: str, raw: Mapping[str, RawMessages]
     kind = topic.msgtype
     with naming_file(what):
         if field:
-            value = ros_messages.get_field(topic.deserialize(topic.messages[0]), field)
+            value = ros_messages.get_field(topic.decode(0), field)
             kind = getattr(value, "__msgtype__", "")
         if kind in types:
             return ros_messages.decode(topic, [f"{field}.{path}".lstrip(".") for path in types[kind]])
@@ -317,7 +317,7 @@ def _number_fields(topic: RawMessages) -> dict[str, int]:
         elif np.asarray(value).dtype.kind in "fiub" and not path.endswith("__msgtype__"):
             fields[path.lstrip(".")] = np.size(value)
 
-    visit(topic.deserialize(topic.messages[0]), "")
+    visit(topic.decode(0), "")
     return fields
 
 

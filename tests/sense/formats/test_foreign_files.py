@@ -1,6 +1,7 @@
 """Files as other labs' programs write them, by the mapping that their page of errors suggests."""
 
 import re
+import struct
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -262,13 +263,27 @@ def test_import_mat_reads_structures_and_columns(tmp_path: Path) -> None:
     assert import_mat(new, "time=x[0],fibres=x[1:5]").fibre_names == ("x[1]", "x[2]", "x[3]", "x[4]")
 
 
+def opaque(path: Path, name: bytes, kind: bytes) -> Path:
+    """Write a MATLAB 5 file with an object of a class that only MATLAB reads."""
+
+    def element(number: int, data: bytes) -> bytes:
+        return struct.pack("<II", number, len(data)) + data + bytes(-len(data) % 8)
+
+    numbers = element(6, struct.pack("<II", 13, 0)) + element(5, struct.pack("<ii", 1, 6)) + element(1, b"")
+    inner = element(14, numbers + element(6, struct.pack("<6I", *range(6))))
+    labels = element(1, name) + element(1, b"MCOS") + element(1, kind)
+    outer = element(14, element(6, struct.pack("<II", 17, 0)) + labels + inner)
+    path.write_bytes(b"MATLAB 5.0 MAT-file".ljust(124) + struct.pack("<HH", 0x0100, 0x4D49) + outer)
+    return path
+
+
 def test_import_mat_names_timetables_and_cells(tmp_path: Path) -> None:
-    path = mat73(tmp_path / "tt.mat", {"data": np.ones((1, 6), np.uint32)}, "timetable")
-    for mapping in ("", "rate=20,fibres=data"):
-        with pytest.raises(
-            InputError, match=r"data is a timetable, which only MATLAB reads: writetimetable\(data, 'data.csv'\)"
-        ):
-            import_mat(path, mapping)
+    new = mat73(tmp_path / "new.mat", {"data": np.ones((1, 6), np.uint32)}, "timetable")
+    for path in (new, opaque(tmp_path / "old.mat", b"data", b"timetable")):
+        for mapping in ("", "rate=20,fibres=data", "time=data.Time,fibres=data.v"):
+            message = r"data is a timetable, which only MATLAB reads: writetimetable\(data, 'data.csv'\)"
+            with pytest.raises(InputError, match=message):
+                import_mat(path, mapping)
     scipy.io.savemat(tmp_path / "cells.mat", {"t": TIMES, "v": np.array([VOLTS, 1], dtype=object)})
     with pytest.raises(InputError, match="v is a cell array, expected a full matrix"):
         import_mat(tmp_path / "cells.mat", "time=t,fibres=v")
