@@ -57,7 +57,9 @@ def test_no_frame_mixes_what_was_before_a_command_with_what_came_after(rate_hz: 
     times_s, readings = uneven(rate_hz, 0, seconds=20.0)
     commands = (len(times_s) * np.array([0.21, 0.44, 0.46, 0.9])).astype(int)
     level = np.searchsorted(commands, np.arange(len(times_s)), side="right")
-    recording = Recording(readings * 0.0 + level[:, None].astype(float), times_s, np.zeros((2, 2)), commands[::2], commands[1::2])
+    recording = Recording(
+        readings * 0.0 + level[:, None].astype(float), times_s, np.zeros((2, 2)), commands[::2], commands[1::2]
+    )
     frames = framed(recording)
     found = np.stack([frames.down_command, frames.up_command], axis=1).ravel()
     expected = np.searchsorted(found, np.arange(len(frames.readings)), side="right")
