@@ -20,8 +20,8 @@ _OBJECTS = ("cell", "char", "table", "timetable", "string", "datetime", "duratio
 class Hdf5Reader:
     """The datasets of an open HDF5 file.
 
-    Its `names` are the paths of the datasets that are reached without a link and have all values in the file, and of the
-    columns of tables among them.
+    Its `names` are the paths of the datasets that are reached without a link and have all values in the file, and those
+    of the columns of tables among them.
     """
 
     def __init__(self, file: Any) -> None:

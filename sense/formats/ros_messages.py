@@ -83,7 +83,7 @@ TOPICS = {
 
 
 class RawMessages(NamedTuple):
-    """Messages of a topic in the order of the file: type, what deserializes one, and log time (ns) and bytes of each."""
+    """Messages of a topic as the file has them: type, what deserializes one, and log time (ns) and bytes of each."""
 
     msgtype: str
     deserialize: Callable[[bytes], Any]

@@ -245,7 +245,7 @@ def _split(lines: Iterator[tuple[int, str]], separator: str) -> Iterator[tuple[i
 
     def texts() -> Iterator[str]:
         nonlocal number
-        for number, line in lines:
+        for number, line in lines:  # noqa: B007  it is that of the row below
             line = _MONITOR.sub(rf"\1{separator}", line)
             yield " ".join(line.split()) if separator == " " else line
 

@@ -28,7 +28,7 @@ _SEPARATOR = re.compile(rb"[,;\t ]+")
 
 
 def parse_numbers(line: bytes) -> list[float] | None:
-    """Return the numbers of a line, separated by commas, semicolons or blanks, with or without labels; None of others."""
+    """Return the numbers of a line, between commas, semicolons or blanks, with or without labels; None of others."""
     try:
         return [
             float(cell) for cell in _SEPARATOR.split(_LABEL.sub(b"", line).strip(b" ,;\t\r")) if cell != b""

@@ -43,7 +43,7 @@ def test_calibrate_doubts_units_and_misplaced_presses(few) -> None:
     code, out, _ = few("calibrate", "metres", "--out", "m", "--json")
     assert code == 1
     (doubt,) = json.loads(out)["doubts"]
-    assert doubt.endswith("are positions in m (x=NAME:m,y=NAME:m)?")
+    assert doubt.endswith("are they in m (x=NAME:m,y=NAME:m)?")
     presses_mm = good.presses_mm.copy()
     presses_mm[7] = 250, 3
     replace(good, presses_mm=presses_mm).save("typo", {})

@@ -55,7 +55,7 @@ def test_match_columns_orders_fibres_by_their_numbers() -> None:
     [
         (
             "",
-            "columns are '', expected QUANTITY=NAME or QUANTITY=NAME:UNIT, where QUANTITY is one of time, rate, fibres, x",
+            "columns are '', expected QUANTITY=NAME or QUANTITY=NAME:UNIT, where QUANTITY is one of time, rate, fibres",
         ),
         ("time=t_ms,fibres=ch*,x=px", "name one of x and y, expected both or neither"),
         ("time=t_ms:volt,fibres=ch*", "unit of time is 'volt', allowed is s, ms, us, µs, ns, min, h, d or a factor"),

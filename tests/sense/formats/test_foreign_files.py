@@ -358,7 +358,7 @@ def test_import_bag_reads_fields_of_messages(tmp_path: Path) -> None:
     recording = import_bag(path, f"{mapping},positions=/all.position")
     check(recording)
     np.testing.assert_allclose(recording.presses_mm[4], [0, 5], atol=1e-9)
-    with pytest.raises(InputError, match="'position.q' is no field"):
+    with pytest.raises(InputError, match=r"'position\.q' is no field"):
         import_bag(path, "fibres=/all.position.q")
 
 
