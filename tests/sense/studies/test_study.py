@@ -88,14 +88,20 @@ def test_every_study_writes_table_figure_and_text(name: str, tmp_path: Path, mon
 
 @pytest.mark.parametrize("executor", [None, ThreadPoolExecutor(2)], ids=["threads", "executor"])
 def test_results_do_not_depend_on_the_order_of_tasks(executor: Executor | None) -> None:
-    """The second task ends first."""
+    """The second task ends first: the first one waits until that is reported."""
     gate = threading.Event()
     tasks = [
         Task("first", lambda: {"value": np.array(1.0 if gate.wait(10) else 0.0)}),
-        Task("second", lambda: gate.set() or {"value": np.array(2.0)}),
+        Task("second", lambda: {"value": np.array(2.0)}),
     ]
     reports: list[tuple[int, int, str]] = []
-    states = compute_states(tasks, lambda *report: reports.append(report), jobs=2, executor=executor)
+
+    def report(done: int, total: int, what: str) -> None:
+        reports.append((done, total, what))
+        if what == "second":
+            gate.set()
+
+    states = compute_states(tasks, report, jobs=2, executor=executor)
     assert [float(state["value"]) for state in states] == [1.0, 2.0]
     assert reports == [(0, 2, ""), (1, 2, "second"), (2, 2, "first")]
 
