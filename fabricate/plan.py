@@ -389,7 +389,11 @@ class Plan:
         return shapely.union_all(bands).simplify(_OUTLINE_SHARE * tolerance)
 
     def layer_fibres(self, layer: int) -> list[int]:
-        """Return the indices of the fibres of a layer, ascending."""
+        """Return the indices of the fibres of a layer, ascending.
+
+        Args:
+            layer: its index, from the lowest, 0.
+        """
         return [fibre for fibre, index in enumerate(self.layer_indices) if index == layer]
 
     @cached_property

@@ -16,6 +16,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
+import shapely
 from build123d import (
     Color,
     Compound,
@@ -34,7 +35,7 @@ from build123d import (
 )
 from OCP.BRepGProp import BRepGProp
 from OCP.GProp import GProp_GProps
-from OCP.Standard import Standard_Failure
+from OCP.Standard import Standard_Failure, Standard_NullObject
 from shapely import affinity
 
 from padforge.common.plotting import HORIZONTAL, VERTICAL
@@ -78,6 +79,10 @@ MAX_DEVIATION = 2e-4
 """Maximum relative deviation of a ridge's volume from that of its mesh."""
 MAX_BODY_DEVIATION = 5e-4
 """The same for a lid with its round holes, which are polygons in the mesh, and all else of few prisms."""
+KERNEL_ERRORS = Standard_Failure, Standard_NullObject, RuntimeError, ValueError
+"""What the CAD kernel raises, and build123d about what it was given."""
+_LEAST_EDGE_MM = 1e-6
+"""Of an outline; the kernel takes points within 1e-7 mm for one."""
 _AREA_TOLERANCE = 1e-2
 """Relative error asked for of areas; it selects an adaptive integration, which is far more accurate."""
 _INTO_TERRACE_MM = 0.005
@@ -174,7 +179,7 @@ def _ridge_part(plan: Plan, fibre: int, of: str) -> CadPart:
     for fit_mm in FIT_TOLERANCES_MM:
         try:
             solid = _ridge_solid(plan, fibre, prisms, fit_mm)
-        except (Standard_Failure, RuntimeError, ValueError):  # the kernel's, and build123d's about what it was given
+        except KERNEL_ERRORS:
             continue
         deviation = abs(_upright_volume(solid) / volume_mm3 - 1)
         if isinstance(solid, Solid) and solid.is_valid and deviation <= MAX_DEVIATION:
@@ -211,7 +216,8 @@ def _extrude(plan: Plan, fibre: int, prism: Prism, fit_mm: float) -> Solid:
     mould = plan.settings.mould
     below_mm = mould.floor_mm + plan.heights_mm[plan.layer_indices[fibre]] - prism.top_mm
     joints = find_joints(plan, fibre, mould.ridge_width_mm / 2 + below_mm * plan.settings.ridge_slope)
-    (rings,) = polygon_rings(insert_joints(prism.area, joints))
+    outline = shapely.remove_repeated_points(insert_joints(prism.area, joints), _LEAST_EDGE_MM)
+    (rings,) = polygon_rings(outline)
     curves = [ring_curves(ring, joints, fit_mm) for ring in rings]
     outer, *holes = [Wire([_edge(curve, prism.bottom_mm) for curve in ring]) for ring in curves]
     face = Face(outer, holes)

@@ -155,7 +155,8 @@ def test_resume_repeats_interrupted_calibration_only(
         patch.setattr("padforge.sense.report.calibration.calibrate_into", breaks)
         assert called("run", cwd=tmp_path).code == 130
     assert resumed(tmp_path) == "design, mould, recording, contacts"
-    assert digests(tmp_path, "mould.step", *VOLATILE) == digests(finished[0], "mould.step", *VOLATILE)
+    without = "mould.step", "fabrication.json", *VOLATILE  # the CAD kernel orders colours by addresses
+    assert digests(tmp_path, *without) == digests(finished[0], *without)
 
 
 @pytest.mark.slow
