@@ -18,6 +18,9 @@ AS_READ = 0.9, 1.1
 """Readings per frame, by the median interval, that are taken as they are: each is a frame."""
 MIN_PRESENT = 0.25
 """Share of a frame in which a fibre must have been read; else it is missing there."""
+MAX_PAUSE_S, MAX_PAUSE = 1.0, 3.0
+"""Longest time between two readings that frames are made of, s or, if that is longer, in intervals of the rate: of a
+computer that slept for a night they have no more."""
 
 
 def framed(recording: Recording) -> Recording:
@@ -26,9 +29,12 @@ def framed(recording: Recording) -> Recording:
     Args:
         recording: of any rate.
     """
-    if is_as_read(recording.rate_hz):
+    rate_hz = recording.rate_hz
+    if is_as_read(rate_hz):
         return recording
-    edges = reading_edges(recording.times_s)
+    pauses_s = np.append(0.0, np.cumsum(_excess_s(np.diff(recording.times_s), rate_hz)))
+    clock_s = recording.times_s - pauses_s
+    edges = reading_edges(clock_s)
     commands = np.stack([recording.down_command, recording.up_command], axis=1).ravel()
     starts = np.concatenate([[0], commands, [len(recording.readings)]])
     begin = edges[starts]
@@ -36,10 +42,11 @@ def framed(recording: Recording) -> Recording:
     first = np.concatenate([[0], np.cumsum(counts)])
     number = np.arange(first[-1]) - np.repeat(first[:-1], counts)
     frame_edges = np.append(np.repeat(begin[:-1], counts) + FRAME_S * number, begin[-1])
+    middle_s = (frame_edges[:-1] + frame_edges[1:]) / 2
     return replace(
         recording,
         readings=time_means(edges, recording.readings, frame_edges),
-        times_s=(frame_edges[:-1] + frame_edges[1:]) / 2,
+        times_s=middle_s + np.interp(middle_s, clock_s, pauses_s),
         down_command=first[1:-1:2],
         up_command=first[2:-1:2],
     )
@@ -54,9 +61,9 @@ class FrameStream:
     """
 
     def __init__(self, rate_hz: float, fibres: int) -> None:
-        self._is_as_read, self._interval_s = is_as_read(rate_hz), 1 / rate_hz
-        self._times, self._rows = np.empty(0), np.empty((0, fibres))  # readings of frames that are to come
-        self._before_s = self._begin_s = np.nan  # time of the reading before these, and begin of the next frame
+        self._rate_hz, self._begin_s = rate_hz, np.nan  # begin of the next frame, by the clock without pauses
+        # readings of frames that are to come, and the one before: that clock, pauses until then, volts
+        self._pending = np.empty((0, 2 + fibres))
 
     def feed(self, times_s: Array, readings: Array) -> tuple[Array, Array]:
         """Take further readings; return the times (N,), s, and the means (N, C), V, of the frames that are complete.
@@ -65,23 +72,30 @@ class FrameStream:
             times_s: ascending; shape (n,).
             readings: NaN where missing; shape (n, C), V.
         """
-        if self._is_as_read or not len(times_s):
+        if is_as_read(self._rate_hz) or not len(times_s):
             return times_s, readings
-        if np.isnan(self._begin_s):
-            self._before_s = times_s[0] - self._interval_s
-            self._begin_s = times_s[0] - self._interval_s / 2
-        self._times, self._rows = np.concatenate([self._times, times_s]), np.concatenate([self._rows, readings])
-        first_s = (self._times[0] + self._before_s) / 2
-        edges = np.concatenate([[first_s], (self._times[:-1] + self._times[1:]) / 2])  # the last reading has no end yet
-        count = int((edges[-1] - self._begin_s) / FRAME_S)
-        frame_edges = self._begin_s + FRAME_S * np.arange(count + 1)
-        means = time_means(edges, self._rows[:-1], frame_edges) if count else self._rows[:0]
+        if not len(self._pending):  # as if there had been a reading before
+            self._pending = np.full((1, self._pending.shape[1]), np.nan)
+            self._pending[0, :2] = times_s[0] - 1 / self._rate_hz, 0.0
+        last_s, pause_s = self._pending[-1, :2].sum(), self._pending[-1, 1]
+        pauses_s = pause_s + np.cumsum(_excess_s(np.diff(times_s, prepend=last_s), self._rate_hz))
+        self._pending = np.vstack([self._pending, np.column_stack([times_s - pauses_s, pauses_s, readings])])
+        clock_s, pauses_s = self._pending[:, :2].T
+        edges = (clock_s[:-1] + clock_s[1:]) / 2  # the last reading has no end yet
+        begin_s = edges[0] if np.isnan(self._begin_s) else self._begin_s
+        count = int((edges[-1] - begin_s) / FRAME_S)
+        frame_edges = begin_s + FRAME_S * np.arange(count + 1)
+        means = time_means(edges, self._pending[1:-1, 2:], frame_edges) if count else np.empty((0, readings.shape[1]))
         self._begin_s = frame_edges[-1]
         used = int(np.searchsorted(edges, self._begin_s, side="right")) - 1  # readings that are over before it
-        if used:
-            self._before_s = self._times[used - 1]
-            self._times, self._rows = self._times[used:], self._rows[used:]
-        return (frame_edges[:-1] + frame_edges[1:]) / 2, means
+        self._pending = self._pending[used:]
+        middle_s = (frame_edges[:-1] + frame_edges[1:]) / 2
+        return middle_s + np.interp(middle_s, clock_s, pauses_s), means
+
+
+def _excess_s(intervals_s: Array, rate_hz: float) -> Array:
+    """Return by how much intervals between readings are longer than frames are made of; shape as the intervals, s."""
+    return np.maximum(intervals_s - max(MAX_PAUSE_S, MAX_PAUSE / rate_hz), 0.0)
 
 
 def frame_rate_hz(rate_hz: float) -> float:

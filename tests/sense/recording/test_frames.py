@@ -94,6 +94,21 @@ def test_frames_of_a_stream_do_not_depend_on_how_it_is_cut(rate_hz: float, lengt
     assert len(whole[0]) == pytest.approx((times_s[-1] - times_s[0]) / FRAME_S, abs=1.5 + 1.5 / (rate_hz * FRAME_S))
 
 
+def test_a_night_without_readings_makes_few_frames() -> None:
+    """In a recording and in a stream; their times are those of the clock."""
+    times_s = np.arange(2000) / 100 + np.repeat([0.0, 1e9], 1000)
+    readings = np.repeat([[0.0], [1.0]], 1000, axis=0)
+    frames = framed(Recording(readings, times_s, np.zeros((2, 2)), np.array([300, 1300]), np.array([500, 1500])))
+    stream = FrameStream(100.0, 1)
+    parts = [stream.feed(times_s[i : i + 7], readings[i : i + 7]) for i in range(0, 2000, 7)]
+    for found_s, values in ((frames.times_s, frames.readings), map(np.concatenate, zip(*parts, strict=True))):
+        assert (np.diff(found_s) > 0).all()
+        assert len(found_s) == pytest.approx(21 / FRAME_S, abs=3)
+        np.testing.assert_array_equal(values[found_s < 10], 0)
+        np.testing.assert_allclose(values[found_s > 1e9 + 10], 1)
+    np.testing.assert_allclose(frames.times_s[frames.down_command], times_s[[300, 1300]], atol=FRAME_S)
+
+
 def test_more_readings_of_the_same_locate_alike(localizer: LocalizerModel, recording: Recording) -> None:
     once, often = repeated(recording, 1), repeated(recording, 6)
     at_once, at_often = localizer.predict(once), localizer.predict(often)
