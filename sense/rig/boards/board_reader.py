@@ -1,6 +1,7 @@
-"""What a board needs besides its protocol: a thread that drains the port, and host times of the samples."""
+"""What a board needs besides its protocol: its port, a thread that drains it, and host times of the samples."""
 
 import threading
+from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -9,7 +10,7 @@ import numpy as np
 
 from padforge.sense.arrays import Array, Indices
 from padforge.sense.rig import clock
-from padforge.sense.rig.devices import RigFault
+from padforge.sense.rig.devices import RigFault, SerialStream
 
 POLL_S = 0.1  # longest wait for bytes
 SETTLE_S = 0.5
@@ -99,6 +100,50 @@ class BlockReader(threading.Thread):
                     raise RigFault("data", f"{self._port}: nobody has read the samples for {BUFFER_S:g} s")
             if silent_s > _STALL_S:
                 raise RigFault("stale", f"{self._port}: no sample for {silent_s:.1f} s", "reset the board")
+
+
+class SerialBoard(ABC):
+    """A board at a serial port, whose protocol a subclass knows.
+
+    Args:
+        port: its name; nothing is opened before `connect`.
+        baud: speed of the port.
+        rate_hz: samples a second.
+        inputs: of the board, one a fibre, from 0; () for all.
+    """
+
+    def __init__(self, port: str, baud: int, rate_hz: float, inputs: Sequence[int] = ()) -> None:
+        self._port, self._baud, self._rate_hz, self._inputs = port, baud, rate_hz, inputs
+        self._stream: SerialStream | None = None
+        self._reader: BlockReader | None = None
+
+    def connect(self) -> dict[str, Any]:
+        """Open the port, and return the board's identity once times are settled; see `Board`."""
+        self.close()
+        self._stream = SerialStream(self._port, self._baud, POLL_S)
+        try:
+            return self._start(self._stream)
+        except BaseException:
+            self.close()
+            raise
+
+    def close(self) -> None:
+        """Close the port; never raises."""
+        if self._reader is not None:
+            self._reader.stop()
+        if self._stream is not None:
+            self._stream.close()
+        self._stream = self._reader = None
+
+    @abstractmethod
+    def _start(self, stream: SerialStream) -> dict[str, Any]:
+        """Start `_reader` on the open port, and return the board's identity."""
+
+    def _drain(self) -> Arrivals:
+        """Return the blocks that have come; RigFault("refused") before `connect`."""
+        if self._reader is None:
+            raise RigFault("refused", f"{self._port}: not connected")
+        return self._reader.drain()
 
 
 def select_inputs(inputs: Sequence[int], n_inputs: int) -> tuple[int, ...]:

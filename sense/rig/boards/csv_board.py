@@ -13,7 +13,7 @@ import numpy as np
 
 from padforge.sense.arrays import MAX_FIBRES, Array
 from padforge.sense.rig import clock
-from padforge.sense.rig.boards.board_reader import POLL_S, BlockReader, SampleClock, select_inputs
+from padforge.sense.rig.boards.board_reader import BlockReader, SampleClock, SerialBoard, select_inputs
 from padforge.sense.rig.boards.line_board import describe_lines, find_line_port
 from padforge.sense.rig.devices import BoardSamples, RigFault, SerialStream
 from padforge.sense.settings import RigSettings
@@ -37,49 +37,32 @@ def parse_numbers(line: bytes) -> list[float] | None:
         return None
 
 
-class CsvBoard:
-    """A board at a serial port that prints lines of numbers; implements `Board`.
+class CsvBoard(SerialBoard):
+    """A board at a serial port that prints lines of numbers; implements `Board`. About `rate_hz` of them must come.
 
     A first column that only ascends is the board's time, and no input.
+
+    Args:
+        port: its name; nothing is opened before `connect`.
+        baud: speed of the port.
+        rate_hz: lines a second.
+        inputs: column of each fibre, from 0, without that of the time; () for all.
+        count_v: volts of 1.
     """
 
     def __init__(self, port: str, baud: int, rate_hz: float, inputs: Sequence[int] = (), count_v: float = 1.0) -> None:
-        """Take the settings; nothing is opened before `connect`, where about `rate_hz` lines a second must come.
-
-        Args:
-            port: its name.
-            baud: speed of the port.
-            rate_hz: lines a second.
-            inputs: column of each fibre, from 0, without that of the time; () for all.
-            count_v: volts of 1.
-        """
-        self._port, self._baud, self._rate_hz, self._inputs = port, baud, rate_hz, inputs
+        super().__init__(port, baud, rate_hz, inputs)
         self._count_v = count_v
-        self._stream: SerialStream | None = None
-        self._reader: BlockReader | None = None
-        self._tail = b""
 
     @classmethod
     def from_settings(cls, rig: RigSettings, inputs: Sequence[int]) -> "CsvBoard":
         """Return the board that `[rig]` names."""
         return cls(find_line_port(rig), rig.baud, rig.board_rate_hz, inputs, rig.count_v)
 
-    def connect(self) -> dict[str, Any]:
-        """Open the port, find columns and rate, and return the board's identity; see `Board`."""
-        self.close()
-        self._stream = SerialStream(self._port, self._baud, POLL_S)
-        try:
-            return self._start(self._stream)
-        except BaseException:
-            self.close()
-            raise
-
     def read(self) -> BoardSamples:
         """Return all samples since the last call, volts; see `Board`."""
-        if self._reader is None:
-            raise RigFault("refused", f"{self._port}: not connected")
         indices, rows = [], []
-        for arrival_s, block in self._reader.drain():
+        for arrival_s, block in self._drain():
             for numbers in block:
                 self._n_lines += 1
                 if len(numbers) == self._width:
@@ -94,14 +77,6 @@ class CsvBoard:
             np.array(rows, np.float64).reshape(-1, len(self._columns)) * self._count_v,
             missing,
         )
-
-    def close(self) -> None:
-        """Close the port; never raises."""
-        if self._reader is not None:
-            self._reader.stop()
-        if self._stream is not None:
-            self._stream.close()
-        self._stream = self._reader = None
 
     def _start(self, stream: SerialStream) -> dict[str, Any]:
         self._tail = b""

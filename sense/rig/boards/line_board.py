@@ -10,7 +10,7 @@ import numpy as np
 
 from padforge.sense.arrays import MAX_FIBRES
 from padforge.sense.rig import clock
-from padforge.sense.rig.boards.board_reader import POLL_S, BlockReader, SampleClock, select_inputs
+from padforge.sense.rig.boards.board_reader import BlockReader, SampleClock, SerialBoard, select_inputs
 from padforge.sense.rig.devices import BoardSamples, RigFault, SerialStream, host_ports
 from padforge.sense.settings import RigSettings
 
@@ -171,50 +171,23 @@ def find_line_port(rig: RigSettings) -> str:
     return ports[0]
 
 
-class LineBoard:
-    """A board at a serial port that sends samples as lines; implements `Board`.
+class LineBoard(SerialBoard):
+    """A board at a serial port that sends samples as lines; implements `Board`. Its header must state `rate_hz`.
 
     The host time of a sample is when it was measured by the board's clock, but for the least delay of the port.
     """
 
-    def __init__(self, port: str, baud: int, rate_hz: float, inputs: Sequence[int] = ()) -> None:
-        """Take the settings; nothing is opened before `connect`, where the board's header must state `rate_hz`."""
-        self._port, self._baud = port, baud
-        self._rate_hz, self._inputs = rate_hz, inputs
-        self._stream: SerialStream | None = None
-        self._reader: BlockReader | None = None
-        self._assembler: LineAssembler | None = None
-        self._decoder = LineDecoder()
-        self._settled, self._last_sample_s = False, 0.0
+    _assembler: "LineAssembler"  # once it is connected
 
     @classmethod
     def from_settings(cls, rig: RigSettings, inputs: Sequence[int]) -> "LineBoard":
-        """Return the board that `[rig]` names; see `__init__` and `find_line_port`."""
+        """Return the board that `[rig]` names; see `find_line_port`."""
         return cls(find_line_port(rig), rig.baud, rig.board_rate_hz, inputs)
-
-    def connect(self) -> dict[str, Any]:
-        """Open the port, and return the board's identity once times are settled; see `Board`."""
-        self.close()
-        self._stream = SerialStream(self._port, self._baud, POLL_S)
-        try:
-            return self._start(self._stream)
-        except BaseException:
-            self.close()
-            raise
 
     def read(self) -> BoardSamples:
         """Return all samples since the last call, volts; see `Board`. RigFault("data") if overfull or out of step."""
-        if self._reader is None or self._assembler is None:
-            raise RigFault("refused", f"{self._port}: not connected")
-        return self._assembler.assemble(self._reader.drain())
-
-    def close(self) -> None:
-        """Close the port; never raises."""
-        if self._reader is not None:
-            self._reader.stop()
-        if self._stream is not None:
-            self._stream.close()
-        self._stream = self._reader = None
+        arrivals = self._drain()
+        return self._assembler.assemble(arrivals)
 
     def _start(self, stream: SerialStream) -> dict[str, Any]:
         self._decoder, self._settled = LineDecoder(), False
