@@ -265,21 +265,22 @@ def _sink(press: LayerPress, r: "Array", height_mm: float, steps: int = 6) -> "A
 
 
 def press_sections(
-    document: Mapping[str, Any], max_strain: float | None, silicone: tuple[str, float] = ("EcoFlex 00-20", 55)
+    document: Mapping[str, Any], max_strain: float | None, silicone: tuple[str, float] | None = None
 ) -> list[PageSection]:
     """Return the section on the press that a pad is designed for, with its picture; none unless a layer.
 
     Args:
         document: its `design.json`; a damaged one raises any of the built-in errors.
         max_strain: elongation that the fibres bear, relative to their length; None if unknown.
-        silicone: name and Young's modulus, kPa.
+        silicone: name and Young's modulus, kPa; None for EcoFlex 00-20.
     """
     settings = document["provenance"]["settings"]
     contact = Contact(**settings["contact"])
     if contact.model != "layer":
         return []
     press = contact_press(contact)
-    force_n = press.force_n(reduced_modulus_kpa(silicone[1]))
+    silicone_name, modulus_kpa = silicone or ("EcoFlex 00-20", 55)
+    force_n = press.force_n(reduced_modulus_kpa(modulus_kpa))
     rows = []
     families = zip(FAMILIES, contact.fibre_depths_mm, half_widths_mm(contact), fibre_strains(contact), strict=True)
     for (name, _), depth, width, (squeeze, stretch) in families:
@@ -289,7 +290,7 @@ def press_sections(
     lead = (
         f"A {contact.tool} of {contact.tool_radius_mm:g} mm, pressed {contact.depth_mm:g} mm deep into silicone of"
         f" {contact.thickness_mm:g} mm, touches it within {press.contact_radius_mm:.1f} mm and takes"
-        f" {force_n:.1f} N on {silicone[0]}. Fibres respond to being pressed flat and stretched, by the strains"
+        f" {force_n:.1f} N on {silicone_name}. Fibres respond to being pressed flat and stretched, by the strains"
         " of an elastic layer, which are small ones: large presses exceed what it says."
     )
     caption = "The press in section, true to scale, and the weight of an element of a fibre by its distance from it."

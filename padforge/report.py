@@ -81,16 +81,16 @@ def write_report(folder: Path) -> Path:
     return folder / "report.html"
 
 
-def _materials(folder: Path, format_: str) -> tuple[Any, ...]:
-    """Return what `press_sections` asks of the materials of the mould in a folder; of the strain alone without one."""
+def _materials(folder: Path, format_: str) -> tuple[float | None, tuple[str, float] | None]:
+    """Return what `press_sections` asks of the materials of the mould in a folder, as far as it is known."""
     path = folder / "fabrication.json"
     if not path.exists():
-        return (None,)
+        return None, None
     with reraise_as_input_error(path):
         document = read_json(path, format_)
         max_strain, silicone = document["fibre"]["max_strain"], document["silicone"]
-        strain = None if max_strain is None else float(max_strain)
-        return (strain, (silicone["name"], float(silicone["modulus_kpa"]))) if silicone["modulus_kpa"] else (strain,)
+        stiffness = (silicone["name"], float(silicone["modulus_kpa"])) if silicone["modulus_kpa"] else None
+        return None if max_strain is None else float(max_strain), stiffness
 
 
 def _find_mismatches(

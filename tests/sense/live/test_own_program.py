@@ -27,14 +27,15 @@ def check_places(printed: str, recording: Recording) -> int:
     return len(places)
 
 
-def test_program_prints_each_press(
-    localizer: LocalizerModel,
-    recording: Recording,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+@pytest.fixture(autouse=True)
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Programs run in a folder of their own."""
     monkeypatch.chdir(tmp_path)
+
+
+def test_program_prints_each_press(
+    localizer: LocalizerModel, recording: Recording, capsys: pytest.CaptureFixture[str]
+) -> None:
     localizer.save("out/example")
     recording.save("out/example/recording", {})
     exec(PROGRAMS[0], {})
@@ -44,7 +45,6 @@ def test_program_prints_each_press(
 def test_program_reads_a_board(
     localizer: LocalizerModel,
     recording: Recording,
-    tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
@@ -65,7 +65,6 @@ def test_program_reads_a_board(
         def readline(self) -> bytes:
             return ",".join(f"{volts:.6f}" for volts in next(rows)).encode() + b"\r\n"
 
-    monkeypatch.chdir(tmp_path)
     localizer.save("out/pad")
     with monkeypatch.context() as patched:
         patched.setattr(serial, "Serial", Board)
