@@ -3,7 +3,7 @@
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy.special import gammaincinv
@@ -18,6 +18,9 @@ from padforge.sense.localizer.model import Localization, LocalizerModel
 from padforge.sense.localizer.moments import MOMENTS
 from padforge.sense.recording.frames import framed
 from padforge.sense.recording.recording import Recording
+
+if TYPE_CHECKING:
+    from pandas import DataFrame
 
 FORMAT = "padforge-calibration/1"
 BUILT_PAD = "simulated, by default with the scatter of a built pad, which itself errs 0.97 / 1.20 / 1.54 / 2.32 mm"
@@ -76,6 +79,14 @@ class Evaluation:
     def to_dict(self) -> dict[str, Any]:
         """Return the document of `calibration.json`."""
         return {"format": FORMAT} | {name: value for name, value in vars(self).items() if value is not None}
+
+    def to_frame(self) -> "DataFrame":
+        """Return `errors` as a table of pandas; InputError where it is not installed."""
+        try:
+            from pandas import DataFrame
+        except ModuleNotFoundError as error:
+            raise InputError("a table needs pandas, which is not installed: pip install 'padforge[formats]'") from error
+        return DataFrame(self.errors)
 
 
 def evaluate(

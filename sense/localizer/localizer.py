@@ -175,22 +175,19 @@ class Localizer:
         true = X.presses_mm if isinstance(X, Recording | PressSelection) and y is None else _array_positions(y)
         return -float(np.nanmean(distances(predicted, true)))
 
-    def evaluate(self, recording: Recording, max_failures: int | None = None) -> list[dict[str, Any]]:
+    def evaluate(self, recording: Recording, max_failures: int | None = None) -> Evaluation:
         """Evaluate for every set of up to `max_failures` failed fibres.
 
         Args:
             recording: of the pad; of the recording of the training, only the presses that were held back count.
             max_failures: most fibres that fail at once; None for as many as in training.
 
-        Returns:
-            Rows of `evaluation.error_row`, one a number of failed fibres.
-
         Raises:
             InputError: not fitted, or as `evaluation.evaluate`.
         """
         model = self._fitted
         most = model.max_failures if max_failures is None else max_failures
-        return evaluate(model, recording, range(min(most, model.fibres - 1) + 1)).errors
+        return evaluate(model, recording, range(min(most, model.fibres - 1) + 1))
 
     def save(self, folder: str | Path) -> None:
         """Write `localizer.json` and `localizer.safetensors`.

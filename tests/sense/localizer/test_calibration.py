@@ -348,10 +348,12 @@ def test_localizer_scores_in_cross_validation(arrays: tuple[np.ndarray, np.ndarr
 @few_moments()
 def test_localizer_fits_evaluates_and_keeps_a_recording(brief: Recording, tmp_path: Path) -> None:
     localizer = Localizer(2, split="chronological", **TINY).fit(brief)
-    rows = localizer.evaluate(brief)
-    assert rows == localizer.calibration_.errors
-    assert [row["n_failed"] for row in rows] == [0, 1, 2]
-    assert localizer.evaluate(brief, max_failures=0) == rows[:1]
+    evaluation = localizer.evaluate(brief)
+    assert evaluation.errors == localizer.calibration_.errors
+    assert localizer.evaluate(brief, max_failures=0).errors == evaluation.errors[:1]
+    table = evaluation.to_frame()
+    assert table["n_failed"].tolist() == [0, 1, 2]
+    assert table["mean_mm"].tolist() == [row["mean_mm"] for row in evaluation.errors]
     assert localizer.score(brief) < 0
     localizer.save(tmp_path)
     again = Localizer.load(tmp_path)
