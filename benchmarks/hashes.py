@@ -18,7 +18,7 @@ import click
 import numpy as np
 
 from padforge import design, fabricate, sense
-from padforge.common.parallel import one_torch_thread
+from padforge.common.parallel import one_thread
 from padforge.design.published.objective import published_terms
 
 PAD = design.Morphology.random(2, knots=3, seed=5)
@@ -80,7 +80,7 @@ def hash_presses(recording: sense.Recording) -> str:
 @click.option("--against", type=click.Path(exists=True, path_type=Path), help="Hashes of an earlier run.")
 def main(recording: Path | None, against: Path | None) -> None:
     """Print the hashes, or what has moved."""
-    with one_torch_thread():
+    with one_thread():
         hashes = dict([*hash_pads(), *hash_calibration()])
     if recording is not None:
         hashes[f"presses of {recording.name}"] = hash_presses(sense.open_recording(recording))

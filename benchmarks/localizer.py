@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 from padforge.benchmarks.harness import Bench, BenchTrial
-from padforge.common.parallel import one_torch_thread
+from padforge.common.parallel import one_thread
 from padforge.common.progress import ignore_progress
 from padforge.design import Morphology
 from padforge.design.published.networks import fit_batch, initial_weights
@@ -44,7 +44,7 @@ Predict = Callable[[Array], Array]
 
 def trials() -> Iterator[BenchTrial]:
     """Yield trainings by all ways, and the prediction of one press."""
-    with one_torch_thread():
+    with one_thread():
         for features in FEATURES:
             yield from _trainings(features)
         # the time of a prediction does not depend on the training

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from padforge.benchmarks.harness import Bench, BenchTrial
-from padforge.common.parallel import one_torch_thread
+from padforge.common.parallel import one_thread
 from padforge.design.contact import signals
 from padforge.design.morphology import Array, Morphology
 from padforge.design.objectives.fibre_loss import failure_subsets
@@ -37,7 +37,7 @@ def trials() -> Iterator[BenchTrial]:
     Both ways train on the same samples and are tested on the same fresh presses; the plain way uses as many threads as
     NumPy does.
     """
-    with one_torch_thread():
+    with one_thread():
         for case, pad in (("square", Morphology.straight(4)), ("random N=5", Morphology.random(4, 5, seed=1))):
             presses = SimulatedPresses.simulate(pad, 32, 2000, 0, partial(signals, pad, contact=PUBLISHED_CONTACT))
             failures = failure_subsets(len(pad.knots), FAILED, SETS)

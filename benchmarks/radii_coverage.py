@@ -11,7 +11,7 @@ import sys
 import numpy as np
 from numpy.typing import NDArray
 
-from padforge.common.parallel import one_torch_thread
+from padforge.common.parallel import one_thread
 from padforge.design import Morphology
 from padforge.sense import LocalizerSettings, RigSettings, calibrate, simulate
 
@@ -71,5 +71,5 @@ def main(recordings: int, seed: int) -> None:
 
 
 if __name__ == "__main__":
-    with one_torch_thread():
+    with one_thread():
         main(int(sys.argv[1]), int(sys.argv[2]))

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
 
-from padforge.common.parallel import one_torch_thread, run_tasks
+from padforge.common.parallel import one_thread, run_tasks
 from padforge.common.settings import or_default
 from padforge.common.validation import InputError, check_int
 from padforge.design.contact import serpentine_presses, signals
@@ -245,7 +245,7 @@ class SimulatedPresses:
             return np.array([self.test_errors(*pair).mean() for pair in zip(networks, batch, strict=True)])
 
         batches = [batch for level in failures for batch in split_batches(level)]
-        with one_torch_thread():
+        with one_thread():
             means = dict(run_tasks((i, partial(mean_errors, batch)) for i, batch in enumerate(batches)))
         errors = np.concatenate([np.empty(0), *(means[i] for i in range(len(batches)))])
         levels = np.split(errors, np.cumsum([len(sets) for sets in failures[:-1]], dtype=int))

@@ -1,8 +1,8 @@
 # %% [markdown]
 # # From an idea to a calibrated sensor
 #
-# This notebook designs a small pad, makes its mould, presses it on a simulated rig, and learns to locate touches, in
-# about two minutes. It needs `pip install 'padforge[design,cad,train,formats]' scikit-learn`.
+# This notebook designs a small pad, makes its mould, presses it on a simulated rig, and learns to locate touches, in a
+# minute. It needs `pip install 'padforge[design,cad,train,formats]' scikit-learn`.
 
 # %%
 import matplotlib.pyplot as plt
@@ -20,14 +20,15 @@ from padforge import design, fabricate, sense
 
 # %%
 size = design.PadSettings(grid=3)
-quick = design.SearchSettings(starts=2, steps=150)
+quick = design.SearchSettings(starts=2, steps=100)
 found = design.search(size, settings=quick)
 for failed in range(4):
     name = f"expected_error_mm_{failed}"
     print(f"{failed} failed: {found.terms[name]:.2f} mm, straight fibres {found.straight[name]:.2f} mm")
 
 # %%
-design.draw_plan(found.morphology, design.Contact())
+design.draw_plan(found.morphology, design.Contact()).savefig("plan.png")
+Image("plan.png")
 
 # %% [markdown]
 # ## Mould
@@ -49,7 +50,7 @@ Image("mould/mould.png")
 # sense record`, from files, or from arrays of your own.
 
 # %%
-recording = sense.simulate(found.morphology, sense.RigSettings(presses=400), size=size)
+recording = sense.simulate(found.morphology, sense.RigSettings(presses=300), size=size)
 shown = recording.times_s < 30
 plt.plot(recording.times_s[shown], recording.readings[shown])
 plt.xlabel("time (s)")
@@ -71,7 +72,7 @@ print(f"{len(yours)} presses of {yours.fibres} fibres, {yours.rate_hz:.1f} readi
 # set of failed ones.
 
 # %%
-localizer = sense.Localizer(epochs=40).fit(recording)
+localizer = sense.Localizer(epochs=30).fit(recording)
 evaluation = localizer.calibration_
 evaluation.to_frame()[["n_failed", "mean_mm", "median_mm", "p95_mm", "within_r90"]].round(2)
 
@@ -90,4 +91,4 @@ plt.show()
 # in mm.
 
 # %%
--cross_val_score(sense.Localizer(epochs=10), recording, cv=3)
+-cross_val_score(sense.Localizer(epochs=6), recording, cv=3)

@@ -10,7 +10,7 @@ import os
 import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, CancelledError, Executor, Future, ThreadPoolExecutor, wait
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from itertools import islice, pairwise
 from pathlib import Path
 from threading import Lock, Thread
@@ -142,27 +142,32 @@ def map_chunks(work: Callable[[int, int], Result], count: int, min_chunk: int) -
         return list(pool.map(lambda bounds: work(*bounds), pairwise(edges)))
 
 
-_threads_before, _torch_lock = list[int](), Lock()  # torch has one number of threads for all
+_bodies, _limits, _limits_lock = list[None](), ExitStack(), Lock()  # torch and BLAS have one number of threads for all
 
 
 @contextmanager
-def one_torch_thread() -> Iterator[None]:
-    """Limit torch to one thread in the body; from any thread, in parallel or nested, until the last body ends.
+def one_thread() -> Iterator[None]:
+    """Limit torch and BLAS to one thread in the body; from any thread, in parallel or nested, until the last body ends.
 
-    More threads gain little on small matrices, slow down where another program runs, and sum in another order.
+    More threads gain little on small matrices, slow down where another program runs, and sum in another order. Those of
+    BLAS wait by spinning: beside other programs, uncertainty was calibrated in six times the processor time.
     """
     import torch
+    from threadpoolctl import threadpool_limits
 
-    with _torch_lock:
-        _threads_before.append(torch.get_num_threads())
-        torch.set_num_threads(1)
+    with _limits_lock:
+        if not _bodies:
+            _limits.callback(torch.set_num_threads, torch.get_num_threads())
+            _limits.enter_context(threadpool_limits(1, "blas"))
+            torch.set_num_threads(1)
+        _bodies.append(None)
     try:
         yield
     finally:
-        with _torch_lock:
-            n_before = _threads_before.pop()
-            if not _threads_before:
-                torch.set_num_threads(n_before)
+        with _limits_lock:
+            _bodies.pop()
+            if not _bodies:
+                _limits.close()
 
 
 class Checkpoints:

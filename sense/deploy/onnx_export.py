@@ -23,7 +23,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from padforge.common.files import atomic_file
-from padforge.common.parallel import one_torch_thread
+from padforge.common.parallel import one_thread
 from padforge.common.validation import Fault, InputError
 from padforge.sense.arrays import Array, Indices
 from padforge.sense.localizer import features, moments
@@ -264,7 +264,7 @@ def _build_graph(model: LocalizerModel, digest: str) -> onnx.ModelProto:
     names = [*list(OUTPUTS)[:4], *(name for each in model.scaler.measures for name in MEASURE_COLUMNS[each.name])]
     axes = {"readings": {0: "readings"}} | {name: {0: "presses"} for name in [*list(INPUTS)[1:], *names]}
     content = io.BytesIO()
-    with warnings.catch_warnings(), one_torch_thread(), torch.no_grad():
+    with warnings.catch_warnings(), one_thread(), torch.no_grad():
         warnings.simplefilter("ignore")  # the exporter is deprecated, and constants are traced as such
         torch.onnx.export(
             _LocalizerModule(model),

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from padforge.common.parallel import one_torch_thread, run_tasks
+from padforge.common.parallel import one_thread, run_tasks
 from padforge.common.validation import InputError, check_float, short_repr
 from padforge.sense.arrays import Array, Floats, Mask, check_numbers
 from padforge.sense.health.domain_shift import rest_levels
@@ -359,7 +359,7 @@ class FaultDetector:
             rng = np.random.default_rng(self.seed)
             return fit_health_model(readings, recording.rate_hz, down_command, up_command, rng=rng, **options)
 
-        with one_torch_thread():
+        with one_thread():
             models = dict(run_tasks((name, partial(fit, name)) for name in presses))
         self.model_, self.live_model_ = models[COMMANDED], models[DETECTED]
         return self

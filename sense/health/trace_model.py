@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from padforge.common.parallel import one_torch_thread
+from padforge.common.parallel import one_thread
 from padforge.sense.arrays import MIN_SCALE_V, Array, Floats, Indices, Mask
 
 Weights = Mapping[str, Floats]
@@ -194,5 +194,5 @@ def train_networks(inputs: Floats, targets: Array, rows: list[Indices], rng: np.
         loss = ((nll + square / 4) * dropped).sum(dim=(1, 2, 3)) / dropped.sum(dim=(1, 2, 3))
         return loss.sum()
 
-    with one_torch_thread():
+    with one_thread():
         return fit_network(weights, loss_of_batch, min(MAX_STEPS, len(x)), LEARNING_RATE, weight_decay=WEIGHT_DECAY)

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from padforge.common.files import provenance
-from padforge.common.parallel import one_torch_thread
+from padforge.common.parallel import one_thread
 from padforge.common.profiling import stage
 from padforge.common.progress import OnProgress, ignore_progress
 from padforge.common.settings import or_default
@@ -118,11 +118,11 @@ def calibrate(
     training, test = (known[part] for part in split_presses(len(known), options.split, options.test_share, rng))
     made_by = provenance("padforge sense calibrate", options.seed, packages=("torch", "safetensors"))
     made_by |= {"inputs": {"recording": recording.digest}, "recording_kind": recording.source.get("kind")}
-    with stage("train"), one_torch_thread():
+    with stage("train"), one_thread():
         model = fit_recording(recording, training, options, rng, on_progress, time_budget)
     origin = {"fibre_names": recording.fibre_names, "pad_sha256": recording.pad_digest, "provenance": made_by}
     model = replace(model, split=options.split, test=tuple(test.tolist()), **origin)
-    with stage("evaluate"):
+    with stage("evaluate"), one_thread():
         levels = range(_n_levels(options, recording.fibres))
         evaluation = evaluate(model, recording, levels, by_moment=by_moment, on_progress=on_progress)
     evaluation = replace(evaluation, training_presses=len(training), settings=options.model_dump())

@@ -22,7 +22,7 @@ from scipy.linalg import eigh
 from torch import Tensor
 from torch.optim.adamw import adamw
 
-from padforge.common.parallel import makespan, one_torch_thread, run_tasks
+from padforge.common.parallel import makespan, one_thread, run_tasks
 from padforge.common.progress import OnProgress, ignore_progress
 from padforge.common.validation import InputError
 from padforge.design.published.networks import fit_batch
@@ -190,7 +190,7 @@ def train_members(
     length, has_bayes = sum(phase.length for phase in phases.values()), options.members > 1 and not presses.depth_gain
     members, cores, pace_s = max(1, options.members - has_bayes), os.cpu_count() or 1, 0.0
     if time_budget is not None:
-        with one_torch_thread():
+        with one_thread():
             pace_s = Training(presses, table, options, 0, next(iter(phases.values()))).measure_pace()
         has_bayes = not presses.depth_gain
         members = max(1, min(round(cores * time_budget / (pace_s * MIN_LENGTHS * steps * length)), MAX_MEMBERS))
@@ -231,7 +231,7 @@ def train_members(
         )
         return training.weights(fitted)
 
-    with one_torch_thread(), joint:
+    with one_thread(), joint:
         weights = dict(run_tasks((number, partial(train, number)) for number in range(len(tasks))))
     missing = [max(0, min(MIN_STEPS, usual) - taken) for taken, usual in zip(n_steps, all_steps, strict=True)]
     if time_budget is not None and any(missing):
@@ -408,6 +408,6 @@ def fine_tune(
         return share * new + (1 - share) * kept
 
     parameters, steps = dict(network.named_parameters()), FINE_TUNING_STEPS
-    with one_torch_thread():
+    with one_thread():
         fitted = fit_network(parameters, loss_of_batch, steps, FINE_TUNING_RATE, weight_decay=0.0, averaged=False)
     return EnsembleMlp.join(fitted)

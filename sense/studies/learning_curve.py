@@ -15,7 +15,7 @@ import numpy as np
 from scipy.optimize import nnls
 
 from padforge.common.files import provenance
-from padforge.common.parallel import one_torch_thread, run_tasks
+from padforge.common.parallel import one_thread, run_tasks
 from padforge.common.plotting import ALARM, FAINT, INK, add_caption, new_figure, save_figure
 from padforge.common.progress import OnProgress, ignore_progress
 from padforge.common.settings import or_default
@@ -135,7 +135,7 @@ def _predict(
         return localizer.predict_features(localizer.scaled_features(recording)[test]).positions_mm
 
     longest_first = reversed(range(len(steps)))
-    with one_torch_thread(), joint:
+    with one_thread(), joint:
         predictions = dict(run_tasks((number, partial(train, number)) for number in longest_first))
     return [predictions[number] for number in range(len(steps))]
 

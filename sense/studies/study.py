@@ -14,7 +14,7 @@ import numpy as np
 
 from padforge.common import files, plotting
 from padforge.common.command_line import text_table
-from padforge.common.parallel import State, one_torch_thread, run_tasks
+from padforge.common.parallel import State, one_thread, run_tasks
 from padforge.common.plotting import FAINT, INK, save_figure, style_axes
 from padforge.common.progress import OnProgress, ignore_progress
 from padforge.common.settings import validate
@@ -131,7 +131,7 @@ def compute_states(
 
 
 def _compute(task: Task) -> State:
-    with one_torch_thread():
+    with one_thread():
         return task.compute()
 
 

@@ -1,4 +1,4 @@
-"""Tasks on any executor, torch on one thread, the cache of kernels, and the end of a program with running tasks."""
+"""Tasks on any executor, torch and BLAS on one thread, the cache of kernels, and the end of a program with running ones."""
 
 import os
 import subprocess
@@ -10,8 +10,9 @@ from functools import partial
 
 import pytest
 import torch
+from threadpoolctl import threadpool_info, threadpool_limits
 
-from padforge.common.parallel import cluster, makespan, one_torch_thread, run_tasks
+from padforge.common.parallel import cluster, makespan, one_thread, run_tasks
 from padforge.common.validation import Fault
 
 
@@ -95,15 +96,20 @@ def test_cluster_failure_is_a_fault_of_one_line(monkeypatch, killed, said):
         list(run_tasks([("a", lost)], pool))
 
 
-def test_one_torch_thread_nests_and_restores():
+def blas_threads():
+    return {pool["num_threads"] for pool in threadpool_info() if pool["user_api"] == "blas"}
+
+
+def test_one_thread_nests_and_restores():
     before = torch.get_num_threads()
     try:
         torch.set_num_threads(3)
-        with one_torch_thread():
-            with one_torch_thread():
-                assert list(run_tasks([("a", one_torch_thread()(torch.get_num_threads))])) == [("a", 1)]
-            assert torch.get_num_threads() == 1
-        assert torch.get_num_threads() == 3
+        with threadpool_limits(3, "blas"):
+            with one_thread():
+                with one_thread():
+                    assert list(run_tasks([("a", one_thread()(torch.get_num_threads))])) == [("a", 1)]
+                assert (torch.get_num_threads(), blas_threads()) == (1, {1})
+            assert (torch.get_num_threads(), blas_threads()) == (3, {3})
     finally:
         torch.set_num_threads(before)
 

@@ -22,7 +22,7 @@ def taken(monkeypatch):
 @pytest.fixture
 def one_thread():
     """Torch computes on one thread, as in a search: several that wait for a busy machine take many times as long."""
-    from padforge.common.parallel import one_torch_thread
+    from padforge.common.parallel import one_thread
 
-    with one_torch_thread():
+    with one_thread():
         yield

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from padforge.common.parallel import one_torch_thread
+from padforge.common.parallel import one_thread
 from padforge.design import Morphology, signals
 from padforge.sense.studies.multicontact import (
     COUNTING,
@@ -58,7 +58,7 @@ def test_fit_pairs_does_not_depend_on_the_order_except_for_fixed_labels(method: 
     pairs, inputs = pairs[:60], signals(PAD, pairs[:60])
     shuffled = np.where(np.random.default_rng(3).random((len(pairs), 1, 1)) < 0.5, pairs, pairs[:, ::-1])
     sizes = Sizes(len(pairs), 0, members=2, hidden=4, epochs=3)
-    with one_torch_thread():
+    with one_thread():
         first, second = (
             fit_pairs(METHODS[method], inputs, order, np.random.default_rng(0), sizes)(inputs)
             for order in (pairs, shuffled)
