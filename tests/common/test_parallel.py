@@ -1,4 +1,4 @@
-"""Tasks on any executor, torch and BLAS on one thread, the cache of kernels, and the end of a program with running ones."""
+"""Tasks on any executor, torch and BLAS on one thread, the cache of kernels, and the end of a program with tasks."""
 
 import os
 import subprocess
