@@ -98,7 +98,7 @@ class _PressRecord(NamedTuple):
     is_warm: Mask  # (L,) whether that level is reliable
 
 
-class _Wiring(NamedTuple):
+class _WiringFault(NamedTuple):
     kind: str  # a key of `TEXTS`
     fibres: tuple[int, ...]  # among the living
     llr: float  # log-likelihood ratio of this wiring against that of the calibration
@@ -250,22 +250,22 @@ class FaultMonitor:
         self._replay(first, self._failed)
         return FibreFault(self.n_presses, since, tuple(self.model.living[list(fibres)].tolist()), kind, score)
 
-    def _find_wiring(self, pairs: Sequence[tuple[int, int]], first: int) -> _Wiring | None:
+    def _find_wiring(self, pairs: Sequence[tuple[int, int]], first: int) -> _WiringFault | None:
         """Find the pair or fibre whose readings since press `first` are far more likely if swapped or inverted."""
         wirings = [*self._swapped(pairs, first), *self._inverted(first)]
         best = max(wirings, key=lambda wiring: wiring.llr, default=None)
         return best if best and best.llr > self.model.threshold else None
 
-    def _inverted(self, first: int) -> Iterator[_Wiring]:
+    def _inverted(self, first: int) -> Iterator[_WiringFault]:
         """Yield each fibre as if inverted; an inverted one disturbs predictions for all others, but not its own."""
         _, targets, mean, std = self._predict(self._records_since(first), self._failed)
         log_likelihood = self.model.likelihoods.log_likelihood_healthy
         difference = log_likelihood(-targets, mean, std) - log_likelihood(targets, mean, std)
         llrs = np.nan_to_num(np.clip(difference, -MAX_LLR, MAX_LLR)).sum(axis=0)
         for fibre in np.flatnonzero(~self._failed).tolist():
-            yield _Wiring("inverted", (fibre,), float(llrs[fibre]))
+            yield _WiringFault("inverted", (fibre,), float(llrs[fibre]))
 
-    def _swapped(self, pairs: Sequence[tuple[int, int]], first: int) -> Iterator[_Wiring]:
+    def _swapped(self, pairs: Sequence[tuple[int, int]], first: int) -> Iterator[_WiringFault]:
         """Yield pairs as if swapped."""
         records = self._records_since(first)
         pca, likelihoods = self.model.pca, self.model.likelihoods
@@ -286,7 +286,7 @@ class FaultMonitor:
             scale_v, level = pca.target_scale_v[this, -1], records[0].level[this]
             as_is, if_swapped = ((rests[:, source].mean(axis=0) - level) / scale_v for source in (this, other))
             llr += np.nan_to_num(np.clip(as_is**2 - if_swapped**2, -2 * MAX_LLR, 2 * MAX_LLR)).sum() / 2
-            yield _Wiring("swapped", pair, float(llr))
+            yield _WiringFault("swapped", pair, float(llr))
 
     def _classify(self, fibre: int, hypothesis: int, since: int) -> str:
         """Return the kind of fault, by the last presses of the fibre."""

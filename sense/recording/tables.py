@@ -44,7 +44,7 @@ _THOUSANDS = re.compile(r"[-+]?\d{1,3}(,\d{3})+(\.\d*)?")
 
 
 @dataclass(frozen=True)
-class _Layout:
+class _Dialect:
     """How a table is written."""
 
     separator: str
@@ -67,7 +67,7 @@ class Table:
         names: of the columns; numbers from 1 without a header.
         units: of the columns, from a line below the header; "" without.
         rows: first cells of the table, for people.
-        layout: how it is written.
+        dialect: how it is written.
         notes: what was left out in reading, each in one line.
     """
 
@@ -76,14 +76,14 @@ class Table:
     names: list[str]
     units: list[str]
     rows: list[list[str]]
-    layout: _Layout
+    dialect: _Dialect
     notes: list[str] = field(default_factory=list)
     _lines: "array[int]" = field(default_factory=lambda: array("q"))
 
     @property
     def has_header(self) -> bool:
         """Whether a line names the columns."""
-        return self.layout.header > 0
+        return self.dialect.header > 0
 
     def line_number(self, row: int) -> int:
         """Return the number of the line, from 1, that a row was read from."""
@@ -99,20 +99,20 @@ class Table:
         Returns:
             (R, n), NaN where a value is missing; dates as seconds since 1970, or since midnight without a day.
         """
-        layout, width = self.layout, len(self.names)
+        dialect, width = self.dialect, len(self.names)
         numbers, self._lines, self.notes = array("d"), array("q"), []
-        dates: dict[int, list[str]] = {column: [] for column in columns if column in layout.dates}
+        dates: dict[int, list[str]] = {column: [] for column in columns if column in dialect.dates}
         words: dict[int, dict[int, str]] = {column: {} for column in columns}  # by column and line, what is no number
         torn: list[tuple[int, int]] = []
         n_headers, last = 0, 0
         garbled: list[int] = []
-        for line, row in _split(_iterate_lines(self.path, self.encoding, garbled=garbled), layout.separator):
-            if line < layout.first:
+        for line, row in _split(_iterate_lines(self.path, self.encoding, garbled=garbled), dialect.separator):
+            if line < dialect.first:
                 continue
             last = line
             cells = [cell.strip() for cell in row]
             if len(cells) != width and not any(cells[width:]):
-                cells = cells[:width] if len(cells) != layout.width else cells + [""] * (width - layout.width)
+                cells = cells[:width] if len(cells) != dialect.width else cells + [""] * (width - dialect.width)
             if len(cells) != width:
                 torn.append((line, len(cells)))
             elif not any(cells):
@@ -126,7 +126,7 @@ class Table:
                         dates[column].append(cells[column])
                         numbers.append(np.nan)
                         continue
-                    value = _parse(cells[column], layout, column in may_be_unknown)
+                    value = _parse(cells[column], dialect, column in may_be_unknown)
                     if value is None:
                         words[column][line], value = cells[column], np.nan
                     numbers.append(value)
@@ -184,11 +184,11 @@ def read_table(path: Path, encoding: str = "") -> Table:
     """
     encoding = encoding or _find_encoding(check_file(path, MAX_BYTES))
     sample = list(islice(_iterate_lines(path, encoding, comments=True), _N_SAMPLED))
-    layout = _find_layout(sample)
-    blank = [""] * len(layout.names)
-    lines = _split(iter(sample), layout.separator)
-    rows = [[*row, *blank][: len(blank)] for line, row in lines if line >= layout.first]
-    return Table(path, encoding, layout.names, layout.units, rows, layout)
+    dialect = _find_dialect(sample)
+    blank = [""] * len(dialect.names)
+    lines = _split(iter(sample), dialect.separator)
+    rows = [[*row, *blank][: len(blank)] for line, row in lines if line >= dialect.first]
+    return Table(path, encoding, dialect.names, dialect.units, rows, dialect)
 
 
 @contextmanager
@@ -253,7 +253,7 @@ def _split(lines: Iterator[tuple[int, str]], separator: str) -> Iterator[tuple[i
         yield number, row
 
 
-def _find_layout(sample: list[tuple[int, str]]) -> _Layout:
+def _find_dialect(sample: list[tuple[int, str]]) -> _Dialect:
     comments = [(number, line.lstrip("# ")) for number, line in sample if line.startswith("#")]
     lines = [(number, line) for number, line in sample if not line.startswith("#")]
     separator, first = "", 0
@@ -282,7 +282,7 @@ def _find_layout(sample: list[tuple[int, str]]) -> _Layout:
     dates = frozenset(
         i for i, cells in enumerate(columns) if 2 * sum(bool(_DATE.fullmatch(c)) for c in cells) > len(cells)
     )
-    return _Layout(
+    return _Dialect(
         separator,
         has_comma and not has_point,
         header,
@@ -341,11 +341,11 @@ def _is_value(cell: str) -> bool:
     return word in MISSING or word in _TRUTH or word == "?" or _is_number(word) or bool(_DATE.fullmatch(cell.strip()))
 
 
-def _parse(cell: str, layout: _Layout, may_be_unknown: bool) -> float | None:
+def _parse(cell: str, dialect: _Dialect, may_be_unknown: bool) -> float | None:
     """Return the number of a cell, NaN of one that is missing; None of one that is neither."""
     try:
         value = float(cell)
-        if value - value == 0 and "_" not in cell and not (layout.decimal_comma and "." in cell):
+        if value - value == 0 and "_" not in cell and not (dialect.decimal_comma and "." in cell):
             return value  # most cells
     except ValueError:
         pass
@@ -356,11 +356,11 @@ def _parse(cell: str, layout: _Layout, may_be_unknown: bool) -> float | None:
         return _TRUTH[word]
     if word == "?" and may_be_unknown:
         return UNKNOWN
-    if layout.decimal_comma:
+    if dialect.decimal_comma:
         cell = cell.replace(".", "").replace(",", ".")
-    elif _THOUSANDS.fullmatch(cell) and (layout.separator == "," or "." in cell):
+    elif _THOUSANDS.fullmatch(cell) and (dialect.separator == "," or "." in cell):
         cell = cell.replace(",", "")
-    elif layout.separator != ",":
+    elif dialect.separator != ",":
         cell = cell.replace(",", ".")
     try:
         return float(cell) if "_" not in cell else None

@@ -280,7 +280,7 @@ class LivePad:
         self._pad, self._contact, self._rig, self._rate_hz = build_pad(pad, rig), contact, rig, rate_hz
         self._depth_mm = max(rig.press_depths_mm)
         self._responses: dict[tuple[float, float], PressParts[Array]] = {}  # (1, C) of the deepest press, by position
-        self._presses: list[_Press] = []  # the last of them
+        self._presses: list[_PadPress] = []  # the last of them
         self._depth, self._n_read = 0.0, 0
 
     def prepare(self) -> None:
@@ -317,11 +317,11 @@ class LivePad:
     def _touch(self, position_mm: Array, time_s: float) -> None:
         """Begin a press, which takes away residues of earlier ones."""
         response = self._responses[_rounded(position_mm)]
-        press = _Press(position_mm, time_s, time_s, self._gains(1), response, np.zeros_like(response.held))
+        press = _PadPress(position_mm, time_s, time_s, self._gains(1), response, np.zeros_like(response.held))
         self._presses = [*self._presses[-MAX_LAG:], press]
         press.replaced = self._replaced()
 
-    def _slide(self, press: "_Press", position_mm: Array) -> Array:
+    def _slide(self, press: "_PadPress", position_mm: Array) -> Array:
         """Move a press; return which residues (1, C) it takes away there, less those that it gives back.
 
         A press that slides is at any time like one that was made where it is then; it leaves none on its way.
@@ -360,7 +360,7 @@ def _rounded(position_mm: Array) -> tuple[float, float]:
 
 
 @dataclass
-class _Press:
+class _PadPress:
     """A press of a `LivePad`; its response at the full depth."""
 
     position_mm: Array
