@@ -118,7 +118,7 @@ def calibrate(
     training, test = (known[part] for part in split_presses(len(known), options.split, options.test_share, rng))
     made_by = provenance("padforge sense calibrate", options.seed, packages=("torch", "safetensors"))
     made_by |= {"inputs": {"recording": recording.digest}, "recording_kind": recording.source.get("kind")}
-    with stage("train"), one_thread():
+    with stage("train"):
         model = fit_recording(recording, training, options, rng, on_progress, time_budget)
     origin = {"fibre_names": recording.fibre_names, "pad_sha256": recording.pad_digest, "provenance": made_by}
     model = replace(model, split=options.split, test=tuple(test.tolist()), **origin)
@@ -160,6 +160,7 @@ def fit_recording(
     return fit_model(data, training, options, rng, on_progress, time_budget)
 
 
+@one_thread()
 def fit_model(
     data: CalibrationData,
     training: Indices,
