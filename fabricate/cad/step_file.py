@@ -70,7 +70,7 @@ def write_step(path: Path, shape: Compound | Solid) -> None:
 
 
 def _add_parts(tool: Any, node: Any, parent: TDF_Label | None = None) -> Iterator[tuple[Any, Any]]:
-    """Add a node and its children to a document; yield the shape and the colour of every leaf."""
+    """Add a node and its children to a document; yield the shape and the colour of every leaf that has one."""
     if parent is None:
         label = product = tool.AddShape(node.wrapped, False)
     else:
@@ -82,7 +82,7 @@ def _add_parts(tool: Any, node: Any, parent: TDF_Label | None = None) -> Iterato
         yield from _add_parts(tool, child, product)
     if parent is None:
         tool.UpdateAssemblies()
-    if not node.children:
+    if node.color is not None and not node.children:
         yield XCAFDoc_ShapeTool.GetShape_s(product), node.color.wrapped.GetRGB()
 
 
