@@ -94,6 +94,7 @@ PRODUCTS = {
     "filament": ("1.75 mm", "Prusament PLA"),
     "resin": ("for 405 nm; test that silicone cures on it", "Formlabs Clear"),
     "connectors": ("crimped on both ends of a fibre, to wire of 0.14 mm²", "ferrules of 0.25 mm², Weidmüller H0,25"),
+    "wire": ("stranded, 0.14 mm² (AWG 26)", "LiY 0.14 mm²"),
     "resistors": ("metal film, 1 %, 0.25 W", "Yageo MFR-25"),
     "board": (
         "12 or more bits; an input a fibre, 3.3 V",

@@ -264,6 +264,7 @@ def _order_lines(document: Document) -> Iterator[str]:
         "adhesive": f"{sum(document['adhesive']['steps_ml']):.2f} ml",
         "resin" if resin else "filament": f"{order['plastic_g']:.0f} g of {PLASTICS[resin][0]}",
         "connectors": f"{2 * n_fibres}",
+        "wire": f"{2 * n_fibres} pieces, from the pad to the board",
         "resistors": f"{n_fibres}, of the values below",
         "board": f"for {n_fibres} fibres",
     }

@@ -324,17 +324,20 @@ def test_page_has_the_amounts_of_the_document():
 
 def test_page_orders_materials_by_kind_and_estimates_the_work():
     order = section(bench_document(), "Order")
-    assert [row.split(" | ")[:2] for row in order[2:9]] == [
+    assert [row.split(" | ")[:2] for row in order[2:10]] == [
         ["| fibre", "0.23 m of soft thread, 0.35 mm"],
         ["| silicone", "5 g of Goo"],
         ["| adhesive", "0.60 ml"],
         ["| filament", "13 g of PLA"],
         ["| connectors", "4"],
+        ["| wire", "4 pieces, from the pad to the board"],
         ["| resistors", "2, of the values below"],
         ["| board", "for 2 fibres"],
     ]
-    assert order[9].startswith("The fibre includes 17 % for waste. The mould prints in about 1.3 h, by rules of thumb")
-    assert "Laying and sealing by hand takes about 2.3 h, an estimate of 60 minutes a metre and 2 minutes a" in order[9]
+    assert order[10].startswith("The fibre includes 17 % for waste. The mould prints in about 1.3 h, by rules of thumb")
+    assert (
+        "Laying and sealing by hand takes about 2.3 h, an estimate of 60 minutes a metre and 2 minutes a" in order[10]
+    )
 
 
 @pytest.mark.parametrize(("resin", "hours"), [(False, 4.0 * 1000 / (0.4 * 0.1 * 50) / 3600), (True, 80 * 12 / 3600)])
