@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 from padforge.benchmarks.harness import Bench, BenchTrial
 from padforge.design.morphology import Morphology
 from padforge.design.paths.curves import flatten
-from padforge.fabricate.cad.model import FIT_TOLERANCES_MM, assemble, body_solid, mould_parts, write_step
+from padforge.fabricate.cad.model import FIT_TOLERANCES_MM, assemble, body_solid, mould_parts
+from padforge.fabricate.cad.step_file import write_step
 from padforge.fabricate.mesh import mould_mesh
 from padforge.fabricate.mould import INTO_FLOOR_MM, mould_body
 from padforge.fabricate.plan import Plan, offset_box

@@ -139,7 +139,7 @@ def show(morphology: Path, spec: Path | None, out: Path | None) -> None:
     if path.suffix.lower() not in (".svg", ".png"):
         raise InputError(f"--out is {path}, allowed are .svg and .png")
     pad, settings, pad_settings, violations = _load_and_check(morphology, spec)
-    save_figure(draw_plan(pad, read_contact(settings), violations, pad_settings.keep_out_mm), path)
+    save_figure(draw_plan(pad, read_contact(settings), violations, pad_settings.keep_out_corners_mm), path)
     common.echo(f"plan -> {path}")
 
 

@@ -94,7 +94,7 @@ def run_design(
         # checked again: an interrupted search with the same settings may end with another pad
         files.check_replaceable(path, folder / path.name, regenerated, force)
         document["morphology_sha256"] = files.sha256(folder / path.name)
-        figure = draw_plan(designed, contact, result.violations, pad.keep_out_mm)
+        figure = draw_plan(designed, contact, result.violations, pad.keep_out_corners_mm)
         for name in ("design.svg", "design.png"):
             save_figure(figure, folder / name)
         files.write_json(folder / "design.json", document)

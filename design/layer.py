@@ -40,7 +40,7 @@ def reduced_modulus_kpa(modulus_kpa: float) -> float:
 
 
 REDUCED_MODULUS_KPA = reduced_modulus_kpa(55)
-"""E* of EcoFlex 00-20, kPa: modulus at 100 % strain by the manufacturer's data sheet."""
+"""E* of Ecoflex 00-20, kPa: modulus at 100 % strain by the manufacturer's data sheet."""
 FINGER_COMPLIANCE = 1.0
 """Compliance of a fingertip's pulp as a multiple of the pad's: both are tens of kPa soft."""
 TERMS = 16

@@ -272,14 +272,14 @@ def press_sections(
     Args:
         document: its `design.json`; a damaged one raises any of the built-in errors.
         max_strain: elongation that the fibres bear, relative to their length; None if unknown.
-        silicone: name and Young's modulus, kPa; None for EcoFlex 00-20.
+        silicone: name and Young's modulus, kPa; None for Ecoflex 00-20.
     """
     settings = document["provenance"]["settings"]
     contact = Contact(**settings["contact"])
     if contact.model != "layer":
         return []
     press = contact_press(contact)
-    silicone_name, modulus_kpa = silicone or ("EcoFlex 00-20", 55)
+    silicone_name, modulus_kpa = silicone or ("Ecoflex 00-20", 55)
     force_n = press.force_n(reduced_modulus_kpa(modulus_kpa))
     rows = []
     families = zip(FAMILIES, contact.fibre_depths_mm, half_widths_mm(contact), fibre_strains(contact), strict=True)

@@ -6,9 +6,9 @@ from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from itertools import pairwise
-from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, TypeGuard
 
-from pydantic import BeforeValidator, Field, ValidationInfo, field_validator, model_validator
+from pydantic import BeforeValidator, Discriminator, Field, Tag, ValidationInfo, field_validator, model_validator
 
 from padforge.common.settings import Settings, Spec, as_tuple, null_as, to_builtins, validate
 from padforge.common.validation import InputError, check_float, check_int, short_repr
@@ -134,8 +134,10 @@ class Layout:
     def settings(self) -> Mapping[str, Any]:
         """The layout as keys of `[pad]`."""
         if self.horizontals == self.verticals:
-            return {"grid": self.horizontals, "horizontals": "grid", "verticals": "grid", "pitch_mm": self.pitch_mm}
-        return {"horizontals": self.horizontals, "verticals": self.verticals, "pitch_mm": self.pitch_mm}
+            counts = {"grid": self.horizontals, "horizontals": "grid", "verticals": "grid"}
+        else:
+            counts = {"horizontals": self.horizontals, "verticals": self.verticals}
+        return counts | {"pitch_mm": self.pitch_mm, "size_mm": "pitch"}
 
     def __str__(self) -> str:
         """Describe the layout: `4 + 4 fibres, pitch 11.25 mm`."""
@@ -581,7 +583,23 @@ Sensed = tuple[Millimetres, Millimetres] | Literal["beyond", "fibres"]
 Rectangle = tuple[tuple[float, float], tuple[float, float]]  # low and high corner, grid units
 Coordinate = Annotated[float, Field(ge=-1e6, le=1e6)]
 Corners = tuple[tuple[Coordinate, Coordinate], ...]  # corners of a polygon, mm from the middle of the pad
+Hole = tuple[Coordinate, ...]  # centre x and y, diameter, and diameter of a screw's head if it has one, mm
+KeepOut = Corners | Hole
+
+
+def is_hole(keep_out: KeepOut) -> TypeGuard[Hole]:
+    """Return whether a keep-out is a round hole, no polygon."""
+    return isinstance(keep_out, tuple) and len(keep_out) > 0 and isinstance(keep_out[0], int | float)
+
+
+_StatedKeepOut = Annotated[
+    Annotated[Corners, Tag("corners")] | Annotated[Hole, Field(min_length=3, max_length=4), Tag("hole")],
+    Discriminator(lambda shape: "hole" if is_hole(shape) else "corners"),
+    BeforeValidator(_as_tuples),
+]
 BentRadius = Annotated[Annotated[float, Field(ge=1, le=1e6)] | None, *null_as("flat")]
+_HOLE_SIDES = 64
+"""Sides of the polygon that stands for a round hole where paths and presses avoid it."""
 Count = Annotated[Annotated[int, Field(ge=0, le=256)] | None, *null_as("grid")]
 PitchMm = Annotated[float, Field(ge=0.1, le=1000)]
 
@@ -631,9 +649,13 @@ class PadSettings(Settings):
         horizontals: `grid` if None; with 0 the pad is a strip one pitch wide, and the verticals run across it.
         verticals: in the same way.
         leads: "one side" is the lower edge, for a connector; leads come down beside the pad, nested.
+        size_mm: of the pad from fibre end to fibre end, in place of `pitch_mm`, which follows from it: the model holds
+            the pitch alone. `[mould] border_mm` and leads to one side add to it.
         sensed_mm: as of `sensed_rectangle`, at most the pad's size. Designs are for presses there.
         keep_out_mm: holes, screws, a connector. Each polygon has 3 corners or more and an area, does not cross itself,
-            and lies on the pad at least in part.
+            and lies on the pad at least in part. A hole is round and lies on the pad wholly; with a fourth number, the
+            diameter of a screw's head, all of that is kept free, and the head sinks into the pad by half of its
+            thickness, on the face with the tracks.
         bent_radius_mm: None for a flat pad. It is cast flat in either case.
     """
 
@@ -642,6 +664,9 @@ class PadSettings(Settings):
     verticals: Count = Field(default=None, description='fibres along y, or as "grid"; 0: a strip of fibres across it')
     pitch_mm: Annotated[PitchMm | tuple[PitchMm, PitchMm], BeforeValidator(_check_pitches)] = Field(
         default=DEFAULT_PITCH_MM, description="distance of neighbouring fibre ends, mm, or [along x, along y]"
+    )
+    size_mm: Annotated[tuple[Millimetres, Millimetres] | None, BeforeValidator(as_tuple), *null_as("pitch")] = Field(
+        default=None, description='[width, height] of the pad, mm, in place of pitch_mm; or by its "pitch"'
     )
     deep_family: Literal["horizontal", "vertical"] = Field(
         default="horizontal", description="family whose tracks lie deeper in the silicone and are laid first"
@@ -652,9 +677,10 @@ class PadSettings(Settings):
     sensed_mm: Annotated[Sensed, BeforeValidator(_check_sensed)] = Field(
         default="beyond", description='pressed [width, height], mm; half a pitch "beyond" fibres, or between "fibres"'
     )
-    keep_out_mm: Annotated[
-        tuple[Annotated[Corners, BeforeValidator(_as_tuples)], ...], Field(max_length=64), BeforeValidator(as_tuple)
-    ] = Field(default=(), description="polygons [[x, y], ...] from the middle, mm, that no fibre enters")
+    keep_out_mm: Annotated[tuple[_StatedKeepOut, ...], Field(max_length=64), BeforeValidator(as_tuple)] = Field(
+        default=(),
+        description="what no fibre enters: holes [x, y, diameter], polygons [[x, y], ...]; from the middle, mm",
+    )
     bent_radius_mm: BentRadius = Field(default=None, description='radius of a cylinder about y it is on, mm, or "flat"')
 
     @property
@@ -667,6 +693,11 @@ class PadSettings(Settings):
         """`sensed_rectangle` of this pad, grid units."""
         return sensed_rectangle(self.layout, self.sensed_mm)
 
+    @property
+    def keep_out_corners_mm(self) -> tuple[Corners, ...]:
+        """Polygons of all keep-outs; those of holes, or of their screws' heads, are regular ones around the circle."""
+        return tuple(_hole_corners(shape) if is_hole(shape) else shape for shape in self.keep_out_mm)
+
     def for_layout(self, layout: Layout) -> "PadSettings":
         """Return these settings for a pad of another layout.
 
@@ -677,6 +708,32 @@ class PadSettings(Settings):
             InputError: a setting that does not fit that pad.
         """
         return type(self)(**{**self.model_dump(), **layout.settings})
+
+    @model_validator(mode="before")
+    @classmethod
+    def _size_to_pitch(cls, stated: object) -> object:
+        """Replace a size by the pitches that make a pad of it; the fields refuse what is no size, or no count."""
+        stated = to_builtins(stated)  # `Settings` does so later
+        if not isinstance(stated, Mapping) or not isinstance(size_mm := stated.get("size_mm"), list | tuple):
+            return stated
+        if "pitch_mm" in stated:
+            pitch = f"pitch_mm is {short_repr(stated['pitch_mm'])}"
+            raise ValueError(f"size_mm is {short_repr(size_mm)} and {pitch}, allowed is one of them")
+        grid = stated.get("grid", cls.model_fields["grid"].default)
+        counts = [
+            grid if (count := stated.get(name)) in (None, "grid") else count for name in ("verticals", "horizontals")
+        ]
+        if len(size_mm) != 2 or not all(
+            isinstance(number, int | float) and number >= 0 for number in (*size_mm, *counts)
+        ):
+            return stated
+        pitches = tuple(side / (count + 1) for side, count in zip(size_mm, counts, strict=True))
+        if not all(0.1 <= pitch <= 1000 for pitch in pitches):
+            apart = " and ".join(f"{pitch:.3g}" for pitch in pitches)
+            raise ValueError(
+                f"size_mm is {short_repr(size_mm)}, which makes pitches of {apart} mm, allowed is 0.1 to 1000"
+            )
+        return {**stated, "size_mm": None, "pitch_mm": pitches}
 
     @model_validator(mode="after")
     def _check_fibres(self) -> "PadSettings":
@@ -696,24 +753,49 @@ class PadSettings(Settings):
 
     @field_validator("keep_out_mm")
     @classmethod
-    def _check_polygons(cls, keep_out_mm: tuple[Corners, ...], info: ValidationInfo) -> tuple[Corners, ...]:
-        if not keep_out_mm:
-            return keep_out_mm
-        import shapely  # takes a while, and few pads have keep-outs
-
+    def _check_keep_outs(cls, keep_out_mm: tuple[KeepOut, ...], info: ValidationInfo) -> tuple[KeepOut, ...]:
         layout = _validated_layout(info.data)
         width, height = layout.size_mm if layout else (2e6, 2e6)  # of a refused layout: all that coordinates reach
-        pad = shapely.box(-width / 2, -height / 2, width / 2, height / 2)
-        for number, corners in enumerate(keep_out_mm, 1):
-            if not 3 <= len(corners) <= 1000:
-                raise ValueError(f"polygon {number} has {len(corners)} corners, allowed are 3 to 1000")
-            polygon = shapely.Polygon(corners)
-            if not polygon.is_valid or polygon.area == 0:
-                raise ValueError(f"polygon {number} crosses or touches itself or has no area")
-            if not polygon.intersects(pad):
-                size = f"{width:g} by {height:g} mm about (0, 0)"
-                raise ValueError(f"polygon {number} lies beside the pad, which is {size}")
+        size = f"the pad, which is {width:g} by {height:g} mm about (0, 0)"
+        for number, shape in enumerate(keep_out_mm, 1):
+            if is_hole(shape):
+                x, y, *diameters = shape
+                if min(diameters) < 0.1 or diameters != sorted(diameters):
+                    allowed = "allowed are diameters from 0.1 mm, of a head no less than of its hole"
+                    raise ValueError(f"hole {number} is {short_repr(shape)}, {allowed}")
+                if max(abs(x) - width / 2, abs(y) - height / 2) + diameters[-1] / 2 > 1e-9:
+                    raise ValueError(f"hole {number} reaches beyond {size}")
+            else:
+                _check_polygon(shape, number, width, height, size)
         return keep_out_mm
+
+
+def scale_keep_out(keep_out: KeepOut, factor: float) -> KeepOut:
+    """Return a keep-out that is larger by a factor about the middle of the pad."""
+    if is_hole(keep_out):
+        return tuple(factor * number for number in keep_out)
+    return tuple((factor * x, factor * y) for x, y in keep_out)
+
+
+def _hole_corners(hole: Hole) -> Corners:
+    """Return the corners of the regular polygon around a hole, or around its screw's head."""
+    x, y, *diameters = hole
+    radius = diameters[-1] / 2 / math.cos(math.pi / _HOLE_SIDES)
+    angles = [2 * math.pi * side / _HOLE_SIDES for side in range(_HOLE_SIDES)]
+    return tuple((x + radius * math.cos(angle), y + radius * math.sin(angle)) for angle in angles)
+
+
+def _check_polygon(corners: Corners, number: int, width: float, height: float, size: str) -> None:
+    """Refuse a polygon that has no area, or none on a pad of a width and height, mm."""
+    import shapely  # takes a while, and few pads have keep-outs
+
+    if not 3 <= len(corners) <= 1000:
+        raise ValueError(f"polygon {number} has {len(corners)} corners, allowed are 3 to 1000")
+    polygon = shapely.Polygon(corners)
+    if not polygon.is_valid or polygon.area == 0:
+        raise ValueError(f"polygon {number} crosses or touches itself or has no area")
+    if not polygon.intersects(shapely.box(-width / 2, -height / 2, width / 2, height / 2)):
+        raise ValueError(f"polygon {number} lies beside {size}")
 
 
 def _layout(fields: Mapping[str, Any]) -> Layout:

@@ -1,8 +1,7 @@
 """Building a mould and writing its files: meshes, CAD, drawings, programs, laying page and fabrication document.
 
-The same inputs give the same bytes, but for the order of colours in a STEP file, which is the CAD kernel's. Everything
-is built and checked before the first file is written, and the files appear together or not at all. A new export format
-is a line in `FORMATS`, and its writer.
+The same inputs give the same bytes. Everything is built and checked before the first file is written, and the files
+appear together or not at all. A new export format is a line in `FORMATS`, and its writer.
 """
 
 import logging
@@ -162,7 +161,8 @@ def _draw_mould_png(fabrication: Fabrication, path: Path) -> None:
 
 
 def _write_cad(fabrication: Fabrication, path: Path) -> None:
-    from padforge.fabricate.cad.model import assemble, write_step
+    from padforge.fabricate.cad.model import assemble
+    from padforge.fabricate.cad.step_file import write_step
 
     write_step(path, assemble(fabrication.cad_parts, fabrication.plan.shrinkage_compensated))
 

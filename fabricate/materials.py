@@ -1,7 +1,11 @@
 """Materials: `[silicone]`, which a pad is cast of, `[fibre]`, which is placed in it, and the plastics of its mould.
 
-Data of silicones are from the maker's technical bulletins (Smooth-On), at room temperature; those of the published
-pads from the paper. None is unknown, and what follows from it is omitted. A new material is one line in its table.
+Data of silicones are from the maker's technical bulletins, at room temperature; those of the published pads from the
+paper. None is unknown, and what follows from it is omitted. A new material is one line in its table.
+
+- Smooth-On, Ecoflex Series, technical bulletin, https://www.smooth-on.com/tb/files/ECOFLEX_SERIES_TB.pdf
+- Smooth-On, Dragon Skin Series, technical bulletin, https://www.smooth-on.com/tb/files/DRAGON_SKIN_SERIES_TB.pdf
+- Adafruit, Conductive Rubber Cord Stretch Sensor, https://www.adafruit.com/product/519
 """
 
 import math
@@ -61,20 +65,20 @@ class Fibre:
 
 _EQUAL = (1.0, 1.0)
 _SHRINKAGE = 0.001
-"""The bulletins say "< 0.001 in/in" for every grade here: the maximum."""
-_GRADES = (
-    Silicone("EcoFlex 00-10", 1.04, _EQUAL, 30, 4, _SHRINKAGE, 55),
-    Silicone("EcoFlex 00-20", 1.07, _EQUAL, 30, 4, _SHRINKAGE, 55),
-    Silicone("EcoFlex 00-30", 1.07, _EQUAL, 45, 4, _SHRINKAGE, 69),
-    Silicone("EcoFlex 00-50", 1.07, _EQUAL, 18, 3, _SHRINKAGE, 83),
-    Silicone("Dragon Skin 10 fast", 1.07, _EQUAL, 8, 1.25, _SHRINKAGE, 151),
-    Silicone("Dragon Skin 10 medium", 1.07, _EQUAL, 20, 5, _SHRINKAGE, 151),
-    Silicone("Dragon Skin 10 slow", 1.07, _EQUAL, 45, 7, _SHRINKAGE, 151),
+"""The bulletins say "< .001 in./in." for every grade here: the maximum."""
+_GRADES = (  # moduli are 8, 8, 10 and 12 psi, then 22, 49 and 86 psi in the bulletins
+    Silicone("Ecoflex 00-10", 1.04, _EQUAL, 30, 4, _SHRINKAGE, 55),
+    Silicone("Ecoflex 00-20", 1.07, _EQUAL, 30, 4, _SHRINKAGE, 55),
+    Silicone("Ecoflex 00-30", 1.07, _EQUAL, 45, 4, _SHRINKAGE, 69),
+    Silicone("Ecoflex 00-50", 1.07, _EQUAL, 18, 3, _SHRINKAGE, 83),
+    Silicone("Dragon Skin 10 Fast", 1.07, _EQUAL, 8, 1.25, _SHRINKAGE, 152),
+    Silicone("Dragon Skin 10 Medium", 1.07, _EQUAL, 20, 5, _SHRINKAGE, 152),
+    Silicone("Dragon Skin 10 Slow", 1.07, _EQUAL, 45, 7, _SHRINKAGE, 152),
     Silicone("Dragon Skin 20", 1.08, _EQUAL, 25, 4, _SHRINKAGE, 338),
     Silicone("Dragon Skin 30", 1.08, _EQUAL, 45, 16, _SHRINKAGE, 593),
 )
 SILICONES = {PUBLISHED: replace(_GRADES[1], shrinkage=0.0), **{grade.name: grade for grade in _GRADES}}
-"""Presets by name; "published": EcoFlex 00-20 in moulds of the pad's size, as the published pads were cast."""
+"""Presets by name; "published": Ecoflex 00-20 in moulds of the pad's size, as the published pads were cast."""
 
 _CORD = Fibre("conductive rubber cord 2 mm", 2.0, ohm_per_mm=350 / 25.4, max_strain=0.5)
 FIBRES = {PUBLISHED: Fibre("carbon-black TPE", 0.3, max_strain=0.8), _CORD.name: _CORD}
@@ -85,11 +89,12 @@ PLASTICS = {False: ("PLA", 1.24), True: ("resin", 1.1)}
 
 PRODUCTS = {
     "fibre": ("conductive and elastic", "Adafruit 519, cord of 2 mm; thinner ones are extruded from carbon-black TPE"),
-    "silicone": ("two parts, cures at room temperature", "grades of Smooth-On EcoFlex and Dragon Skin"),
+    "silicone": ("two parts, cures at room temperature", "grades of Smooth-On Ecoflex and Dragon Skin"),
     "adhesive": ("one part, sticks to cured silicone", "Smooth-On Sil-Poxy, DOWSIL 732"),
     "filament": ("1.75 mm", "Prusament PLA"),
     "resin": ("for 405 nm; test that silicone cures on it", "Formlabs Clear"),
     "connectors": ("crimped on both ends of a fibre, to wire of 0.14 mm²", "ferrules of 0.25 mm², Weidmüller H0,25"),
+    "wire": ("stranded, 0.14 mm² (AWG 26)", "LiY 0.14 mm²"),
     "resistors": ("metal film, 1 %, 0.25 W", "Yageo MFR-25"),
     "board": (
         "12 or more bits; an input a fibre, 3.3 V",
@@ -157,7 +162,7 @@ class SiliconeSettings(_MaterialSettings):
 
     name: Name = Field(
         default=PUBLISHED,
-        description=f"{', '.join(SILICONES)}; published: EcoFlex 00-20 in a mould as large as the pad",
+        description=f"{', '.join(SILICONES)}; published: Ecoflex 00-20 in a mould as large as the pad",
     )
     density_g_per_ml: PositiveOrPreset = Field(
         default=None, le=30, description='density, g/ml; "preset": as of the name'

@@ -6,6 +6,7 @@ from collections.abc import Iterable
 from importlib.metadata import version
 from io import BytesIO
 from pathlib import Path
+from xml.etree import ElementTree
 from xml.sax.saxutils import escape, quoteattr
 
 import numpy as np
@@ -135,7 +136,7 @@ def write_3mf(path: Path, vertices: np.ndarray, triangles: np.ndarray, *, name: 
 
 
 def read_mesh(path: Path) -> tuple[Array, Numbers]:
-    """Read vertices (n, 3), mm, and triangles (m, 3), m > 0, of a .stl or .3mf, all objects of a 3MF together.
+    """Read vertices (n, 3), mm, and triangles (m, 3), m > 0, of a .stl or .3mf, all that is printed of a 3MF together.
 
     An STL counts as mm; a 3MF states its unit.
 
@@ -151,16 +152,45 @@ def read_mesh(path: Path) -> tuple[Array, Numbers]:
     return vertices, triangles
 
 
-def _without_tail(path: Path) -> BytesIO:
+def _without_tail(path: Path) -> bytes:
     """Return a file without the stray bytes at the end of a binary STL, for which trimesh takes it for text."""
     content = path.read_bytes()
-    if path.suffix.lower() == ".stl":
-        n_bytes = _STL_HEAD_BYTES + _STL_RECORD.itemsize * int.from_bytes(content[80:_STL_HEAD_BYTES], "little")
-        stray = len(content) - n_bytes
-        if n_bytes > _STL_HEAD_BYTES and 0 < stray < _STL_RECORD.itemsize:
-            _log.warning("%s: %d stray bytes at its end are left out", path, stray)
-            content = content[:n_bytes]
-    return BytesIO(content)
+    n_bytes = _STL_HEAD_BYTES + _STL_RECORD.itemsize * int.from_bytes(content[80:_STL_HEAD_BYTES], "little")
+    stray = len(content) - n_bytes
+    if n_bytes > _STL_HEAD_BYTES and 0 < stray < _STL_RECORD.itemsize:
+        _log.warning("%s: %d stray bytes at its end are left out", path, stray)
+        content = content[:n_bytes]
+    return content
+
+
+def _is_printed(part: ElementTree.Element) -> bool:
+    """Return whether a slicer prints an object, or an item of the build; true for all else that a 3MF has."""
+    if part.tag.endswith("}object"):
+        return part.get("type", "model") == "model"
+    return not (part.tag.endswith("}item") and part.get("printable", "1") in ("0", "false"))
+
+
+def _without_unprinted(path: Path) -> bytes:
+    """Return a 3MF without what slicers do not print: items set so, supports, modifiers and all else that is no model.
+
+    trimesh reads the objects of all build items, whatever their kind.
+    """
+    content, count = BytesIO(), 0
+    with zipfile.ZipFile(path) as package, zipfile.ZipFile(content, "w") as printed:
+        for name in package.namelist():
+            part = package.read(name)
+            if name.lower().endswith(".model"):
+                model = ElementTree.fromstring(part)
+                parts = [(node, child) for node in model for child in node]
+                unprinted = [(node, child) for node, child in parts if not _is_printed(child)]
+                for node, child in unprinted:
+                    node.remove(child)
+                count += len(unprinted)
+                part = ElementTree.tostring(model) if unprinted else part
+            printed.writestr(name, part)
+    if count:
+        _log.warning("%s: %d objects that are not printed are left out", path, count)
+    return content.getvalue()
 
 
 def _read_by_trimesh(path: Path) -> tuple[Array, Numbers]:
@@ -171,7 +201,9 @@ def _read_by_trimesh(path: Path) -> tuple[Array, Numbers]:
     try:
         with np.errstate(all="ignore"):
             # processing would drop triangles with NaN
-            scene = trimesh.load_scene(_without_tail(path), file_type=path.suffix[1:].lower(), process=False)
+            kind = path.suffix[1:].lower()
+            content = {"stl": _without_tail, "3mf": _without_unprinted}.get(kind, Path.read_bytes)(path)
+            scene = trimesh.load_scene(BytesIO(content), file_type=kind, process=False)
             if scene.units:
                 scene = scene.convert_units("millimeters")
             mesh = scene.to_mesh()

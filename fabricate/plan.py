@@ -29,7 +29,7 @@ from padforge.design.paths.curves import (
     trace_curve,
 )
 from padforge.design.paths.keep_outs import keep_outs
-from padforge.design.settings import Layout
+from padforge.design.settings import Layout, is_hole
 from padforge.fabricate.leads import Lead, Leads, lead_spacing, one_side_leads, straight_leads
 from padforge.fabricate.settings import DEFAULTS, FabricationSettings
 
@@ -130,7 +130,7 @@ def _position_numbers(plan: "Plan", numbers: Sequence[BaseGeometry]) -> list[Bas
     mould, lines = plan.settings.mould, plan.lines
     clearance = mould.ridge_width_mm / 2 + plan.heights_mm[-1] * plan.settings.ridge_slope + mould.min_silicone_mm
     reach = min(plan.min_pitch_mm, _NUMBER_DISTANCE * mould.number_mm)
-    floor, occupied = plan.cavity.difference(plan.pillars).buffer(-clearance, join_style="mitre"), []
+    floor, occupied = plan.cavity.difference(plan.feet).buffer(-clearance, join_style="mitre"), []
     shapely.prepare([*lines, floor])
     positioned: list[BaseGeometry | None] = []
     ahead, aside = np.arange(0, reach, _NUMBER_STEP_MM), np.arange(-reach / 2, reach / 2, _NUMBER_STEP_MM)
@@ -433,7 +433,12 @@ class Plan:
         if not self.settings.pad.keep_out_mm:
             return shapely.MultiPolygon()
         into_mm = self.flare_mm + INTO_WALL_MM
-        outlines = shapely.union_all([shapely.Polygon(corners) for corners in self.settings.pad.keep_out_mm])
+        outlines = shapely.union_all(
+            [
+                self._disc(*keep_out[:3]) if is_hole(keep_out) else shapely.Polygon(keep_out)
+                for keep_out in self.settings.pad.keep_out_mm
+            ]
+        )
         outlines = outlines.intersection(self.cavity.buffer(into_mm, join_style="mitre"))
         low, high = np.reshape(self.cavity.bounds, (2, 2))
         for axis in (0, 1):  # one after the other, so that corners are filled as well
@@ -449,11 +454,33 @@ class Plan:
             low[axis], high[axis] = low[axis] - into_mm, high[axis] + into_mm
         return areas(shapely.set_precision(outlines, SNAP_MM))
 
+    def _disc(self, x: float, y: float, diameter_mm: float) -> shapely.Polygon:
+        """Return the outline of a round hole, mm."""
+        radius = diameter_mm / 2
+        chord = 2 * math.acos(max(0.5, 1 - _ARC_SHARE * self.settings.mould.tolerance_mm / radius))
+        return shapely.Point(x, y).buffer(radius, quad_segs=math.ceil(math.pi / 2 / chord))
+
+    @cached_property
+    def heads(self) -> list[shapely.Polygon]:
+        """Outlines of the heads of screws, mm, which sink into the pad around their holes."""
+        holes = [keep_out for keep_out in self.settings.pad.keep_out_mm if is_hole(keep_out)]
+        return [self._disc(hole[0], hole[1], hole[3]) for hole in holes if len(hole) > 3]
+
+    @property
+    def head_mm(self) -> float:
+        """Depth to which the heads of screws sink into the pad, mm: half of its thickness."""
+        return self.silicone_mm / 2
+
+    @cached_property
+    def feet(self) -> BaseGeometry:
+        """Outlines of the pillars at the floor, mm, where those of screws with heads are wider."""
+        return shapely.union_all([self.pillars, *self.heads])
+
     @cached_property
     def silicone(self) -> BaseGeometry:
         """Area that the silicone fills at the floor, exits included, mm."""
         area = shapely.union_all([self.cavity, *self.exits])
-        return without(area, self.pillars) if self.pillars.area else area
+        return without(area, self.feet) if self.feet.area else area
 
     @property
     def flare_mm(self) -> float:

@@ -18,6 +18,7 @@ from padforge.design.settings import (
     RulesSettings,
     fill_cast,
     read_contact,
+    scale_keep_out,
 )
 
 from .materials import FibreSettings, SiliconeSettings
@@ -221,7 +222,7 @@ class FabricationSettings:
         for keys in (ridges, depth):
             if all(self.printer.is_whole_layers(getattr(self.mould, key)) for key in keys):
                 larger |= {key: round(round(larger[key] / layer) * layer, 9) for key in keys}
-        keep_outs = tuple(tuple((x / factor, y / factor) for x, y in corners) for corners in self.pad.keep_out_mm)
+        keep_outs = tuple(scale_keep_out(keep_out, 1 / factor) for keep_out in self.pad.keep_out_mm)
         return replace(
             self,
             mould=self.mould.model_copy(update=larger),

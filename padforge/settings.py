@@ -21,7 +21,7 @@ SECTIONS = {
 }
 """Sections of a `pad.toml`, and the model of each."""
 
-_LAYOUT_KEYS = {"grid", "horizontals", "verticals", "pitch_mm"}
+_LAYOUT_KEYS = {"grid", "horizontals", "verticals", "pitch_mm", "size_mm"}
 
 
 def section_models() -> "dict[str, type[Settings]]":

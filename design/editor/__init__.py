@@ -229,7 +229,7 @@ class EditSession:
             "mirrored": False,
             "deep_family": int(self._pad_settings.deep_family == "vertical"),
             "sensed_mm": [*low.tolist(), *high.tolist()],
-            "keep_out_mm": self._pad_settings.keep_out_mm,
+            "keep_out_mm": self._pad_settings.keep_out_corners_mm,
             "positions_mm": positions_mm.round(3).tolist(),
             "cell_mm": [_lattice_step(column) for column in positions_mm.T],
             "straight_mm": self._ambiguity_mm(straight).mean(axis=1).tolist(),

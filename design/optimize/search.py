@@ -55,7 +55,7 @@ GRACE_S = 10.0
 """After a deadline, for running slices: one takes a second or so, but an executor may hang."""
 MAX_SECONDS = 1e9
 """Longest time budget: some thirty years."""
-LAYOUT_KEYS = ("grid", "horizontals", "verticals", "pitch_mm")
+LAYOUT_KEYS = ("grid", "horizontals", "verticals", "pitch_mm", "size_mm")
 """Keys of `[pad]` that say where fibres end."""
 TOLERANCE = 1.03
 """Ratio of errors, to the better of the default pad and straight fibres, that counts as equal: expected errors are no
@@ -380,6 +380,8 @@ def settings_for_twin(spec: "Spec", path: Path, pad: Morphology | None = None) -
         raise InputError(f"{spec.source}: [contact] is given beside {path}, which has one of its own; leave one out")
     layout = twin.morphology.layout
     keys = {**layout.settings, **{key: stated[key] for key in LAYOUT_KEYS if key in stated}}
+    if "size_mm" in stated and "pitch_mm" not in stated:
+        del keys["pitch_mm"]  # follows from the size
     if pad is not None:
         keys = {**pad.layout.settings}
     size = spec.section(PadSettings, **keys, sensed_mm="beyond").layout

@@ -15,16 +15,16 @@ _LENGTH = 1.5  # length of the transition to a lane, relative to the shortest on
 
 
 def keep_outs(pad: PadSettings) -> list[Polygon]:
-    """Return the polygons of `[pad] keep_out_mm` in grid units from the pad's corner."""
+    """Return the polygons of `[pad] keep_out_mm`, round holes too, in grid units from the pad's corner."""
     scale, middle = pad.layout.unit_mm, np.array(pad.layout.extent) / 2
-    return [Polygon(np.array(corners) / scale + middle) for corners in pad.keep_out_mm]
+    return [Polygon(np.array(corners) / scale + middle) for corners in pad.keep_out_corners_mm]
 
 
 def check_fibre_ends(pad: PadSettings, rules: RulesSettings) -> None:
     """Refuse keep-outs too near to fibre ends, which cannot move.
 
     Raises:
-        InputError: naming the polygon, the fibre and the position of its end.
+        InputError: naming the keep-out, the fibre and the position of its end.
     """
     layout = pad.layout
     for number, polygon in enumerate(keep_outs(pad), 1):
@@ -37,7 +37,7 @@ def check_fibre_ends(pad: PadSettings, rules: RulesSettings) -> None:
                     x, y = (np.array(end) - np.array(layout.extent) / 2) * layout.unit_mm
                     end_name = f"an end of fibre {fibre + 1}, at ({x:.4g}, {y:.4g}) mm"
                     allowed = f"{rules.keep_out_mm:g} or more ([rules] keep_out_mm)"
-                    error = f"polygon {number} is {distance_mm:.3g} mm from {end_name}, allowed is {allowed}"
+                    error = f"keep-out {number} is {distance_mm:.3g} mm from {end_name}, allowed is {allowed}"
                     raise InputError(f"[pad] keep_out_mm: {error}")
 
 

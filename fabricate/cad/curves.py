@@ -35,6 +35,9 @@ _STRAIGHT_MM = 1e-3
 """An edge with a larger sagitta is straight: chords of drawn curves have a several times smaller one."""
 _ARC_TOLERANCE_MM = 1e-4
 """Tolerance of arcs and straight runs."""
+_KNOT_DECIMALS, _LEAST_SPAN_MM = 4, 1e-3
+"""Decimals of knots, mm, and their least distance from the ends: more decimals would only lengthen a STEP file, and
+their last ones depend on where arrays lie in memory."""
 _SAMPLES, _SAMPLE_MM = 4, 0.1
 """A fit is checked at as many places of every edge, and at least as densely: between far vertices it might stray."""
 _ALONG = 20
@@ -46,8 +49,8 @@ class OutlineCurve:
     """A smooth run of an outline: a straight line unless it has an arc or a spline.
 
     Attributes:
-        points: vertices, of a straight run its two ends; shape (n, 2).
-        spline: cubic spline over the arc length along the vertices; None for lines and arcs.
+        points: vertices, of a straight run and a spline its two ends; shape (n, 2).
+        spline: cubic spline over about its arc length; None for lines and arcs.
         arc: arc; None for lines and splines.
     """
 
@@ -137,12 +140,8 @@ def _smooth_curves(points: Array, tangents: Sequence[Array | None], fit_mm: floa
     start, end = tangents
     start = _end_tangent(s, points) if start is None else start
     end = -_end_tangent(s[-1] - s[::-1], points[::-1]) if end is None else end
-    curve = fit_spline(points, (start, end), fit_mm)
-    # at vertices, so that a part may have a span more where its cut lies between two
-    cuts = sorted({0, *np.searchsorted(s, split_parameters(curve)).tolist(), len(s) - 1})
-    for first, last in pairwise(cuts):
-        part = trim_spline(curve, s[first], s[last])
-        yield OutlineCurve(points[first : last + 1], spline=BSpline(part.t - part.t[0], part.c, 3))
+    for part in cut_spline(fit_spline(points, (start, end), fit_mm)):
+        yield OutlineCurve(part.c[[0, -1]], spline=part)
 
 
 def _end_tangent(s: Array, points: Array) -> Array:
@@ -175,10 +174,10 @@ def fit_arc(points: Array) -> Arc | None:
 
 
 def fit_spline(points: Array, tangents: Sequence[Array], fit_mm: float) -> BSpline:
-    """Fit the cubic spline of about the fewest spans that follows a polyline, over its arc length.
+    """Fit a cubic spline of few spans that follows a polyline, over its arc length.
 
-    Interpolation through sites, halved where it strays, shows how densely knots are needed. With knots as dense in
-    proportion, fewer and fewer by bisection, the inner poles are then least-squares fits.
+    Interpolation through sites, halved where it strays, shows how densely knots are needed. The inner poles are then
+    least-squares fits, and every knot without which the spline does not stray is left out.
 
     Args:
         points: vertices; shape (n, 2), n > 2; the ends are exact.
@@ -186,6 +185,7 @@ def fit_spline(points: Array, tangents: Sequence[Array], fit_mm: float) -> BSpli
         fit_mm: tolerance against the whole polyline.
     """
     s, samples, normals, vertices = _sample_edges(points)
+    s *= max(np.round(s[-1], _KNOT_DECIMALS), _LEAST_SPAN_MM) / s[-1]
 
     def fit(knots: Array, rows: NDArray[np.intp] | slice) -> tuple[BSpline, NDArray[np.bool_]]:
         """Fit a spline to some samples; tell at which of all it is within the tolerance."""
@@ -205,15 +205,14 @@ def fit_spline(points: Array, tangents: Sequence[Array], fit_mm: float) -> BSpli
         if not bad:
             break
         sites = np.union1d(sites, [_next_site(a, b, vertices) for a, b in bad])
-    low, high = (len(sites) - 1) // 3, len(sites) - 1  # spans: too few, and enough
-    while high - low > 1:
-        spans = (low + high) // 2
-        knots = np.interp(np.linspace(0, 1, spans + 1), np.linspace(0, 1, len(sites)), s[sites])
-        curve, near = fit(knots, slice(None))
+    inner = np.unique(np.round(s[sites], _KNOT_DECIMALS))
+    inner = inner[(inner > _LEAST_SPAN_MM) & (inner < s[-1] - _LEAST_SPAN_MM)]
+    knots = np.concatenate([s[:1], inner, s[-1:]])
+    for knot in (np.nan, *knots[1:-1]):  # none, then one after the other
+        fewer = knots[knots != knot]
+        curve, near = fit(fewer, slice(None))
         if near.all():
-            best, high = curve, spans
-        else:
-            low = spans
+            best, knots = curve, fewer
     return best
 
 
@@ -248,26 +247,16 @@ def _sample_edges(points: Array) -> tuple[Array, Array, Array, NDArray[np.intp]]
     return s[edge] + fraction * length[edge], points[edge] + fraction[:, None] * edges[edge], normals[edge], vertices
 
 
-def split_parameters(curve: BSpline) -> Array:
-    """Return the inner knots at which a spline is cut so that no part has more than `MAX_SPANS` spans."""
+def cut_spline(curve: BSpline) -> Iterator[BSpline]:
+    """Yield the parts of a cubic spline, each from 0, cut at knots so that none has more than `MAX_SPANS` spans."""
     knots = np.unique(curve.t)
     parts = -(-(len(knots) - 1) // MAX_SPANS)
-    return knots[np.linspace(0, len(knots) - 1, parts + 1).round().astype(int)[1:-1]]
-
-
-def trim_spline(curve: BSpline, start: float, end: float) -> BSpline:
-    """Return the part of a cubic spline between two parameters, by knot insertion."""
-    span = int(np.searchsorted(curve.t, start, side="right")) - 1
-    if curve.t[span] < start < end < curve.t[span + 1]:  # one Bezier segment, from its ends and their derivatives
-        (first, last), (rise, fall) = curve([start, end]), curve([start, end], 1) * ((end - start) / 3)
-        return BSpline(np.repeat([start, end], 4), np.array([first, first + rise, last - fall, last]), 3)
-    nearest = [curve.t[np.abs(curve.t - s).argmin()] for s in (start, end)]
-    start, end = (knot if abs(knot - s) < 1e-9 else s for knot, s in zip(nearest, (start, end), strict=True))
-    for s in (start, end):
-        missing = 4 - int((curve.t == s).sum())
-        curve = curve.insert_knot(s, missing) if missing > 0 else curve
-    first, last = np.searchsorted(curve.t, start), np.searchsorted(curve.t, end, side="right")
-    return BSpline(curve.t[first:last], curve.c[first : last - 4], 3)
+    cuts = knots[np.linspace(0, len(knots) - 1, parts + 1).round().astype(int)]
+    for knot in cuts[1:-1]:
+        curve = curve.insert_knot(knot, 3)
+    for start, end in pairwise(cuts):
+        first, last = np.searchsorted(curve.t, start), np.searchsorted(curve.t, end, side="right")
+        yield BSpline(curve.t[first:last] - start, curve.c[first : last - 4], 3)
 
 
 def arc_lengths(points: Array) -> Array:

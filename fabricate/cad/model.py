@@ -30,10 +30,12 @@ from build123d import (
     Vector,
     Wire,
     export_brep,
-    export_step,
     import_brep,
 )
+from OCP.BRepBuilderAPI import BRepBuilderAPI_MakeEdge
 from OCP.BRepGProp import BRepGProp
+from OCP.GC import GC_MakeArcOfCircle
+from OCP.gp import gp_Pnt
 from OCP.GProp import GProp_GProps
 from OCP.Standard import Standard_Failure, Standard_NullObject
 from shapely import affinity
@@ -57,7 +59,7 @@ from padforge.fabricate.settings import DEFAULTS, FabricationSettings
 
 from .curves import FINE_MM, OutlineCurve, find_joints, fit_arc, insert_joints, ring_curves
 
-FIT_TOLERANCES_MM = (2e-3, 5e-4, 1e-4)
+FIT_TOLERANCES_MM = (2e-3, 1.5e-3, 5e-4, 1e-4)
 """Tolerances of curves against the finely drawn outlines; the next is tried where the kernel finds a solid invalid.
 
 Curves that hardly meet may cross where the outlines that they replace do not; finer ones do not.
@@ -81,16 +83,16 @@ MAX_BODY_DEVIATION = 5e-4
 """The same for a lid with its round holes, which are polygons in the mesh, and all else of few prisms."""
 KERNEL_ERRORS = Standard_Failure, Standard_NullObject, RuntimeError, ValueError
 """What the CAD kernel raises, and build123d about what it was given."""
-_LEAST_EDGE_MM = 1e-6
-"""Of an outline; the kernel takes points within 1e-7 mm for one."""
+_DECIMALS = 5
+"""Decimals of points, mm: a hundredth of a micrometre. More would only lengthen a STEP file."""
+_LEAST_EDGE_MM = 2e-5
+"""Of an outline: two points remain two when they are rounded."""
 _AREA_TOLERANCE = 1e-2
 """Relative error asked for of areas; it selects an adaptive integration, which is far more accurate."""
 _INTO_TERRACE_MM = 0.005
 """Overlap of a terrace with the one below, so that no two faces coincide."""
 _SPACING_MM = 10.0
 """Distance between bodies that stand side by side."""
-_TIMESTAMP = "2000-01-01T00:00:00"
-"""STEP files must carry a time; this one makes their bytes reproducible."""
 
 
 @dataclass(frozen=True)
@@ -226,13 +228,18 @@ def _extrude(plan: Plan, fibre: int, prism: Prism, fit_mm: float) -> Solid:
 
 def _edge(curve: OutlineCurve, z: float) -> Edge:
     """Return the edge of an outline's curve at a height; it begins and ends exactly at the outline's vertices."""
-    start, end = [(x, y, z) for x, y in curve.points[[0, -1]].tolist()]
+    start, end = [(x, y, z) for x, y in np.round(curve.points[[0, -1]], _DECIMALS).tolist()]
     if curve.spline is not None:
-        return Edge.make_bspline([(x, y, z) for x, y in curve.spline.c.tolist()], curve.spline.t.tolist(), 3)
+        poles = np.round(curve.spline.c, _DECIMALS).tolist()
+        return Edge.make_bspline([(x, y, z) for x, y in poles], curve.spline.t.tolist(), 3)
     if curve.arc is not None:
         x, y, radius, angle, sweep = curve.arc
-        middle = angle + sweep / 2
-        return Edge.make_three_point_arc(start, (x + radius * np.cos(middle), y + radius * np.sin(middle), z), end)
+        middle = np.round(
+            [x + radius * np.cos(angle + sweep / 2), y + radius * np.sin(angle + sweep / 2)], _DECIMALS + 2
+        )
+        first, second, third = gp_Pnt(*start), gp_Pnt(*middle.tolist(), z), gp_Pnt(*end)
+        arc = GC_MakeArcOfCircle(first, second, third).Value()
+        return Edge(BRepBuilderAPI_MakeEdge(arc, first, third).Edge())  # which ends exactly there
     return Edge.make_line(start, end)
 
 
@@ -270,18 +277,6 @@ def assemble(bodies: Mapping[str, Sequence[CadPart]], plan: Plan) -> Compound:
             shape.locate(Location((x_mm + _SPACING_MM - box.min.X, 0.0, 0.0)))
             x_mm = shape.bounding_box().max.X
     return Compound(label="moulds of the pad", children=shapes)
-
-
-def write_step(path: Path, shape: Compound | Solid) -> None:
-    """Write a shape with its names and colours as a STEP file, mm; the same bytes for the same shapes.
-
-    Raises:
-        OSError: the file cannot be written.
-    """
-    try:
-        export_step(shape, path, write_pcurves=False, timestamp=_TIMESTAMP)  # curves on surfaces double the size
-    except RuntimeError as error:
-        raise OSError("the CAD kernel could not write it: is the disk full?") from error
 
 
 def fuse(parts: Sequence[CadPart], name: str) -> Solid:
@@ -327,7 +322,7 @@ def prism_solids(prism: Prism) -> list[Solid]:
     def wire(ring: np.ndarray, z: float) -> Wire:
         return Wire.make_polygon([Vector(x, y, z) for x, y in ring.tolist()], close=True)
 
-    polygons, height = polygon_rings(prism.area), prism.top_mm - prism.bottom_mm
+    polygons, height = polygon_rings(shapely.simplify(prism.area, _LEAST_EDGE_MM)), prism.top_mm - prism.bottom_mm
     arc = None
     if len(polygons) == 1 and len(polygons[0]) == 1 and len(polygons[0][0]) >= _MIN_CIRCLE_CORNERS:
         arc = fit_arc(polygons[0][0])

@@ -202,8 +202,8 @@ def _check_silicone_wall(plan: Plan) -> Finding:
     layout, limit = plan.pad.layout, plan.settings.mould.min_silicone_mm
     pitch = max(layout.pitch_x_mm, layout.pitch_y_mm)
     around = plan.cavity.buffer(2 * pitch, join_style="mitre")
-    if plan.pillars.area:
-        around = without(around, plan.pillars)
+    if plan.feet.area:
+        around = without(around, plan.feet)
     silicones = [
         without(around, plan.outline(plan.layer_fibres(layer), height)) for layer, height in enumerate(plan.heights_mm)
     ]
@@ -347,7 +347,7 @@ def _check_numbers(plan: Plan) -> Finding:
 def _check_keep_outs(plan: Plan) -> Iterator[Finding]:
     """Check that no track runs into a pillar, that pillars hold, and that they do not cut the pad in two."""
     half = plan.settings.mould.ridge_width_mm / 2 + plan.heights_mm[-1] * plan.settings.ridge_slope
-    shared = {fibre: line.buffer(half, cap_style="flat") & plan.pillars for fibre, line in enumerate(plan.lines, 1)}
+    shared = {fibre: line.buffer(half, cap_style="flat") & plan.feet for fibre, line in enumerate(plan.lines, 1)}
     blocked = [fibre for fibre, area in shared.items() if area.area > 0]
     message = (
         f"tracks of {_list_fibres('fibre', blocked)} run into keep-outs" if blocked else "no track runs into a keep-out"

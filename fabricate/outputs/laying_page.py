@@ -9,6 +9,9 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
 from typing import Any
 
+import numpy as np
+
+from padforge.design.settings import is_hole
 from padforge.fabricate.materials import PLASTICS, PRODUCTS, divider_ohm
 from padforge.fabricate.outputs.drawings import CROSSING_LINK, ORIENTATION_LINK, orientation_sentence
 from padforge.fabricate.plan import Plan, fibre_layers, fibre_name, overlap
@@ -213,6 +216,7 @@ def _common_tracks(plan: Plan) -> list[dict[str, Any]]:
 def laying_page(document: Document) -> str:
     """Write `laying.md`, a page to print for the bench, from a fabrication document."""
     sections = {
+        "Pad": _pad_lines(document),
         "Order": _order_lines(document),
         "Print": _print_lines(document),
         "Mix": _mix_lines(document["silicone"]),
@@ -232,6 +236,25 @@ def _table_lines(head: Sequence[object], rows: Sequence[Sequence[object]]) -> It
         yield f"| {' | '.join(map(str, row))} |"
 
 
+def _pad_lines(document: Document) -> Iterator[str]:
+    thickness_mm, n_fibres = document["silicone"]["thickness_mm"], len(document["fibres"])
+    width, height = np.broadcast_to(document["sizes"]["pad_mm"], 2)
+    yield f"The pad is {width:.5g} x {height:.5g} mm, {thickness_mm:.3g} mm thick, with {n_fibres} fibres."
+    keep_outs = document["settings"]["pad"]["keep_out_mm"]
+    if holes := [keep_out for keep_out in keep_outs if is_hole(tuple(keep_out))]:
+        yield from ("", "It has these holes:", "")
+        rows = []
+        for x, y, diameter, *heads in holes:
+            sunk = [f"{head:g} mm, {thickness_mm / 2:.3g} mm deep" for head in heads] or ["-"]
+            rows.append((f"{x:g} mm", f"{y:g} mm", f"{diameter:g} mm", *sunk))
+        yield from _table_lines(("x", "y", "diameter", "screw's head"), rows)
+        yield ""
+        yield (
+            "Positions are from the centre of the pad. As it lies to be used, tracks up, x runs to the left and y away"
+            " from you. The heads of screws sink into the face with the tracks."
+        )
+
+
 def _order_lines(document: Document) -> Iterator[str]:
     order, fibre, silicone = document["order"], document["fibre"], document["silicone"]
     n_fibres, resin = len(document["fibres"]), document["settings"]["printer"]["resin"]
@@ -241,6 +264,7 @@ def _order_lines(document: Document) -> Iterator[str]:
         "adhesive": f"{sum(document['adhesive']['steps_ml']):.2f} ml",
         "resin" if resin else "filament": f"{order['plastic_g']:.0f} g of {PLASTICS[resin][0]}",
         "connectors": f"{2 * n_fibres}",
+        "wire": f"{2 * n_fibres} pieces, from the pad to the board",
         "resistors": f"{n_fibres}, of the values below",
         "board": f"for {n_fibres} fibres",
     }
@@ -248,10 +272,11 @@ def _order_lines(document: Document) -> Iterator[str]:
     yield from _table_lines(("kind", "amount", "properties", "for example"), rows)
     yield ""
     yield (
-        f"Of the fibre, {order['waste_percent']:g} % are waste. The mould prints in about {order['print_h']:.1f} h, by"
-        f" rules of thumb; a slicer knows better. Laying and sealing by hand takes about {order['laying_h']:.1f} h, an"
-        f" estimate of {LAY_MIN_PER_M:g} minutes a metre and {LAY_MIN_PER_CROSSING:g} minutes a crossing, without the"
-        " time in which silicone and adhesive cure."
+        f"The fibre includes {order['waste_percent']:g} % for waste."
+        f" The mould prints in about {order['print_h']:.1f} h, by rules of thumb; a slicer knows better."
+        f" Laying and sealing by hand takes about {order['laying_h']:.1f} h, an estimate of {LAY_MIN_PER_M:g} minutes"
+        f" a metre and {LAY_MIN_PER_CROSSING:g} minutes a crossing, without the time in which silicone and adhesive"
+        " cure."
     )
 
 

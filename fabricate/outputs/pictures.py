@@ -39,8 +39,8 @@ from padforge.fabricate.plan import (
 
 CARE = "#7b3fa0"
 """Colour of warnings: unlike both families, and unlike failures."""
-_NUMBER, _EDGE, _GREY = "#8a867d", "#a7a49c", "#77746c"
-"""Greys of the numbers on the floor, of outlines, and of text beside a picture."""
+_NUMBER, _HEAD, _EDGE, _GREY = "#8a867d", "#b4b0a7", "#a7a49c", "#77746c"
+"""Greys of the numbers on the floor, of the heads of screws, of outlines, and of text beside a picture."""
 _RAMP = (PAPER, "#a9c4c9", "#4f7f8e", "#24404c")
 """Colours of a mesh from its lowest visible height to its highest."""
 _DPI = 100
@@ -80,6 +80,8 @@ def draw_mould(plan: Plan, vertices: ArrayLike, triangles: ArrayLike, findings: 
     entries = [(PAPER, "floor"), (FAINT, f"wall, {plan.silicone_mm:g} mm")]
     if any(plan.numbers):
         entries.append((_NUMBER, f"mirrored numbers, {plan.settings.mould.shallow_ridge_height_mm:g} mm"))
+    if plan.heads:
+        entries.append((_HEAD, f"screws' heads, {plan.head_mm:g} mm"))
     entries += [(layer.colour, f"{FAMILIES[layer.family]} ridges, {layer.depth_mm:g} mm") for layer in layers]
     handles = [Patch(facecolor=colour, edgecolor=_GREY, label=label) for colour, label in entries]
 
@@ -107,6 +109,7 @@ def _mould_colours(plan: Plan, corners: Array) -> NDArray[np.str_]:
     for layer in reversed(fibre_layers(plan)):  # taller ridges come later and cover lower ones
         base = plan.outline(layer.fibres, plan.heights_mm[layer.index])
         colours[raised & shapely.contains_xy(base, x, y)] = layer.colour
+    colours[raised & shapely.contains_xy(shapely.union_all(plan.heads), x, y)] = _HEAD
     return colours
 
 
@@ -119,7 +122,7 @@ def draw_tracks(plan: Plan, path: Path) -> None:
     note = orientation_sentence(layout.counts, plan.settings.pad.leads)
     bounds = (x_min - room, y_min - room, x_max + room, y_max + room)
     picture = _Picture(bounds, title, len(layers) + (len(clashes) > 0), note)
-    pillars = overlap(plan.pillars, plan.cavity)
+    pillars = overlap(plan.feet, plan.cavity)
     for area, colour in ((plan.silicone, PAPER), (plan.cavity, PAPER), (pillars, FAINT)):
         for rings in polygon_rings(area):
             for ring in rings[:1] if area is pillars else rings:

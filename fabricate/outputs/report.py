@@ -178,6 +178,7 @@ def _mould_section(folder: Path, names: Collection[str], document: Mapping[str, 
     solid = folder / "mould.stl"
     mesh = pack_mesh(solid) if solid.name in names else None
     findings = document["findings"]
+    width, height = np.broadcast_to(document["sizes"]["pad_mm"], 2)
     size = " x ".join(f"{round(side, 2):g}" for side in document["size_mm"])
     passed = [finding for finding in findings if finding["status"] == "pass"]
     remarks = sorted((f for f in findings if f["status"] != "pass"), key=lambda finding: finding["status"])
@@ -198,6 +199,7 @@ def _mould_section(folder: Path, names: Collection[str], document: Mapping[str, 
             *([collapsible("Checks that pass", [_findings_table(passed)])] if passed else []),
         ],
         [
+            (f"{width:.5g} x {height:.5g} mm", "pad, as it is cast"),
             (f"{len(passed)} / {len(findings)}", "mould checks passed"),
             (f"{document['silicone_volume_ml']:.1f} ml", "silicone to cast"),
         ],

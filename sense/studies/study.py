@@ -213,7 +213,7 @@ def _load_pad(name: str, seed: int, layout: Layout) -> tuple[str, Morphology]:
     from padforge.design.settings import PUBLISHED_CONTACT, PUBLISHED_SEARCH, SearchSettings
 
     # under the published contact: by descent from a single start, or genetic as published
-    pad = PUBLISHED_PAD.model_copy(update=layout.settings)
+    pad = PUBLISHED_PAD.for_layout(layout)
     method = "genetic" if kind == "genetic" else "descent"
     overrides = {"starts": 1, "seed": seed, "method": method} | ({"knots": int(named[4])} if named[4] else {})
     settings = validate(SearchSettings, PUBLISHED_SEARCH.model_dump() | overrides, f"{method} search")

@@ -24,7 +24,7 @@ from padforge.design.objectives.expected_error import straight_full_scale
 from padforge.design.objectives.rules import Violation
 from padforge.design.optimize.search import SearchResult, settings_for_twin, state_folders
 from padforge.design.paths.curves import crossings, lengths
-from padforge.design.settings import PadSettings, Scatter, SearchSettings
+from padforge.design.settings import Layout, PadSettings, Scatter, SearchSettings
 from padforge.design.twin import PlanTransform, TwinChannel, TwinScatter
 from tests.helpers.less import compare_little
 
@@ -117,6 +117,8 @@ def test_settings_for_twin_take_profile_noise_area_and_layout(here, twin):
     wider = settings_for_twin(Spec({"pad": {"pitch_mm": 20.0}}), twin)
     assert wider.section(Contact).sensitivity_profile[-1] == (15, 0)
     assert (wider.section(PadSettings).pitch_mm, wider.section(PadSettings).sensed_mm) == (20, (18, 31.5))
+    sized = settings_for_twin(Spec({"pad": {"size_mm": [36.0, 45.0]}}), twin)
+    assert sized.section(PadSettings).layout == Layout(2, 2, 12.0, 15.0)
     Morphology.straight(2, 10.0).save(here / "pad.json")
     scored = CliRunner().invoke(design, ["score", "pad.json", "--twin", str(twin)], catch_exceptions=False)
     terms = evaluate(Morphology.straight(2, 10.0), contact, used.noise)

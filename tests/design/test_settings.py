@@ -47,6 +47,23 @@ REFUSED = [
     (PadSettings, {"horizontals": 2, "pitch_mm": [8, 15], "sensed_mm": [40, 46]}, "the pad itself is 45 mm high"),
     (PadSettings, {"grid": 2, "pitch_mm": 10, "sensed_mm": [31, 5]}, r"sensed_mm: got \[31, 5\], .*is 30 mm wide"),
     (PadSettings, {"keep_out_mm": "hole"}, "keep_out_mm"),
+    (
+        PadSettings,
+        {"size_mm": [120, 30], "pitch_mm": 8},
+        r"size_mm is \[120, 30\] and pitch_mm is 8, allowed is one of",
+    ),
+    (PadSettings, {"size_mm": [120, 0.2]}, "which makes pitches of 24 and 0.04 mm, allowed is 0.1 to 1000"),
+    (PadSettings, {"size_mm": [120]}, "size_mm"),
+    (PadSettings, {"size_mm": [120, 0]}, "pitches of 24 and 0 mm, allowed is"),
+    (PadSettings, {"size_mm": "large"}, "size_mm: got 'large'"),
+    (PadSettings, {"keep_out_mm": [[0, 0, 5, 3]]}, r"hole 1 is \(0.0, 0.0, 5.0, 3.0\), allowed are .*head"),
+    (PadSettings, {"keep_out_mm": [[0, 0, 0]]}, "hole 1 is .*, allowed are diameters from 0.1 mm"),
+    (
+        PadSettings,
+        {"keep_out_mm": [[20, 0, 3], [27, 0, 2, 4]]},
+        "hole 2 reaches beyond the pad, which is 56.25 by 56.25",
+    ),
+    (PadSettings, {"keep_out_mm": [[0, 0]]}, r"keep_out_mm\[0\]: .* at least 3 items"),
     (PadSettings, {"bent_radius_mm": "round"}, "bent_radius_mm.*: got 'round'"),
     (Contact, {"weight": "cubic"}, "weight: got 'cubic', .*inverse_square"),
     (Contact, {"sensitivity_profile": [[0, 1], [1, 0]]}, "sensitivity_profile: got .*3 points or more"),
@@ -153,6 +170,30 @@ def test_pad_settings_of_a_rectangle_and_its_sensed_area():
     assert PadSettings(grid=3, pitch_mm=2, sensed_mm=(8, 3)).sensed == ((0, 1.25), (4, 2.75))
     again = PadSettings.model_validate_json(PadSettings(sensed_mm=(40, 20)).model_dump_json())
     np.testing.assert_allclose(again.sensed, [(2.5 - 16 / 9, 2.5 - 8 / 9), (2.5 + 16 / 9, 2.5 + 8 / 9)])
+
+
+def test_size_of_a_pad_sets_its_pitches():
+    pad = PadSettings(size_mm=(120, 30), horizontals=2, verticals=7)
+    assert pad.layout == Layout(2, 7, 15.0, 10.0)
+    assert pad.layout.size_mm == (120, 30)
+    assert pad == PadSettings(pitch_mm=(15, 10), horizontals=2, verticals=7)
+    assert PadSettings(size_mm=(120, 30), sensed_mm=(119, 29)).layout == Layout(4, 4, 24.0, 6.0)
+    assert pad.for_layout(Layout.create(4)).layout == Layout.create(4)
+    stated = Spec({"pad": {"size_mm": [60, 60], "grid": 5}})
+    assert stated.section(PadSettings).layout == Layout.create(5, 10.0)
+    assert stated.section(PadSettings, grid=2).layout == Layout.create(2, 20.0)
+    assert stated.section(PadSettings, **Layout.create(3, 8.0).settings).layout == Layout.create(3, 8.0)
+
+
+def test_holes_of_a_pad_are_polygons_around_their_screws():
+    pad = PadSettings.model_validate({"keep_out_mm": [[1, 2, 3], [-9, 0, 3, 6], HOLE]})
+    assert PadSettings.model_validate_json(pad.model_dump_json()) == pad
+    round_, head, polygon = map(np.array, pad.keep_out_corners_mm)
+    for corners, centre, diameter in ((round_, (1, 2), 3), (head, (-9, 0), 6)):
+        away = np.linalg.norm(corners - centre, axis=1)
+        assert diameter / 2 < away.min() == pytest.approx(away.max())
+        assert away.max() < 1.002 * diameter / 2
+    np.testing.assert_array_equal(polygon, HOLE)
 
 
 PROFILE = [[0, 1], [0.5, 0.25], [1, 0]]

@@ -98,6 +98,31 @@ TRIANGLE = (
     '<mesh><vertices><vertex x="0" y="0" z="0"/><vertex x="1" y="0" z="0"/><vertex x="0" y="1" z="0"/></vertices>'
     '<triangles><triangle v1="0" v2="1" v3="2"/></triangles></mesh>'
 )
+
+
+@pytest.mark.parametrize(
+    ("objects", "items", "n_triangles", "n_left_out"),
+    [
+        ('<object id="2">{}</object>', "", 1, 0),  # no item of the build
+        ('<object id="2" type="model">{}</object>', '<item objectid="2" printable="1"/>', 2, 0),
+        ('<object id="2">{}</object>', '<item objectid="2" printable="0"/>', 1, 1),
+        ('<object id="2" type="support">{}</object>', '<item objectid="2"/>', 1, 1),
+        (  # a modifier beside a part, as slicers write them
+            '<object id="2" type="other">{}</object><object id="3"><components><component objectid="1"/>'
+            '<component objectid="2"/></components></object>',
+            '<item objectid="3"/>',
+            2,
+            1,
+        ),
+    ],
+)
+def test_read_mesh_leaves_out_what_is_not_printed(tmp_path, caplog, objects, items, n_triangles, n_left_out):
+    content = model(f'<object id="1">{TRIANGLE}</object>{objects.format(TRIANGLE)}', f'<item objectid="1"/>{items}')
+    _, triangles = read_mesh(packed(tmp_path / "model.3mf", content))
+    assert len(triangles) == n_triangles
+    assert ["1 objects that are not printed are left out" in line for line in caplog.messages] == [True] * n_left_out
+
+
 BEYOND = TRIANGLE.replace('v3="2"', 'v3="9"')
 
 

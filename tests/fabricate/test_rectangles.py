@@ -1,5 +1,6 @@
 """Pads that are no squares: of two pitches, of one family, with holes, with leads to one side."""
 
+import math
 import re
 from dataclasses import replace
 
@@ -12,11 +13,12 @@ from hypothesis import strategies as st
 
 from padforge.design.morphology import Morphology
 from padforge.design.settings import PadSettings
+from padforge.fabricate.cad.model import body_solid
 from padforge.fabricate.checks.plan_checks import check_mould, check_plan
 from padforge.fabricate.export import build
 from padforge.fabricate.leads import lead_spacing
 from padforge.fabricate.mesh import build_mesh, mould_mesh
-from padforge.fabricate.mould import bed_frame, holder_body, lid_body, sizes
+from padforge.fabricate.mould import bed_frame, holder_body, lid_body, sizes, tray_body
 from padforge.fabricate.outputs.drawings import orientation_sentence, tracks_svg
 from padforge.fabricate.plan import Plan
 from padforge.fabricate.settings import DEFAULTS, FabricationSettings, FibreSettings, MouldSettings
@@ -53,6 +55,28 @@ def test_keep_out_is_a_pillar_of_the_mould():
     rim = DEFAULTS.mould.floor_mm + DEFAULTS.mould.silicone_mm
     section = [shapely.Polygon(ring) for ring in mould_mesh(with_hole).slice(rim - 1e-3).to_polygons()]
     assert min(ring.symmetric_difference(shapely.Polygon(HOLE)).area for ring in section) < 1e-2
+
+
+def test_round_holes_are_round_pillars_whose_feet_are_the_heads_of_screws():
+    holes = [[0.0, 7.0, 3.0], [-8.0, -7.0, 3.0, 5.0]]
+    pad = replace(settings(PAD, keep_out_mm=holes), silicone=DEFAULTS.silicone.model_copy(update={"shrinkage": 0.02}))
+    plan, plain = Plan(PAD, pad), Plan(PAD, replace(pad, pad=PadSettings(**PAD.layout.settings)))
+    found = {finding.name: finding for finding in check_mould(plan)[-1]}
+    assert all(found[name].status == "pass" for name in ("watertight", "bodies", "genus", "keep_out", "pillars"))
+    printed = plan.shrinkage_compensated
+    more = mould_mesh(printed).volume() - mould_mesh(plain.shrinkage_compensated).volume()
+    disc, sunk = math.pi / 4 / 0.98**2, printed.silicone_mm / 2
+    assert more == pytest.approx(disc * (2 * 3**2 * printed.silicone_mm + (5**2 - 3**2) * sunk), rel=2e-3)
+    solid = body_solid(tray_body(printed))
+    round_ = [face for face in solid.faces() if face.geom_type.name == "CYLINDER"]
+    areas = [math.pi / 0.98 * (diameter * height) for diameter, height in ((3, 2 * sunk), (3, sunk), (5, sunk))]
+    assert sorted(face.area for face in round_) == pytest.approx(sorted(areas), rel=1e-3)
+
+
+def test_tracks_keep_clear_of_the_head_of_a_screw():
+    holes = [[0.0, 7.0, 3.0, 9.0]]  # verticals run at x = -4 and 4
+    found = {finding.name: finding for finding in check_plan(Plan(PAD, settings(PAD, keep_out_mm=holes)))}
+    assert found["keep_out"].message == "tracks of fibres 6, 7 run into keep-outs"
 
 
 def test_keep_out_at_the_edge_joins_the_wall():

@@ -123,7 +123,7 @@ def test_defaults_are_those_of_the_published_pads():
     assert PrinterSettings().model_dump() == published["printer"]
 
 
-@pytest.mark.parametrize(("written", "preset"), [("ecoflex 0030", "EcoFlex 00-30"), ("Published", "published")])
+@pytest.mark.parametrize(("written", "preset"), [("ecoflex 0030", "Ecoflex 00-30"), ("Published", "published")])
 def test_preset_names_ignore_case_spaces_and_hyphens(written, preset):
     settings = SiliconeSettings(name=written)
     assert (settings.name, settings.material) == (preset, SILICONES[preset])
@@ -153,7 +153,7 @@ def test_custom_materials_need_all_required_keys():
 
 
 def test_default_materials_are_those_of_the_published_pads():
-    assert SiliconeSettings().material == Silicone("EcoFlex 00-20", 1.07, (1, 1), 30, 4, 0, 55)
+    assert SiliconeSettings().material == Silicone("Ecoflex 00-20", 1.07, (1, 1), 30, 4, 0, 55)
     assert FibreSettings().material.diameter_mm == 0.3
     assert {grade.shrinkage for name, grade in SILICONES.items() if name != "published"} == {0.001}
 

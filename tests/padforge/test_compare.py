@@ -36,7 +36,7 @@ def test_compare_evaluates_finished_pads(tmp_path, monkeypatch):
     assert all(other["errors_mm"] == other["straight_mm"] for other in plain["others"].values())
     assert [name.split(",")[0] for name in bent["others"]] == ["isotropic", "isotropic"]
     assert plain["mould_ml"] > 0
-    assert plain["force_n"] == pytest.approx(contact_press(Contact()).force_n(), rel=1e-9)  # EcoFlex 00-20
+    assert plain["force_n"] == pytest.approx(contact_press(Contact()).force_n(), rel=1e-9)  # Ecoflex 00-20
     assert plain["strain_percent"] == pytest.approx(100 * max(s for _, s in fibre_strains(Contact())))
     assert (plain["straight_length_mm"], plain["straight_crossings"]) == (pytest.approx(plain["length_mm"]), 6)
     assert plain["half_width_mm"] == pytest.approx(half_width_mm(Contact()))

@@ -200,7 +200,9 @@ def test_import_restores_a_drawn_plan(tmp_path: Path) -> None:
         line[:, axis] = np.linspace(0, LAYOUT.extent[axis], 6)
         line[1:-1, 1 - axis] = LAYOUT.levels[fibre] + rng.uniform(-0.4, 0.4, 4)
     pad = Morphology.from_layout(courses, LAYOUT)
-    save_figure(draw_plan(pad, Contact(), (), PadSettings().for_layout(LAYOUT).keep_out_mm), tmp_path / "plan.svg")
+    save_figure(
+        draw_plan(pad, Contact(), (), PadSettings().for_layout(LAYOUT).keep_out_corners_mm), tmp_path / "plan.svg"
+    )
     found = import_plan(tmp_path / "plan.svg", LAYOUT, 0.05)
     assert max_distance_mm(found.pad, pad) < 0.08
     assert found.pad.knots.shape[1] <= 6 + 3

@@ -55,13 +55,14 @@ def test_keep_out_distances_and_free_presses_are_exact():
         (((0, 0), (4, 4), (4, 0), (0, 4)), "polygon 1 crosses or touches itself or has no area"),
         (((0, 0), (4, 4)), "polygon 1 has 2 corners, allowed are 3 to 1000"),
         (square(100, 0, 4), r"polygon 1 lies beside the pad, which is 56 by 60 mm about \(0, 0\)"),
+        ((-25.0, -15.0, 4.0), r"keep-out 1 is 0.998 mm from an end of fibre 1, at \(-28, -15\) mm, allowed is 1.5"),
         (square(-25.0, -15.0, 4.0), r"is 1 mm from an end of fibre 1, at \(-28, -15\) mm, allowed is 1.5"),
         (((-28, -30), (28, -30), (28, 30), (-28, 30)), "keep_out_mm covers all that is pressed"),
     ],
 )
 def test_keep_outs_without_room_are_refused_in_one_line(polygon, message):
     def use():
-        size = kept_off(tuple((float(x), float(y)) for x, y in polygon))
+        size = kept_off(polygon)
         free_presses(size)
         check_fibre_ends(size, RulesSettings())
 
@@ -99,6 +100,17 @@ def test_straight_paths_pass_keep_outs_within_the_rules():
     assert (away[1] > 0.3, away[0] == 0) == (True, True)
     few = Morphology.from_layout(straight_paths(size, rules, 3), size.layout)
     assert few.knots.shape == (9, 5, 2)
+
+
+def test_fibres_and_presses_keep_clear_of_the_head_of_a_screw():
+    size, rules = kept_off((2.0, 1.0, 3.0, 8.0)), RulesSettings()
+    assert {v.rule for v in check_rules(Morphology.straight(size.layout), rules, size)} == {"keep_out_mm"}
+    pad = Morphology.from_layout(straight_paths(size, rules, 21), size.layout)
+    assert check_rules(pad, rules, size) == []
+    angles = np.linspace(0, 2 * np.pi, 50)[:, None]
+    ring = (np.array([2.0, 1.0]) + np.hstack([np.cos(angles), np.sin(angles)]) * [[4.02]]) / size.layout.unit_mm
+    assert is_outside(ring + np.array(size.layout.extent) / 2, size).all()
+    assert not is_outside(0.99 * ring + np.array(size.layout.extent) / 2 + 0.01 * ring.mean(axis=0), size).any()
 
 
 @given(st.integers(0, 99), st.floats(-8, 8), st.floats(-8, 8), st.sampled_from([6.0, 25.0]))

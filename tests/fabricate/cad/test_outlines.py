@@ -32,6 +32,8 @@ FINE = 64
 
 def length(piece: OutlineCurve) -> float:
     """Arc length along the vertices of a piece, up to which its parameter runs."""
+    if piece.spline is not None:
+        return float(piece.spline.t[-1])
     return float(arc_lengths(piece.points)[-1])
 
 

@@ -12,6 +12,7 @@ from scipy.integrate import quad
 from padforge.design.morphology import Morphology
 from padforge.fabricate.export import build
 from padforge.fabricate.mesh import mould_mesh
+from padforge.fabricate.mould import sizes
 from padforge.fabricate.outputs.drawings import CROSSING_LINK, ORIENTATION_FILE, orientation_sentence
 from padforge.fabricate.outputs.laying_page import (
     PRINT_SETTINGS_HEAD,
@@ -31,6 +32,7 @@ def fabrication_document(plan: Plan, findings: tuple[dict, ...] = ()) -> dict:
     return {
         "files": ["mould.stl"],
         "size_mm": [64.669, 64.669, 8.0],
+        "sizes": sizes(plan),
         "mould_volume_ml": volume / 1000,
         "findings": list(findings),
         "settings": {
@@ -259,6 +261,7 @@ def bench_document(**changes: object) -> dict:
     return {
         "files": ["mould.stl", "laying.gcode"],
         "size_mm": [40.5, 30.126, 8.0],
+        "sizes": {"pad_mm": 33.75},
         "mould_volume_ml": 10.0,
         "findings": [],
         "settings": settings,
@@ -291,8 +294,9 @@ def section(document: dict, title: str) -> list[str]:
 def test_page_has_the_amounts_of_the_document():
     document = bench_document()
     titles = [line for line in laying_page(document).splitlines() if line.startswith("#")]
-    names = ["Order", "Print", "Mix", "Cast", "Orientation", "Lay", "Wire", "Crossings", "Checks"]
+    names = ["Pad", "Order", "Print", "Mix", "Cast", "Orientation", "Lay", "Wire", "Crossings", "Checks"]
     assert titles == ["# How to make the pad", *(f"## {name}" for name in names)]
+    assert section(document, "Pad") == ["The pad is 33.75 x 33.75 mm, 6.12 mm thick, with 2 fibres."]
     lines = section(document, "Print")
     assert lines[:2] == [
         "- The mould is 40.5 x 30.13 x 8 mm and takes 10.0 ml, 12 g of PLA if solid.",  # of 1.24 g/ml
@@ -320,17 +324,20 @@ def test_page_has_the_amounts_of_the_document():
 
 def test_page_orders_materials_by_kind_and_estimates_the_work():
     order = section(bench_document(), "Order")
-    assert [row.split(" | ")[:2] for row in order[2:9]] == [
+    assert [row.split(" | ")[:2] for row in order[2:10]] == [
         ["| fibre", "0.23 m of soft thread, 0.35 mm"],
         ["| silicone", "5 g of Goo"],
         ["| adhesive", "0.60 ml"],
         ["| filament", "13 g of PLA"],
         ["| connectors", "4"],
+        ["| wire", "4 pieces, from the pad to the board"],
         ["| resistors", "2, of the values below"],
         ["| board", "for 2 fibres"],
     ]
-    assert order[9].startswith("Of the fibre, 17 % are waste. The mould prints in about 1.3 h, by rules of thumb")
-    assert "Laying and sealing by hand takes about 2.3 h, an estimate of 60 minutes a metre and 2 minutes a" in order[9]
+    assert order[10].startswith("The fibre includes 17 % for waste. The mould prints in about 1.3 h, by rules of thumb")
+    assert (
+        "Laying and sealing by hand takes about 2.3 h, an estimate of 60 minutes a metre and 2 minutes a" in order[10]
+    )
 
 
 @pytest.mark.parametrize(("resin", "hours"), [(False, 4.0 * 1000 / (0.4 * 0.1 * 50) / 3600), (True, 80 * 12 / 3600)])
@@ -445,3 +452,16 @@ def test_page_says_what_the_settings_ask_for():
     assert f"]({ORIENTATION_FILE})" in section(document, "Orientation")[-1]
     plain = document["fibre"] | {"max_strain": None, "min_bend_radius_mm": None}
     assert section(page(fibre=plain), "Lay")[1].endswith("with 20 mm out at both ends.")
+
+
+def test_page_lists_holes_with_room_for_their_screws():
+    pad = {"leads": "edges", "horizontals": 1, "verticals": 1}
+    document = bench_document(sizes={"pad_mm": [120.0, 30.5]})
+    document["settings"]["pad"] = pad | {
+        "keep_out_mm": [[-50.5, 0.0, 3.2, 6.0], [[0, 0], [1, 0], [0, 1]], [9.0, 5.0, 4.0]]
+    }
+    size, lead, _, _, *rows, note = section(document, "Pad")
+    assert size.startswith("The pad is 120 x 30.5 mm, ")
+    assert lead == "It has these holes:"
+    assert rows == ["| -50.5 mm | 0 mm | 3.2 mm | 6 mm, 3.06 mm deep |", "| 9 mm | 5 mm | 4 mm | - |"]
+    assert "The heads of screws sink into the face with the tracks." in note

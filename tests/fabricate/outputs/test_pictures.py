@@ -72,7 +72,8 @@ def colour_at(faces: tuple[np.ndarray, list[str]], x: float, y: float) -> str:
 
 def test_mould_picture_has_colours_by_family_and_height(tmp_path, figures):
     mould: dict[str, object] = {"wall_draft_deg": 10.0, "ridge_draft_deg": 8.0, "pins": True}
-    plan = Plan(level_pad(1.8, 1.2), with_settings(mould, pad={"keep_out_mm": [[[8, 8], [9, 8], [9, 9], [8, 9]]]}))
+    keep_outs = [[[8, 8], [9, 8], [9, 9], [8, 9]], [-9.0, -9.0, 2.0, 4.0]]
+    plan = Plan(level_pad(1.8, 1.2), with_settings(mould, pad={"keep_out_mm": keep_outs}))
     draw_mould(plan, *mesh_of(plan), [], tmp_path / "mould.png")
     faces = faces_of(figures[0])
     for layer in fibre_layers(plan):
@@ -83,8 +84,9 @@ def test_mould_picture_has_colours_by_family_and_height(tmp_path, figures):
     assert colour_at(faces, *digits[0].representative_point().coords[0]) == "#8a867d"
     assert colour_at(faces, 0.0, -14.0) == PAPER
     edge = plan.tray.bounds[2] - 0.5
-    for position in ((edge, 1.0), (8.5, 8.5)):
+    for position in ((edge, 1.0), (8.5, 8.5), (-9.0, -9.0)):
         assert colour_at(faces, *position) == FAINT
+    assert colour_at(faces, -9.0, -7.5) == "#b4b0a7"  # the head of a screw, around its hole
 
 
 def test_mesh_picture_has_upper_faces_on_top(tmp_path, figures):

@@ -74,9 +74,13 @@ def test_section_counts_checks_and_gives_first_positions(made: Path) -> None:
     row = {"measured": 1.0, "limit": 2.0, "message": "told"}
     rest = [row | {"name": f"is_{status}", "status": status, "positions_mm": []} for status in ("pass", "pass", "warn")]
     document["findings"] = [*rest, row | {"name": "so_thin", "status": "fail", "positions_mm": place}]
-    document["silicone_volume_ml"] = 12.34
+    document["silicone_volume_ml"], document["sizes"]["pad_mm"] = 12.34, [120.0, 30.25]
     section, _ = fabrication_sections(made, document)
-    assert list(section.figures) == [("2 / 4", "mould checks passed"), ("12.3 ml", "silicone to cast")]
+    assert list(section.figures) == [
+        ("120 x 30.25 mm", "pad, as it is cast"),
+        ("2 / 4", "mould checks passed"),
+        ("12.3 ml", "silicone to cast"),
+    ]
     text = re.sub(r"\s*<[^>]*>\s*", "|", "".join(section.body))
     assert "2 of 4 checks passed." in text
     assert "so thin||fail||told||(1.0, 2.0) (3.0, 4.0) (5.0, 6.0) and 2 more" in text

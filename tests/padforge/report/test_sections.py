@@ -341,7 +341,7 @@ def test_press_section_states_what_the_press_does_to_each_family(monkeypatch: py
     text = words(section.body)
     assert (
         f"A dome of 10 mm, pressed 2 mm deep into silicone of 8 mm, touches it within {press.contact_radius_mm:.1f} mm"
-        f" and takes {press.force_n():.1f} N on EcoFlex 00-20."
+        f" and takes {press.force_n():.1f} N on Ecoflex 00-20."
     ) in text
     r_mm = np.linspace(0, 2 * press.contact_radius_mm, 100)
     for name, depth, width in zip(("horizontal", "vertical"), (1.5, 0.5), half_widths_mm(contact), strict=True):

@@ -203,7 +203,7 @@ def test_load_pads_searches_with_the_given_knots_by_either_method(monkeypatch: p
     requests = []
 
     def record(pad: PadSettings, contact: Contact, settings: SearchSettings) -> SearchResult:
-        requests.append((pad.grid, settings.method, settings.knots, settings.seed))
+        requests.append((pad.layout.horizontals, settings.method, settings.knots, settings.seed))
         return SearchResult(Morphology.straight(pad.grid), {}, [], "start 1", {})
 
     monkeypatch.setattr("padforge.design.optimize.search.search", record)
