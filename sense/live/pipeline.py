@@ -67,7 +67,7 @@ class Estimate:
     r50_mm: float  # radius that holds the true position in 50 % of cases
     r90_mm: float
     failed: tuple[int, ...]  # indices of the fibres that were masked
-    unlike: bool  # whether no single press explains the responses, as of two fingers; it may be anywhere
+    unlike: bool = False  # whether no single press explains the responses, as of two fingers; it may be anywhere
     depth_mm: float | None = None  # None where the localizer does not predict it, as the three that follow
     depth_r90_mm: float | None = None  # half width of its 90 % interval
     force_n: float | None = None
@@ -378,7 +378,7 @@ class Live:
     def _check_pad(self, press: BufferedPress, end: int) -> list[OtherPad]:
         """Return whether a complete press makes the latest ones those of another pad."""
         scaled, was_other_pad = self._localizer.scaler.transform(self._features(press, end)), self.is_other_pad
-        self._misfits += find_misfits(self._localizer.single_press, scaled)
+        self._misfits.extend(find_misfits(self._localizer.single_press, scaled))
         self.is_other_pad = is_other_pad(self._localizer.single_press, np.array(self._misfits))
         return [OtherPad(press.number)] * (self.is_other_pad and not was_other_pad)
 

@@ -256,7 +256,7 @@ class LocalizerModel(LocalizerDocument):
     def is_other_pad(self, presses: ScaledFeatures) -> bool:
         """Return whether presses are of another pad than that of the calibration, or of one cast again by its plan.
 
-        Fewer than 30 are not judged; nor is a pad that drifts, or with two failed fibres, another.
+        Fewer than 25 are not judged; a pad that drifts, or has two failed fibres, is no other.
 
         Args:
             presses: scaled features.

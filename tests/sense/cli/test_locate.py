@@ -21,7 +21,7 @@ def test_locate_excludes_fibres_by_number(few) -> None:
     code, out, _ = few("locate", "--model", "model", "rec", "--exclude-fibres", "1,4")
     assert (code, out) == (0, "60 positions -> places.csv\n")
     table = np.genfromtxt("places.csv", delimiter=",", names=True)
-    assert table.dtype.names == ("press", "x_mm", "y_mm", "std_x_mm", "std_y_mm", "r50_mm", "r90_mm")
+    assert table.dtype.names == ("press", "x_mm", "y_mm", "std_x_mm", "std_y_mm", "r50_mm", "r90_mm", "unlike")
     assert len(table) == 60
     assert (table["r50_mm"] < table["r90_mm"]).all()
     prediction = LocalizerModel.load("model").predict(Recording.open("rec"), (0, 3))
