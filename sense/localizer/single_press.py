@@ -36,7 +36,8 @@ as deep leaves much, which two strong ones would explain."""
 FALSE_RATE = 0.01  # share of single presses that are said to be none
 LEVELS, SUBSETS = 4, 4
 """Numbers of failed fibres, from 0, that what is usual is learnt for; and sets of a size that it is learnt by."""
-MAX_LEFT_OUT = 2  # fibres that may have failed before a pad is called another
+MAX_LEFT_OUT = 2
+"""Fibres that may have failed before a pad is called another, but a third of them at most: few fit any press."""
 MIN_MISFIT, MIN_MISFIT_LEFT_OUT = 1.35, 0.4
 """Mean logarithm of the misfits over that of the calibration, in standard deviations of single presses, from which on
 they are another pad's: with all fibres, and without those that fit worst. After 1500 presses, 30 of pads cast again by
@@ -144,7 +145,7 @@ class SinglePressTest:
         The first is with all fibres in the (Q, C) mask.
         """
         fibres = fibre_mask.shape[1]
-        most = max(0, min(MAX_LEFT_OUT, fibres - 2))
+        most = min(MAX_LEFT_OUT, fibres // 3)
         sets = [left_out for size in range(most + 1) for left_out in combinations(range(fibres), size)]
         masks = fibre_mask[:, None] & np.array([~np.isin(np.arange(fibres), left_out) for left_out in sets])
         mean, std = self.usual_misfit[np.minimum((~masks).sum(axis=2), LEVELS - 1)].transpose(2, 0, 1)
