@@ -41,8 +41,8 @@ MAX_LEFT_OUT = 2
 MIN_MISFIT, MIN_MISFIT_LEFT_OUT = 1.35, 0.4
 """Mean logarithm of the misfits over that of the calibration, in standard deviations of single presses, from which on
 they are another pad's: with all fibres, and without those that fit worst. After 1500 presses, 30 of pads cast again by
-the same plan had 2.0 and 0.6 or more; of healthy ones 0.5 and 0.3 at most; of pads whose gains drifted by 15 % 1.6 and
-0.7, but not both above these; with two fibres failed in any way 0.4 at most without them."""
+the same plan had 2.0 and 0.6 or more; of healthy ones 0.5 and 0.3 at most; of pads whose gains drifted by up to 20 %
+not both above these; with two fibres failed in any way 0.4 at most without them."""
 MIN_PRESSES, MAX_PRESSES = 25, 300  # of which a pad is judged
 MIN_DET = 1e-3  # of the Gram matrix of two responses over the product of their norms: below, they hardly differ
 MIN_SHARE_LEFT = 1e-6  # of a number, since its logarithm is taken

@@ -7,7 +7,7 @@ import pytest
 
 from padforge.design import Morphology
 from padforge.sense import Recording
-from padforge.sense.arrays import Array, Indices
+from padforge.sense.arrays import Array, Floats, Indices
 from padforge.sense.localizer.features import MODULATED, compute_features
 from padforge.sense.localizer.model import UNIFORM, LocalizerModel
 from padforge.sense.localizer.moments import N_DOWN, N_TIMED, complete_at
@@ -129,9 +129,9 @@ def test_expected_responses_fit_and_two_of_them_do_not(trained: Trained) -> None
     near, far = 0, len(test.positions) - 1
     ones = np.ones((3, test.expected.shape[1]), bool)
 
-    def inputs(discriminants: Array) -> Array:
+    def inputs(discriminants: Array) -> Floats:
         pinv = np.linalg.pinv(test.projection)  # (C, D, F)
-        return np.einsum("qcd,cdf->qcf", discriminants - test.offset, pinv)
+        return np.einsum("qcd,cdf->qcf", discriminants - test.offset, pinv).astype(np.float32)
 
     single = inputs(np.stack([test.expected[near], 1.3 * test.expected[far], 0.4 * test.expected[near]]))
     assert not test.is_unlike(single, ones).any()
