@@ -93,12 +93,20 @@ class Estimate:
         )
 
     def has_moved_from(self, earlier: "Estimate") -> bool:
-        """Return whether the finger is so far from where it was that no error explains it."""
+        """Return whether the finger is so far from where it was that no error explains it.
+
+        Args:
+            earlier: estimate of the same press.
+        """
         distance = hypot(self.x_mm - earlier.x_mm, self.y_mm - earlier.y_mm)
         return distance > max(self.r90_mm, earlier.r90_mm)
 
     def is_sharper_than(self, earlier: "Estimate") -> bool:
-        """Return whether its radius is smaller by a quarter or more."""
+        """Return whether its radius is smaller by a quarter or more.
+
+        Args:
+            earlier: estimate of the same press.
+        """
         return self.r90_mm <= SHARPER * earlier.r90_mm
 
     def to_dict(self) -> dict[str, Any]:

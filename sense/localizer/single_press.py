@@ -46,6 +46,7 @@ not both above these; with two fibres failed in any way 0.4 at most without them
 MIN_PRESSES, MAX_PRESSES = 25, 300  # of which a pad is judged
 MIN_DET = 1e-3  # of the Gram matrix of two responses over the product of their norms: below, they hardly differ
 MIN_SHARE_LEFT = 1e-6  # of a number, since its logarithm is taken
+MIN_STD = 0.1  # of logarithms of misfits, of which few presses may have hardly any
 PREFIX = "single_press."  # of the names of the arrays in files
 _CHUNK = 256
 
@@ -101,14 +102,14 @@ class SinglePressTest:
         scatter = local_scatter(grid[inside], positions, residual, presses.fibre_mask, width)
         # A position of the grid stands for its cell, over which the response varies by its slope.
         blurred = scatter.reshape(-1, fibres, COMPONENTS, COMPONENTS) + cell**2 / 12 * slopes @ slopes.swapaxes(2, 3)
-        strength = relative_depth * interpolate_grid(responses.reshape(side, side, -1), positions)
+        response = relative_depth * interpolate_grid(responses.reshape(side, side, -1), positions)
         return cls(
             projection=projection,
             positions=grid[inside],
             expected=responses[::COARSENING, ::COARSENING][inside],
             precision=np.linalg.inv(blurred),
             offset=offset,
-            floor_share=np.array([_floor_share(residual, strength.reshape(residual.shape))]),
+            floor_share=np.array([_floor_share(residual, response.reshape(residual.shape))]),
             max_strength=np.array([MAX_STRENGTH * float(relative_depth.max())]),
             limit=np.full(LEVELS, np.inf),
             usual_misfit=np.tile([0.0, 1.0], (LEVELS, 1)),
@@ -127,7 +128,7 @@ class SinglePressTest:
             # of a normal distribution that is known from so many presses only
             quantile = stdtrit(n_presses - 1, 1 - FALSE_RATE) * sqrt(1 + 1 / n_presses)
             limit[level] = ratio.mean() + quantile * ratio.std()
-            usual[level] = misfit.mean(), misfit.std()
+            usual[level] = misfit.mean(), max(misfit.std(), MIN_STD)
         return replace(self, limit=limit, usual_misfit=usual, n_presses=np.array([float(n_presses)]))
 
     def is_unlike(self, inputs: Floats, fibre_mask: Mask) -> Mask:
