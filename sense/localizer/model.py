@@ -23,7 +23,7 @@ from padforge.sense.localizer.features import FeatureSet, PressFeatures, compute
 from padforge.sense.localizer.model_files import check_same_pad, files_of
 from padforge.sense.localizer.moments import (
     FOLLOWING,
-    LEAST_SLIDE,
+    MAY_SLIDE,
     N_DOWN,
     N_TIMED,
     PHASES,
@@ -292,7 +292,7 @@ class LocalizerModel(LocalizerDocument):
         rows = np.flatnonzero(unlike)
         if self.sliding is not None and len(rows):  # the response to a finger that slides is that to many presses
             inputs = presses.inputs[rows], presses.fibre_mask[rows], presses.seen[rows]
-            unlike[rows] = self.sliding.follow(self.networks[FOLLOWING], *inputs).moved <= LEAST_SLIDE
+            unlike[rows] = self.sliding.follow(self.networks[FOLLOWING], *inputs).moved <= MAY_SLIDE
         std_mm, r50_mm, r90_mm = np.array(UNIFORM) * self.scaler.scale_mm
         measures = {
             target.name: replace(estimate, r90=np.where(unlike, target.scale, estimate.r90))
