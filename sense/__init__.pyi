@@ -11,7 +11,9 @@ from .health.fault_detector import FaultDetector as FaultDetector
 from .health.fault_detector import FaultMonitor as FaultMonitor
 from .health.fault_detector import FibreFault as FibreFault
 from .health.health_model import HealthModel as HealthModel
+from .live.pipeline import Estimate as Estimate
 from .live.pipeline import Live as Live
+from .live.pipeline import OtherPad as OtherPad
 from .localizer.calibration import calibrate as calibrate
 from .localizer.evaluation import Evaluation as Evaluation
 from .localizer.evaluation import evaluate as evaluate

@@ -52,7 +52,9 @@ BAR = 12  # characters of a fibre's bar on a terminal, to either side
 @click.option("--token", default="", envvar="PADFORGE_TOKEN", help="Secret that clients have to send.")
 @spec_option
 @json_option
+@click.pass_context
 def live(
+    context: click.Context,
     rig: str,
     replay: Path | None,
     speed: float,
@@ -83,7 +85,8 @@ def live(
     the output is no terminal, a line says when a press begins, its radius has shrunk by a quarter, the finger has moved
     by more than that, and the press is over; with --json there is a line for every reading.
 
-    A faulty fibre is masked from then on, if the folder of the model has a health model. Ctrl-C ends it.
+    A faulty fibre is masked from then on, if the folder of the model has a health model. A line says when the presses
+    are those of another pad: then no fibre is masked, and it ends with exit 1. Ctrl-C ends it.
     Fibres are numbered from 1; in JSON "fibres" and "failed" hold indices, from 0.
     """
     from padforge.sense.formats.import_export import open_recording
@@ -130,6 +133,7 @@ def live(
                     draw(view_lines(view))
                 if outputs:
                     broadcast(outputs, builder.build(times_s, readings, events))
+    context.exit(int(pipeline.is_other_pad))
 
 
 def _stream_rig(

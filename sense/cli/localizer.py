@@ -138,7 +138,9 @@ def _parse_moment(context: click.Context, param: click.Parameter, value: str | N
 )
 @common.out_option(what="CSV file of positions, places.csv", file=True)
 @common.profile_option
+@click.pass_context
 def locate(
+    context: click.Context,
     model: Path,
     recording: Path,
     exclude_fibres: tuple[int, ...],
@@ -153,16 +155,21 @@ def locate(
 
     \b
     The columns of the CSV: press (counted from 0), x_mm, y_mm, std_x_mm, std_y_mm (standard
-    deviations), r50_mm, r90_mm (radii that hold the true position in 50 % and 90 % of cases);
+    deviations), r50_mm, r90_mm (radii that hold the true position in 50 % and 90 % of cases),
+    unlike (1 where no single press explains the responses, as of two fingers: it may be anywhere);
     of a model that estimates them also depth_mm, depth_r90_mm, force_n, force_r90_n.
 
     Lines on stderr name fibres that are faulty, and those that differ from the calibration, so that radii may fail.
+    Exit 1 if the presses are of another pad: then no fibre is masked.
     """
+    from padforge.sense.localizer.doubts import OTHER_PAD
     from padforge.sense.localizer.model import write_localization
 
     file = out or common.pad_folder(recording) / "places.csv"
     opened = read_recording(recording)
-    localization, faults, shifts, _ = predict_despite_faults(model, opened, exclude_fibres, moment)
+    localization, faults, shifts, _, is_other_pad = predict_despite_faults(model, opened, exclude_fibres, moment)
+    if is_other_pad:
+        common.echo(OTHER_PAD, err=True)
     for fault in faults:
         masked = f"; masked from press {fault.since} on" if fault.is_masked else ""
         common.echo(f"{fault.text}{masked}", err=True)
@@ -170,6 +177,7 @@ def locate(
         common.echo(shift.text, err=True)
     write_localization(localization, file)
     common.echo(f"{len(localization.r50_mm)} positions -> {file}")
+    context.exit(int(is_other_pad))
 
 
 @click.command()
@@ -183,25 +191,28 @@ def health(context: click.Context, model: Path, recording: Path, as_json: bool) 
     \b
     padforge sense health --model out/pad out/later/recording
 
-    Exit 1 if there are any. Fibres are numbered from 1; in JSON "dead" and "fibres" hold indices, from 0, and "shifts"
-    how fibres differ from the calibration.
+    Exit 1 if there are any, or if the presses are of another pad: then no fibre is said to be at fault. Fibres are
+    numbered from 1; in JSON "dead" and "fibres" hold indices, from 0, and "shifts" how fibres differ from the
+    calibration.
     """
     from dataclasses import asdict
 
     from padforge.sense.health.fault_detector import FaultDetector, fault_lines
+    from padforge.sense.localizer.doubts import OTHER_PAD
 
     opened, dead = read_recording(recording), FaultDetector.load(model).model_.dead
-    _, findings, shifts, _ = predict_despite_faults(model, opened)
+    _, findings, shifts, _, is_other_pad = predict_despite_faults(model, opened)
     document = {
         "format": "padforge-findings/1",
         "presses": len(opened.down_command),
+        "other_pad": is_other_pad,
         "dead": list(dead),
         "findings": [asdict(finding) | {"text": finding.text} for finding in findings],
         "shifts": [asdict(shift) | {"text": shift.text} for shift in shifts],
     }
     lines = [*fault_lines(findings, opened.fibres, dead), *(shift.text for shift in shifts)]
-    common.show_result(document, lines, as_json)
-    context.exit(int(bool(findings)))
+    common.show_result(document, [OTHER_PAD] if is_other_pad else lines, as_json)
+    context.exit(int(bool(findings) or is_other_pad))
 
 
 @click.command()

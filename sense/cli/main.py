@@ -157,7 +157,7 @@ def _annotate(model: Path, recording: "Recording") -> "ModelAnnotations":
 
     from padforge.sense.formats.annotations import FaultAnnotation, ModelAnnotations
 
-    prediction, findings, _, detector = predict_despite_faults(model, recording)
+    prediction, findings, _, detector, _ = predict_despite_faults(model, recording)
     faults = [FaultAnnotation(fault.press, fault.fibres, fault.kind, fault.text) for fault in findings]
     depth = prediction.measures.get("depth_mm")
     unknown = np.full(len(prediction.r90_mm), np.nan)

@@ -103,6 +103,7 @@ class Prediction(NamedTuple):
     faults: "list[FibreFault]"
     shifts: "list[DomainShift]"
     detector: "FaultDetector | None"
+    is_other_pad: bool  # then no fibre is said to be at fault, nor masked
 
 
 def predict_despite_faults(
@@ -119,13 +120,17 @@ def predict_despite_faults(
     localizer = LocalizerModel.load(model)
     detector = FaultDetector.load(model) if has_health(model) else None
     excluded = fibre_indices(failed, localizer.fibres)
-    faults = detector.predict(recording) if detector else []
+    presses = localizer.scaled_features(recording)
+    presses.fibre_mask[:, list(excluded)] = False
+    is_other_pad = localizer.is_other_pad(presses)
+    faults = detector.predict(recording) if detector and not is_other_pad else []
     fibre_mask = mask_faults(faults, len(recording.down_command), localizer.fibres)
     until = None if moment is None else _until(localizer, recording, *moment)
     localization = localizer.predict(recording, excluded, fibre_mask, until)
     fibre_mask[:, list(excluded)] = False
-    shifts = detect_shifts(localizer, detector.model_, recording, fibre_mask) if detector else []
-    return Prediction(localization, faults, shifts, detector)
+    is_known = detector is not None and not is_other_pad
+    shifts = detect_shifts(localizer, detector.model_, recording, fibre_mask) if is_known else []
+    return Prediction(localization, faults, shifts, detector, is_other_pad)
 
 
 def _until(localizer: "LocalizerModel", recording: "Recording", since: str, time_s: float) -> "Indices":

@@ -20,7 +20,8 @@ from padforge.common.validation import InputError, short_repr
 from padforge.sense.arrays import Array
 from padforge.sense.formats.ros_messages import FRAME, HEALTH, PRESSED, READINGS, TOPICS, TOUCHES, UNKNOWN_VARIANCE, Z90
 from padforge.sense.health.fault_detector import FibreFault
-from padforge.sense.live.pipeline import Estimate, Event, Live
+from padforge.sense.live.pipeline import Estimate, Event, Live, OtherPad
+from padforge.sense.localizer.doubts import OTHER_PAD
 
 FORMAT = "padforge-live/1"
 MAX_QUEUED = 4096  # lines that wait for a subscriber; one that is further behind is disconnected
@@ -68,7 +69,7 @@ class MessageBuilder:
             is_touch = isinstance(event, Estimate)
             yield _touch_message(event, self._z_sign) if is_touch else self._health(now_s, event)
 
-    def _health(self, time_s: float, fault: FibreFault | None) -> Message:
+    def _health(self, time_s: float, event: FibreFault | OtherPad | None) -> Message:
         states = [fibre["state"] for fibre in self._pipeline.view()["fibres"]]
         status = [
             {"level": _OK if state in ("sound", "unmonitored") else _ERROR, "name": f"pad: fibre {number}"}
@@ -76,8 +77,11 @@ class MessageBuilder:
             for number, state in enumerate(states, 1)
         ]
         pad: dict[str, Any] = {"event": "health", "time_s": time_s, "states": states}
-        if fault is not None:
-            pad["fault"] = {**asdict(fault), "text": fault.text}
+        pad["other_pad"] = self._pipeline.is_other_pad
+        if pad["other_pad"]:
+            status.append({"level": _ERROR, "name": "pad", "message": OTHER_PAD, "hardware_id": "pad", "values": []})
+        if isinstance(event, FibreFault):
+            pad["fault"] = {**asdict(event), "text": event.text}
         return Message(HEALTH, {"header": _header(time_s), "status": status}, pad)
 
 

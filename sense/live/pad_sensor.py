@@ -62,7 +62,7 @@ class PadSensor:
         self._localizer = LocalizerModel.load(model)
         measures = [column for each in self._localizer.scaler.measures for column in MEASURE_COLUMNS[each.name]]
         fibres = [f"fibre_{fibre}_v" for fibre in range(self._localizer.fibres)]
-        self._touch_names = ["x_mm", "y_mm", "r90_mm", *measures]
+        self._touch_names = ["x_mm", "y_mm", "r90_mm", "unlike", *measures]
         self.names = (*fibres, "pressed", "valid", *self._touch_names)
         self._thread: threading.Thread | None = None
         self._stop, self._started = threading.Event(), threading.Event()
@@ -92,7 +92,8 @@ class PadSensor:
         """Return the latest state by name: readings in V, NaN where one is missing, and the touch.
 
         `pressed` is 1 while the pad is pressed. While `valid` is 1, position, radius, depth and force are those of the
-        press under way, or else of the last one; they are 0 before the first estimate of a press.
+        press under way, or else of the last one; they are 0 before the first estimate of a press. `unlike` is 1 where
+        no single press explains the responses, as of two fingers.
 
         Raises:
             RigFault: the board failed.
@@ -134,5 +135,5 @@ class PadSensor:
         latest = pipeline.presses[-1] if pipeline.presses else None
         # a model of method `published` has no estimate of the press under way, and the latest is that of the one before
         is_valid = latest is not None and not (pipeline.pressed and latest.final)
-        touch = [getattr(latest, name) if is_valid else 0.0 for name in self._touch_names]
+        touch = [float(getattr(latest, name)) if is_valid else 0.0 for name in self._touch_names]
         return dict(zip(self.names, [*volts.tolist(), float(pipeline.pressed), float(is_valid), *touch], strict=True))

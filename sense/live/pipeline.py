@@ -1,8 +1,8 @@
 """The pipeline behind `padforge sense live`: from readings as they arrive to the position of each press.
 
 Blocks of readings of any size go in; events come out: the position of a press at every reading from its touch until
-its release is complete, with radii that hold at that moment; and faulty fibres, which are masked from the next press
-on.
+its release is complete, with radii that hold at that moment; faulty fibres, which are masked from the next press on;
+and that the latest presses are those of another pad, of which no fibre is masked.
 """
 
 from collections import deque
@@ -18,6 +18,7 @@ from padforge.sense.arrays import Array, Mask, check_stream
 from padforge.sense.health.fault_detector import FaultMonitor, FibreFault
 from padforge.sense.health.health_model import HealthModel
 from padforge.sense.health.trace_model import RELEASED
+from padforge.sense.localizer.doubts import OTHER_PAD
 from padforge.sense.localizer.features import (
     MEDIAN,
     MEDIAN_OFFSET,
@@ -34,6 +35,7 @@ from padforge.sense.localizer.model import MEASURE_COLUMNS, LocalizerModel
 from padforge.sense.localizer.model_files import check_same_pad
 from padforge.sense.localizer.moments import DOWN, MODULATED, REST, UP, complete_windows
 from padforge.sense.localizer.scaler import ScaledFeatures
+from padforge.sense.localizer.single_press import MIN_PRESSES, find_misfits, is_other_pad
 from padforge.sense.recording.frames import FrameStream
 from padforge.sense.rig.streams import HISTORY, SLACK, RingBuffer
 from padforge.sense.signals.press_detection import RELEASE_DELAY_S, TOUCH_DELAY_S, PressDetector
@@ -65,6 +67,7 @@ class Estimate:
     r50_mm: float  # radius that holds the true position in 50 % of cases
     r90_mm: float
     failed: tuple[int, ...]  # indices of the fibres that were masked
+    unlike: bool = False  # whether no single press explains the responses, as of two fingers; it may be anywhere
     depth_mm: float | None = None  # None where the localizer does not predict it, as the three that follow
     depth_r90_mm: float | None = None  # half width of its 90 % interval
     force_n: float | None = None
@@ -82,18 +85,28 @@ class Estimate:
 
     @property
     def text(self) -> str:
+        if self.unlike:
+            return f"press {self.press}: no single press, but several fingers? ({self.moment_text})"
         return (
             f"press {self.press}: {self.x_mm:.1f}, {self.y_mm:.1f} mm, within {self.r50_mm:.1f} mm at 50 %, "
             f"{self.r90_mm:.1f} mm at 90 %{self.measures_text} ({self.moment_text})"
         )
 
     def has_moved_from(self, earlier: "Estimate") -> bool:
-        """Return whether the finger is so far from where it was that no error explains it."""
+        """Return whether the finger is so far from where it was that no error explains it.
+
+        Args:
+            earlier: estimate of the same press.
+        """
         distance = hypot(self.x_mm - earlier.x_mm, self.y_mm - earlier.y_mm)
         return distance > max(self.r90_mm, earlier.r90_mm)
 
     def is_sharper_than(self, earlier: "Estimate") -> bool:
-        """Return whether its radius is smaller by a quarter or more."""
+        """Return whether its radius is smaller by a quarter or more.
+
+        Args:
+            earlier: estimate of the same press.
+        """
         return self.r90_mm <= SHARPER * earlier.r90_mm
 
     def to_dict(self) -> dict[str, Any]:
@@ -101,7 +114,15 @@ class Estimate:
         return {name: value for name, value in asdict(self).items() if value is not None}
 
 
-Event = Estimate | FibreFault
+@dataclass(frozen=True)
+class OtherPad:
+    """The latest presses are those of another pad than that of the calibration, or of one cast again by its plan."""
+
+    press: int  # index of the last of them
+    text: str = OTHER_PAD
+
+
+Event = Estimate | FibreFault | OtherPad
 
 
 @dataclass
@@ -162,6 +183,7 @@ class Live:
         presses: the latest estimate of each of the last presses, oldest first.
         track: estimates of the latest press at the last places that it has moved to, oldest first.
         faults: all faults so far, oldest first.
+        is_other_pad: whether the latest presses are those of another pad; then no fibre is masked.
 
     Raises:
         InputError: a localizer that was fitted to arrays, or a model that `check_same_pad` refuses.
@@ -196,6 +218,8 @@ class Live:
         self.presses: deque[Estimate] = deque(maxlen=MAX_SHOWN)
         self.track: deque[Estimate] = deque(maxlen=MAX_TRACK)
         self.faults: list[FibreFault] = []
+        self._misfits: deque[Array] = deque(maxlen=MIN_PRESSES)  # of the latest presses, see `find_misfits`
+        self.is_other_pad = False
 
     @property
     def pressed(self) -> bool:
@@ -205,7 +229,9 @@ class Live:
     @property
     def failed(self) -> tuple[int, ...]:
         """Indices of the fibres that are masked."""
-        return () if self._monitor is None else self._monitor.failed
+        if self._monitor is None:
+            return ()
+        return self._monitor.model.dead if self.is_other_pad else self._monitor.failed
 
     def feed(self, times_s: ArrayLike, readings: ArrayLike) -> list[Event]:
         """Process readings. The events do not depend on how readings are cut into blocks.
@@ -243,7 +269,7 @@ class Live:
             "pressed"; "fibres", for each its "swing" (deviation from its rest in units of its typical response, None
             without a reading) and "state"; "presses": `Estimate.to_dict` with "measures_text", "moment_text" and
             "text"; "track": places [x, y] of the latest press in mm, more than one if the finger has moved; "faults": a
-            line each.
+            line each, and one of another pad.
         """
         swings, end = np.full(len(self._response_v), np.nan), self._buffer.end
         if end:
@@ -260,7 +286,7 @@ class Live:
                 for press in self.presses
             ],
             "track": [[place.x_mm, place.y_mm] for place in self.track],
-            "faults": [fault.text for fault in self.faults],
+            "faults": [OTHER_PAD] if self.is_other_pad else [fault.text for fault in self.faults],
         }
 
     def _states(self, missing: Mask) -> list[str]:
@@ -308,7 +334,7 @@ class Live:
         if is_complete or self._localizer.features == "windows":  # the published features are those of a whole press
             events.append(self._estimate(press, until, is_complete))
         if press.up_command is not None and is_complete:
-            events += self._check_fibres(press, until)
+            events += [*self._check_pad(press, until), *self._check_fibres(press, until)]
             self._previous_end, self._press = press.up_command, None
         return events
 
@@ -316,7 +342,7 @@ class Live:
         scaled = self._localizer.scaler.transform(self._features(press, until))
         fibre_mask = scaled.fibre_mask.copy()
         fibre_mask[:, list(self.failed)] = False
-        result = self._localizer.predict_features(ScaledFeatures(scaled.inputs, fibre_mask, scaled.seen))
+        result = self._localizer.localize(ScaledFeatures(scaled.inputs, fibre_mask, scaled.seen))
         numbers = np.concatenate([result.positions_mm[0], result.std_mm[0], result.r50_mm, result.r90_mm]).tolist()
         measures = {
             column: float(values[0])
@@ -329,7 +355,8 @@ class Live:
         else:
             moment = "lift", until - press.up_command, now_s - press.up_s
         failed = tuple(np.flatnonzero(~fibre_mask[0]).tolist())
-        estimate = Estimate(press.number, press.time_s, now_s, *moment, final, *numbers, failed=failed, **measures)
+        judged = {"failed": failed, "unlike": bool(result.unlike is not None and result.unlike[0])}
+        estimate = Estimate(press.number, press.time_s, now_s, *moment, final, *numbers, **judged, **measures)
         self._show(estimate)
         return estimate
 
@@ -356,12 +383,21 @@ class Live:
             self.track.pop()  # the same place, better known
         self.track.append(estimate)
 
+    def _check_pad(self, press: BufferedPress, end: int) -> list[OtherPad]:
+        """Return whether a complete press makes the latest ones those of another pad."""
+        scaled, was_other_pad = self._localizer.scaler.transform(self._features(press, end)), self.is_other_pad
+        self._misfits.extend(find_misfits(self._localizer.single_press, scaled))
+        self.is_other_pad = is_other_pad(self._localizer.single_press, np.array(self._misfits))
+        return [OtherPad(press.number)] * (self.is_other_pad and not was_other_pad)
+
     def _check_fibres(self, press: BufferedPress, end: int) -> list[FibreFault]:
-        """Return the faults that a complete press brings to light."""
+        """Return the faults that a complete press brings to light; of another pad, none."""
         if self._monitor is None:
             return []
         readings, down_command, up_command, previous_end = press.excerpt(self._buffer, end)
         first = max(down_command + REST[0], previous_end)
         faults = self._monitor.update(readings[first:], down_command - first, up_command - first)
+        if self.is_other_pad:
+            return []
         self.faults += faults
         return faults

@@ -69,12 +69,10 @@ class BayesianLocalizer:
         for fibre in range(fibres):
             used, valid = table[:, :, fibre].any(axis=(0, 1)), fibre_mask[:, fibre]
             expected = table[:, :, fibre, used].reshape(side * side, -1)
-            projection[fibre, used] = _fit_lda(expected, residual[valid, fibre][:, used])
+            projection[fibre, used] = fit_lda(expected, residual[valid, fibre][:, used], COMPONENTS)
         residual = np.einsum("qcf,cfd->qcd", residual, projection) * fibre_mask[:, :, None]
-        # distance between neighbouring presses, if they lay on a grid
-        press_distance = float(np.sqrt(np.ptp(positions, axis=0).prod() / len(np.unique(positions, axis=0))))
-        width = max(cell, SCATTER_WIDTH * press_distance)
-        scatter = _local_scatter(coarse.reshape(-1, 2), positions, residual, fibre_mask, width)
+        width = max(cell, SCATTER_WIDTH * mean_distance(positions))
+        scatter = local_scatter(coarse.reshape(-1, 2), positions, residual, fibre_mask, width)
         scatter = scatter.reshape(*coarse.shape[:2], fibres, -1)
         coefficients, responses, jacobians, informations = [], [], [], []
         for fibre in range(fibres):
@@ -181,15 +179,15 @@ def fit_stages(
     return tuple(stages)
 
 
-def _fit_lda(expected: Array, residual: Array) -> Array:
-    """(F, D) whitened linear discriminants of (S, F) inputs at positions and (Q, F) residuals of presses."""
+def fit_lda(expected: Array, residual: Array, components: int) -> Array:
+    """Return (F, D) whitened linear discriminants of (S, F) inputs at positions and (Q, F) residuals of presses."""
     size = residual.shape[1]
     scatter = residual.T @ residual / max(len(residual), 1) + MIN_VARIANCE * np.eye(size)
     whitening = np.linalg.inv(np.linalg.cholesky(scatter)).T
     between = (expected - expected.mean(axis=0)) @ whitening
     _, directions = np.linalg.eigh(between.T @ between)
-    projection = np.zeros((size, COMPONENTS))
-    projection[:, : min(size, COMPONENTS)] = whitening @ directions[:, ::-1][:, :COMPONENTS]
+    projection = np.zeros((size, components))
+    projection[:, : min(size, components)] = whitening @ directions[:, ::-1][:, :components]
     return projection
 
 
@@ -207,8 +205,21 @@ def _rounded(part: Array) -> Array:
     return part.astype(np.float32).astype(np.float64)
 
 
-def _local_scatter(centres: Array, positions: Array, residual: Array, fibre_mask: Mask, width: float) -> Any:
-    """(P, C, D, D) covariances of (Q, C, D) residuals, weighted by the distance of presses from (P, 2) centres."""
+def mean_distance(positions: Array) -> float:
+    """Return the distance between neighbours of (Q, 2) positions, if they lay on a grid."""
+    return float(np.sqrt(np.ptp(positions, axis=0).prod() / len(np.unique(positions, axis=0))))
+
+
+def local_scatter(centres: Array, positions: Array, residual: Array, fibre_mask: Mask, width: float) -> Any:
+    """Return (P, C, D, D) covariances of (Q, C, D) residuals, weighted by the distance of presses from (P, 2) centres.
+
+    Args:
+        centres: positions at which they are wanted; shape (P, 2).
+        positions: of the presses; shape (Q, 2).
+        residual: whitened; shape (Q, C, D).
+        fibre_mask: whether a fibre is valid in a press; shape (Q, C).
+        width: standard deviation of the weights.
+    """
     fibres, size = residual.shape[1:]
     sums, weights = np.zeros((len(centres), fibres * size * size)), np.zeros((len(centres), fibres))
     step = max(1, _CHUNK // fibres)

@@ -41,7 +41,8 @@ from padforge.sense.localizer.network import (
     check_weights,
     predict_members,
 )
-from padforge.sense.localizer.scaler import FeatureScaler, ScaledFeatures
+from padforge.sense.localizer.scaler import FeatureScaler, ScaledFeatures, leave_one_out_residuals
+from padforge.sense.localizer.single_press import SinglePressTest, stages
 from padforge.sense.recording.frames import frame_rate_hz, framed
 from padforge.sense.recording.recording import Recording
 from padforge.sense.settings import LocalizerSettings
@@ -190,6 +191,9 @@ def fit_model(
     on_progress(0, 0, "response model")
     scaler, table = FeatureScaler.fit(features, positions_mm, measures, phases)
     presses = scaler.training_presses(features, positions_mm, measures, frame_rate_hz(data.rate_hz))
+    unfitted = leave_one_out_residuals(presses, table)
+    zero = scaler.mean_v / scaler.scale_v
+    tests = tuple(SinglePressTest.fit(table, unfitted, zero, n_complete) for n_complete in stages(n_timed))
     bayes, residual_network, trained_share = (), {}, 1.0
     if is_ensemble:
         trained = train_members(presses, table, options, rng, on_progress, time_budget)
@@ -204,6 +208,7 @@ def fit_model(
         table=table,
         bayes=bayes,
         residual_network=residual_network,
+        single_press=tests,
         method=options.method,
         features=data.feature_set,
         interval_factors=np.ones((n_timed + 1, 1, 3 + len(measures))),
@@ -215,6 +220,8 @@ def fit_model(
         moments = [scaler.transform(data.features[calibration])]
     else:
         moments = [scaler.transform(data.at(n_complete, calibration)) for n_complete in range(1, n_timed + 1)]
+    tests = (test.calibrated(moments[n - 1]) for test, n in zip(tests, stages(n_timed), strict=True))
+    model = replace(model, single_press=tuple(tests))
     positions_mm = data.positions_mm[calibration]
     measures = {name: values[calibration] for name, values in data.measures.items()}
     usual = LocalizerSettings()

@@ -1,4 +1,4 @@
-"""Doubts about an evaluation: presses that cannot lie where the recording says, and a recording of another pad."""
+"""Doubts about an evaluation: another pad, and presses that cannot lie where the recording says."""
 
 from collections.abc import Iterator
 
@@ -13,9 +13,14 @@ MAX_RADII = 4.0
 up to 2.5, and 5 or more where the sign of one coordinate was lost."""
 MIN_WITHIN_R90 = 0.5  # share of presses within their radii; of a pad that has drifted for hours it is above
 MIN_PRESSES = 20  # from which that share means something
+OTHER_PAD = (
+    "these presses are unlike those of the calibration: another pad, or one cast again; radii do not hold; recalibrate"
+)
 
 
-def find_doubts(recording: Recording, localization: Localization, within_r90: float, n_presses: int) -> list[str]:
+def find_doubts(
+    recording: Recording, localization: Localization, within_r90: float, n_presses: int, is_other_pad: bool = False
+) -> list[str]:
     """Return what makes an evaluation doubtful, each in a line.
 
     Args:
@@ -23,7 +28,10 @@ def find_doubts(recording: Recording, localization: Localization, within_r90: fl
         localization: of all its presses.
         within_r90: share of the test presses within their radii of 90 %.
         n_presses: number of the test presses.
+        is_other_pad: whether the responses are those of another pad.
     """
+    if is_other_pad:
+        return [*doubts.find_doubts(recording), OTHER_PAD]
     if within_r90 < MIN_WITHIN_R90 and n_presses >= MIN_PRESSES:
         misfit = f"{within_r90:.0%} of {n_presses} presses lie within r90: is it the recording of this pad?"
         return [*doubts.find_doubts(recording), misfit]

@@ -136,7 +136,9 @@ def evaluate(
     )
     prediction = model.predict_features(features)
     within_r90 = float((distances(prediction.positions_mm, positions_mm) <= prediction.r90_mm).mean())
-    doubts = find_doubts(recording, model.predict_features(presses), within_r90, len(test))
+    doubts = find_doubts(
+        recording, model.predict_features(presses), within_r90, len(test), model.is_other_pad(features)
+    )
     return Evaluation(
         errors=rows,
         split="none" if held_back is None else model.split,

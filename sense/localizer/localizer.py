@@ -154,14 +154,14 @@ class Localizer:
         if isinstance(X, Recording):
             return self._fitted.predict(X, failed)
         if isinstance(X, PressSelection):
-            return self._fitted.predict_features(self._fitted.scaled_features(X.recording)[X.presses], failed)
+            return self._fitted.localize(self._fitted.scaled_features(X.recording)[X.presses], failed)
         model, features = self._fitted, _array_features(X)
         if model.features != "array" or features.windows.shape[1:] != model.scaler.mean_v.shape:
             raise InputError(
                 f"X has shape {features.windows.shape} for a localizer of {model.fibres} fibres and features "
                 f"{model.features}, expected a recording, or (Q, C, F) as it was fitted to"
             )
-        return model.predict_features(model.scaler.transform(features), failed)
+        return model.localize(model.scaler.transform(features), failed)
 
     def score(self, X: "Recording | PressSelection | ArrayLike", y: ArrayLike | None = None) -> float:
         """Return the negative mean error, mm: greater is better.

@@ -15,15 +15,27 @@ from pydantic import ConfigDict, Field, JsonValue, TypeAdapter, ValidationError
 
 from padforge.common.files import read_json, reraise_write_error, write_text
 from padforge.common.validation import InputError, check_type, short_repr
-from padforge.sense.arrays import MAX_RATE_HZ, MIN_RATE_HZ, Array, Floats, Mask
+from padforge.sense.arrays import MAX_RATE_HZ, MIN_RATE_HZ, Array, Floats, Indices, Mask
 from padforge.sense.formats.columns import join_names
 from padforge.sense.localizer.bayes import PREFIX as BAYES
 from padforge.sense.localizer.bayes import BayesianLocalizer
 from padforge.sense.localizer.features import FeatureSet, PressFeatures, compute_features
 from padforge.sense.localizer.model_files import check_same_pad, files_of
-from padforge.sense.localizer.moments import FOLLOWING, N_DOWN, N_TIMED, PHASES, RESIDUAL, STAGES, count_complete
+from padforge.sense.localizer.moments import (
+    FOLLOWING,
+    MAY_SLIDE,
+    N_DOWN,
+    N_TIMED,
+    PHASES,
+    RESIDUAL,
+    STAGES,
+    complete_at,
+    count_complete,
+)
 from padforge.sense.localizer.network import Networks, Sliding, Weights, predict
 from padforge.sense.localizer.scaler import DOCUMENT_CONFIG, FeatureScaler, ScaledFeatures, array_field
+from padforge.sense.localizer.single_press import PREFIX as SINGLE_PRESS
+from padforge.sense.localizer.single_press import SinglePressTest, find_misfits, find_unlike, is_other_pad, stages
 from padforge.sense.recording.frames import framed
 from padforge.sense.recording.recording import Recording
 from padforge.sense.settings import Method, Split
@@ -35,7 +47,7 @@ UNIFORM = (3**-0.5, (2 / np.pi) ** 0.5, 1.1150)
 """Standard deviation and radii of 50 and 90 % of a uniform distribution over a square of half-width 1."""
 MEASURE_COLUMNS = {"depth_mm": ("depth_mm", "depth_r90_mm"), "force_n": ("force_n", "force_r90_n")}
 """Names of depth and force, and of their r90, in tables and messages."""
-COLUMNS = ("press", "x_mm", "y_mm", "std_x_mm", "std_y_mm", "r50_mm", "r90_mm")
+COLUMNS = ("press", "x_mm", "y_mm", "std_x_mm", "std_y_mm", "r50_mm", "r90_mm", "unlike")
 """Columns of `write_localization`; those of `MEASURE_COLUMNS` follow where depth and force are predicted."""
 Digest = Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
 _CHUNK = 2**16
@@ -59,6 +71,8 @@ class Localization:
         r50_mm: (Q,) radius that holds the true position in 50 % of cases.
         r90_mm: (Q,) radius that holds it in 90 % of cases.
         measures: depth and force by the names of `Recording.measures`, where they are predicted.
+        unlike: (Q,) whether no single press explains the responses, as of two fingers; such a press may be anywhere,
+            and its radii say so. None if that was not judged.
     """
 
     positions_mm: Array
@@ -66,6 +80,7 @@ class Localization:
     r50_mm: Array
     r90_mm: Array
     measures: Mapping[str, MeasureEstimate] = field(default_factory=dict)
+    unlike: Mask | None = None
 
 
 def write_localization(localization: Localization, path: str | Path) -> None:
@@ -73,14 +88,17 @@ def write_localization(localization: Localization, path: str | Path) -> None:
     estimates = [column for each in localization.measures.values() for column in (each.values, each.r90)]
     columns = [localization.positions_mm, localization.std_mm, localization.r50_mm, localization.r90_mm, *estimates]
     names = (*COLUMNS, *(name for measure in localization.measures for name in MEASURE_COLUMNS[measure]))
-    rows = np.column_stack(columns).tolist()
-    lines = [",".join([str(press), *(f"{value:.4f}" for value in row)]) for press, row in enumerate(rows)]
+    texts = [[f"{value:.4f}" for value in row] for row in np.column_stack(columns).tolist()]
+    is_unlike = np.zeros(len(texts), bool) if localization.unlike is None else localization.unlike
+    for row, unlike in zip(texts, is_unlike.tolist(), strict=True):
+        row.insert(COLUMNS.index("unlike") - 1, str(int(unlike)))
+    lines = [",".join([str(press), *row]) for press, row in enumerate(texts)]
     with reraise_write_error(Path(path)):
         write_text(Path(path), "\n".join([",".join(names), *lines]) + "\n")
 
 
 def concatenate(parts: Sequence[Localization]) -> Localization:
-    """Concatenate the predictions of localizers that predict the same measures; at least one part."""
+    """Concatenate the predictions of localizers that predict the same measures; at least one part, none judged."""
 
     def joined(estimates: Sequence[Any], *names: str) -> Iterator[Array]:
         return (np.concatenate([getattr(each, name) for each in estimates]) for name in names)
@@ -130,12 +148,14 @@ class LocalizerModel(LocalizerDocument):
         table: (S, S, C, F + G) scaled response by position, by which a recalibration augments presses.
         bayes: the Bayesian localizers, see `bayes.fit_stages`; none where depths vary, and of method "published".
         residual_network: weights of the network that corrects them.
+        single_press: tests whether one press explains the responses, one for each of `single_press.stages`.
     """
 
     networks: Networks
     table: Floats
     bayes: tuple[BayesianLocalizer, ...] = ()
     residual_network: Weights = field(default_factory=dict)
+    single_press: tuple[SinglePressTest, ...] = ()
 
     @property
     def fibres(self) -> int:
@@ -231,10 +251,64 @@ class LocalizerModel(LocalizerDocument):
                     f"fibre_mask is {mask.dtype} of shape {mask.shape}, expected bool {features.fibre_mask.shape}"
                 )
             features = replace(features, fibre_mask=features.fibre_mask & mask)
-        return self.predict_features(features, failed)
+        return self.localize(features, failed)
+
+    def is_other_pad(self, presses: ScaledFeatures) -> bool:
+        """Return whether presses are of another pad than that of the calibration, or of one cast again by its plan.
+
+        Fewer than 25 are not judged; a pad that drifts, or has two failed fibres, is no other.
+
+        Args:
+            presses: scaled features.
+        """
+        return is_other_pad(self.single_press, find_misfits(self.single_press, presses))
+
+    def calibrate_tests(self, recording: Recording, presses: Indices) -> tuple[SinglePressTest, ...]:
+        """Return `single_press` with what is usual of some presses of a recording, which were never trained on.
+
+        Args:
+            recording: as `raw_features`, and raises as it does.
+            presses: their indices.
+        """
+        frames, tests = framed(recording), []
+        for test, n_complete in zip(self.single_press, stages(len(self.interval_factors) - 1), strict=True):
+            until = complete_at(n_complete, frames.down_command, frames.up_command) if n_complete else None
+            tests.append(test.calibrated(self.scaled_features(recording, until)[presses]))
+        return tuple(tests)
+
+    def localize(self, presses: ScaledFeatures, failed: ArrayLike = ()) -> Localization:
+        """Predict the positions of Q presses, and judge whether each of them is a single press.
+
+        Args:
+            presses: scaled features.
+            failed: indices of fibres to mask in every press.
+
+        Raises:
+            InputError: as `predict_features`.
+        """
+        localization = self.predict_features(presses, failed)
+        presses = replace(presses, fibre_mask=np.logical_and(presses.fibre_mask, self._working(failed)))
+        unlike = find_unlike(self.single_press, presses)
+        rows = np.flatnonzero(unlike)
+        if self.sliding is not None and len(rows):  # the response to a finger that slides is that to many presses
+            inputs = presses.inputs[rows], presses.fibre_mask[rows], presses.seen[rows]
+            unlike[rows] = self.sliding.follow(self.networks[FOLLOWING], *inputs).moved <= MAY_SLIDE
+        std_mm, r50_mm, r90_mm = np.array(UNIFORM) * self.scaler.scale_mm
+        measures = {
+            target.name: replace(estimate, r90=np.where(unlike, target.scale, estimate.r90))
+            for target, estimate in zip(self.scaler.measures, localization.measures.values(), strict=True)
+        }
+        return Localization(
+            localization.positions_mm,
+            np.where(unlike[:, None], std_mm, localization.std_mm),
+            np.where(unlike, r50_mm, localization.r50_mm),
+            np.where(unlike, r90_mm, localization.r90_mm),
+            measures,
+            unlike,
+        )
 
     def predict_features(self, presses: ScaledFeatures, failed: ArrayLike = ()) -> Localization:
-        """Predict the positions of Q presses; one without a valid fibre may be anywhere, and its radii say so.
+        """Predict the positions of Q single presses; one without a valid fibre may be anywhere, and its radii say so.
 
         Args:
             presses: scaled features.
@@ -303,6 +377,8 @@ class LocalizerModel(LocalizerDocument):
         arrays |= {TABLE: self.table}
         for number, stage in enumerate(self.bayes):
             arrays |= stage.to_arrays(number)
+        for number, test in enumerate(self.single_press):
+            arrays |= test.to_arrays(number)
         files_of(folder, NAME).write(document, arrays)
 
     @classmethod
@@ -328,13 +404,15 @@ class LocalizerModel(LocalizerDocument):
         arrays = files.read_arrays(digest)
         table = arrays.pop(TABLE)
         networks: dict[str, dict[str, Any]] = {name: {} for name in (*PHASES[n_timed], RESIDUAL)}
-        for name in [name for name in arrays if not name.startswith(BAYES)]:
+        for name in [name for name in arrays if not name.startswith((BAYES, SINGLE_PRESS))]:
             phase, _, part = name.partition(".")
             networks[phase][part] = arrays.pop(name)
         residual_network = networks.pop(RESIDUAL)
-        stages = range((len(STAGES) if n_timed else 1) if residual_network else 0)
-        bayes = tuple(BayesianLocalizer.from_arrays(arrays, number) for number in stages)
-        return cls(**vars(document), networks=networks, table=table, bayes=bayes, residual_network=residual_network)
+        n_stages = (len(STAGES) if n_timed else 1) if residual_network else 0
+        bayes = tuple(BayesianLocalizer.from_arrays(arrays, number) for number in range(n_stages))
+        tests = tuple(SinglePressTest.from_arrays(arrays, number) for number in range(len(stages(n_timed))))
+        parts: dict[str, Any] = {"networks": networks, "table": table, "bayes": bayes, "single_press": tests}
+        return cls(**vars(document), **parts, residual_network=residual_network)
 
 
 def _read_document(document: Mapping[str, Any], where: str) -> tuple[LocalizerDocument, str]:

@@ -92,6 +92,8 @@ Bayesian localizers."""
 SOON, LEAST_SLIDE = 5, 3.0
 """Complete windows soon after the touch: a finger that is farther from where it was then than so many standard
 deviations is believed to have slid. Of presses at rest, hardly one is."""
+MAY_SLIDE = 1.75
+"""The same from which on it may have slid, and is not taken for two fingers: 5 % of pairs of fingers look like that."""
 STAGES = (12, 13, 14, 15, 17)
 """Numbers of complete windows of a press from which on a Bayesian localizer of its own answers, the first one after the
 release has shown: before, it errs a third more than a network."""

@@ -127,6 +127,7 @@ def recalibrate(
     changed = replace(
         changed,
         interval_factors=np.minimum(changed.interval_factors * widened, 1e6),
+        single_press=changed.calibrate_tests(recording, rows),
         recalibrated_by=(*model.recalibrated_by, recording.digest),
         provenance=made_by,
     )

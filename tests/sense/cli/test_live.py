@@ -9,14 +9,19 @@ from unittest.mock import Mock
 
 import pytest
 
+from padforge.design import Morphology
 from padforge.sense import Recording
 from padforge.sense.cli.live import EventPrinter, view_lines
 from padforge.sense.live import outputs
 from padforge.sense.live.outputs import LivePage
 from padforge.sense.live.pipeline import Estimate
+from padforge.sense.localizer.doubts import OTHER_PAD
 from padforge.sense.localizer.model import LocalizerModel
+from padforge.sense.localizer.single_press import MIN_PRESSES
 from padforge.sense.rig import simulated_board
 from padforge.sense.rig.devices import RigFault
+from padforge.sense.settings import RigSettings
+from padforge.sense.simulation.simulated_recording import simulate
 from tests.helpers.page_names import names_in_view
 from tests.sense.conftest import first_presses
 
@@ -27,6 +32,20 @@ def replay(few) -> Callable[..., tuple[int, str, str]]:
     replace(first_presses(Recording.open("rec"), 6), source={"rig": {"mirrored": True}}).save("mirrored", {})
     command = ("live", "--port", "0", "--model", "model", "--replay", "mirrored", "--speed", "1e6")
     return lambda *words: few(*command, *words)
+
+
+def test_live_says_that_another_pad_is_pressed(enough, views: list[dict]) -> None:
+    simulate(Morphology.straight(2), RigSettings(presses=30, seed=14)).save("again", {})
+    command = ("live", "--port", "0", "--model", "model", "--replay", "again", "--speed", "1e6", "--json")
+    code, out, _ = enough(*command)
+    events = [json.loads(line) for line in out.splitlines()]
+    (said,) = [event for event in events if event["event"] == "otherpad"]
+    assert (code, said["text"]) == (1, OTHER_PAD)
+    assert said["press"] >= MIN_PRESSES - 1
+    later = events[events.index(said) + 1 :]
+    assert {(event["event"], *event["failed"]) for event in later} == {("estimate",)}
+    assert {event["unlike"] for event in events if event["event"] == "estimate"} <= {True, False}
+    assert views[-1]["faults"] == [OTHER_PAD]
 
 
 @pytest.fixture

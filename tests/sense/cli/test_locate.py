@@ -9,11 +9,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from padforge.design import Morphology
 from padforge.sense import Recording
 from padforge.sense.health.fault_detector import HEALTH_FILES
+from padforge.sense.localizer.doubts import OTHER_PAD
 from padforge.sense.localizer.model import LocalizerModel
 from padforge.sense.localizer.moments import Moment
+from padforge.sense.settings import RigSettings
 from padforge.sense.signals.press_detection import first_readings
+from padforge.sense.simulation.simulated_recording import simulate
 from tests.sense.conftest import first_presses
 
 
@@ -21,7 +25,7 @@ def test_locate_excludes_fibres_by_number(few) -> None:
     code, out, _ = few("locate", "--model", "model", "rec", "--exclude-fibres", "1,4")
     assert (code, out) == (0, "60 positions -> places.csv\n")
     table = np.genfromtxt("places.csv", delimiter=",", names=True)
-    assert table.dtype.names == ("press", "x_mm", "y_mm", "std_x_mm", "std_y_mm", "r50_mm", "r90_mm")
+    assert table.dtype.names == ("press", "x_mm", "y_mm", "std_x_mm", "std_y_mm", "r50_mm", "r90_mm", "unlike")
     assert len(table) == 60
     assert (table["r50_mm"] < table["r90_mm"]).all()
     prediction = LocalizerModel.load("model").predict(Recording.open("rec"), (0, 3))
@@ -71,6 +75,34 @@ def test_locate_and_health_name_what_differs_from_the_calibration(enough) -> Non
     (shift,) = json.loads(out)["shifts"]
     assert (shift["kind"], shift["fibres"], shift["text"]) == ("rest", [2], err.strip())
     assert shift["value"] > shift["usual"][1]
+
+
+def test_a_pad_cast_again_is_said_to_be_another_and_no_fibre_is_masked(enough) -> None:
+    simulate(Morphology.straight(2), RigSettings(presses=40, seed=14)).save("again", {})
+    code, out, err = enough("locate", "--model", "model", "again")
+    assert (code, out, err) == (1, "40 positions -> places.csv\n", f"{OTHER_PAD}\n")
+    expected_mm = LocalizerModel.load("model").predict(Recording.open("again")).positions_mm
+    table = np.genfromtxt("places.csv", delimiter=",", names=True)
+    np.testing.assert_allclose(np.column_stack([table["x_mm"], table["y_mm"]]), expected_mm, atol=1e-4)
+    code, out, _ = enough("health", "--model", "model", "again")
+    assert (code, out) == (1, f"{OTHER_PAD}\n")
+    code, out, _ = enough("health", "--model", "model", "again", "--json")
+    document = json.loads(out)
+    assert (code, document["other_pad"], document["findings"], document["shifts"]) == (1, True, [], [])
+    code, out, _ = enough("evaluate", "--model", "model", "again", "--max-failures", "0")
+    assert (code, out.count(f"doubtful: {OTHER_PAD}\n"), out.count("doubtful")) == (1, 1, 1)
+
+
+def test_two_fingers_are_marked_in_the_table(enough) -> None:
+    """A recording is superposed on itself, some presses later."""
+    whole = Recording.open("rec")
+    readings = whole.readings + np.roll(whole.readings, -7 * 40, axis=0) - np.median(whole.readings, axis=0)
+    two = replace(whole, readings=readings)
+    two.save("two", {})
+    enough("locate", "--model", "model", "two")
+    unlike = np.genfromtxt("places.csv", delimiter=",", names=True)["unlike"]
+    assert 0 < unlike.mean() < 1
+    np.testing.assert_array_equal(unlike, LocalizerModel.load("model").predict(two).unlike)
 
 
 @pytest.mark.usefixtures("blank")

@@ -105,7 +105,7 @@ def test_lerobot_records_a_pad_beside_an_arm(lerobot: Run, model: Path, tmp_path
     read = read_dataset(lerobot, tmp_path / "set")
     assert len(read["episodes"]) == 2, said
     names, fibres = read["features"]["observation.state"], [f"pad.fibre_{fibre}_v" for fibre in range(4)]
-    touch = [f"pad.{name}" for name in ("pressed", "valid", "x_mm", "y_mm", "r90_mm")]
+    touch = [f"pad.{name}" for name in ("pressed", "valid", "x_mm", "y_mm", "r90_mm", "unlike")]
     assert names == ["elbow.pos", "wrist.pos", *fibres, *touch]
     state = dict(zip(names, read["frames"]["observation.state"].T, strict=True))
     action = read["frames"]["action"]

@@ -95,7 +95,7 @@ def test_touch_messages_are_metres_with_variances(messages) -> None:
 @given(st.floats(-1e10, 1e10) | st.builds(operator.sub, st.integers(-(10**6), 10**6), st.floats(0, 1e-9)))
 @example(1.9999999996)
 def test_stamp_is_the_nearest_nanosecond(time_s: float) -> None:
-    silent: Any = SimpleNamespace(pressed=False, view=lambda: {"fibres": []})
+    silent: Any = SimpleNamespace(pressed=False, is_other_pad=False, view=lambda: {"fibres": []})
     health, _ = MessageBuilder(silent).build(np.array([time_s]), np.zeros((1, 1)), [])
     stamp = health.msg["header"]["stamp"]
     assert 0 <= stamp["nanosec"] < 10**9

@@ -129,4 +129,4 @@ def test_sensor_waits_for_no_silent_board(boards, sensor: PadSensor, monkeypatch
 def test_sensor_names_depth_and_force_where_they_were_learnt(deep_localizer: LocalizerModel, tmp_path: Path) -> None:
     deep_localizer.save(tmp_path / "deep")
     names = PadSensor("simulated", tmp_path / "deep", RigSettings()).names
-    assert names[-7:] == ("x_mm", "y_mm", "r90_mm", "depth_mm", "depth_r90_mm", "force_n", "force_r90_n")
+    assert names[-8:] == ("x_mm", "y_mm", "r90_mm", "unlike", "depth_mm", "depth_r90_mm", "force_n", "force_r90_n")

@@ -307,12 +307,12 @@ def test_track_has_the_places_that_a_finger_has_moved_to(recording, hasty, monke
     up_command[0] = part.down_command[1] - 2
     path = iter(range(1000))
 
-    def predict_features(model, presses) -> Localization:
+    def localize(model, presses) -> Localization:
         x = next(path)
         r90 = np.array([8.0 if x == 0 else 2.0])
         return Localization(np.array([[float(x), 0.0]]), np.ones((1, 2)), r90 / 2, r90)
 
-    monkeypatch.setattr(LocalizerModel, "predict_features", predict_features)
+    monkeypatch.setattr(LocalizerModel, "localize", localize)
     part = replace(part, up_command=up_command)
     monkeypatch.setattr("padforge.sense.live.pipeline.PressDetector", ScriptedDetector(part))
     live, next_down = Live(hasty, rate_hz=part.rate_hz), int(part.down_command[1])

@@ -149,18 +149,20 @@ def test_write_localization_writes_one_line_a_press(tmp_path: Path) -> None:
     plain = Localization(places, sd, np.array([0.4, 1.5]), np.ones(2) * 3)
     write_localization(plain, tmp_path / "places.csv")
     assert (tmp_path / "places.csv").read_text().splitlines() == [
-        "press,x_mm,y_mm,std_x_mm,std_y_mm,r50_mm,r90_mm",
-        "0,1.2346,-2.0000,0.5000,0.2500,0.4000,3.0000",
-        "1,0.0000,3.5000,1.0000,2.0000,1.5000,3.0000",
+        "press,x_mm,y_mm,std_x_mm,std_y_mm,r50_mm,r90_mm,unlike",
+        "0,1.2346,-2.0000,0.5000,0.2500,0.4000,3.0000,0",
+        "1,0.0000,3.5000,1.0000,2.0000,1.5000,3.0000,0",
     ]
     force = MeasureEstimate(np.array([7.0, 8.0]), np.ones(2))
     deep = replace(
-        plain, measures={"depth_mm": MeasureEstimate(np.array([1.25, 2]), np.array([0.5, 1])), "force_n": force}
+        plain,
+        unlike=np.array([True, False]),
+        measures={"depth_mm": MeasureEstimate(np.array([1.25, 2]), np.array([0.5, 1])), "force_n": force},
     )
     write_localization(deep, tmp_path / "places.csv")
     header, line, _ = (tmp_path / "places.csv").read_text().splitlines()
-    assert header.endswith("r90_mm,depth_mm,depth_r90_mm,force_n,force_r90_n")
-    assert line.endswith("3.0000,1.2500,0.5000,7.0000,1.0000")
+    assert header.endswith("r90_mm,unlike,depth_mm,depth_r90_mm,force_n,force_r90_n")
+    assert line.endswith("3.0000,1,1.2500,0.5000,7.0000,1.0000")
     with pytest.raises(InputError, match="cannot be written"):
         write_localization(plain, tmp_path)
 

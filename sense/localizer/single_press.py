@@ -1,0 +1,286 @@
+"""Whether one press explains the responses of a pad, and whether they are those of the pad of the calibration.
+
+The responses of a press are, but for its strength, those expected at some position, with the scatter of the presses
+near it. What the best position and strength leave, in units of that scatter, is the misfit of a press: on another pad,
+the typical press has a large one. Two fingers are told from one by the generalized likelihood ratio: by how much less
+two presses leave than one. What is usual of both is learnt on presses that were never trained on.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from functools import cached_property
+from itertools import combinations
+from math import sqrt
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy.special import stdtrit
+
+from padforge.design.objectives.fibre_loss import failure_subsets
+from padforge.sense.arrays import Array, Floats, Indices, Mask
+from padforge.sense.localizer.bayes import SCATTER_WIDTH, fit_lda, local_scatter, mean_distance
+from padforge.sense.localizer.moments import N_DOWN, N_TIMED, NOW, count_complete
+from padforge.sense.localizer.response_model import grid_positions, interpolate_grid
+from padforge.sense.localizer.scaler import ScaledFeatures, TrainingPresses
+
+STAGES = (N_DOWN, N_TIMED)
+"""Numbers of complete windows from which on presses are judged: while the finger rests, and after the release."""
+COMPONENTS = 4  # discriminant directions of a fibre: further ones are noise, in which two presses look like one
+COARSENING = 6  # cells of the response table along a side of a cell of the grid
+MIN_CELLS, MIN_SHARE = 2, 0.2
+"""Distance of two presses, in cells of the grid, and the response to the weaker over that to the stronger, at least:
+what lies nearer, or is weaker, is the error of the response model."""
+MAX_STRENGTH = 1.5
+"""Response to either of two presses over that to the strongest of the training, at most: a single press that is twice
+as deep leaves much, which two strong ones would explain."""
+FALSE_RATE = 0.01  # share of single presses that are said to be none
+LEVELS, SUBSETS = 4, 4
+"""Numbers of failed fibres, from 0, that what is usual is learnt for; and sets of a size that it is learnt by."""
+MAX_LEFT_OUT = 2
+"""Fibres that may have failed before a pad is called another, but a third of them at most: few fit any press."""
+MIN_MISFIT, MIN_MISFIT_LEFT_OUT = 1.35, 0.4
+"""Mean logarithm of the misfits over that of the calibration, in standard deviations of single presses, from which on
+they are another pad's: with all fibres, and without those that fit worst. After 1500 presses, 30 of pads cast again by
+the same plan had 2.0 and 0.6 or more; of healthy ones 0.5 and 0.3 at most; of pads whose gains drifted by up to 20 %
+not both above these; with two fibres failed in any way 0.4 at most without them."""
+MIN_PRESSES, MAX_PRESSES = 25, 300  # of which a pad is judged
+MIN_DET = 1e-3  # of the Gram matrix of two responses over the product of their norms: below, they hardly differ
+MIN_SHARE_LEFT = 1e-6  # of a number, since its logarithm is taken
+MIN_STD = 0.1  # of logarithms of misfits, of which few presses may have hardly any
+PREFIX = "single_press."  # of the names of the arrays in files
+_CHUNK = 256
+
+
+@dataclass(frozen=True)
+class SinglePressTest:
+    """Expected responses of a pad at one stage of a press, and what presses usually leave of them."""
+
+    projection: Array  # (C, F + G, D), scaled features to whitened discriminants
+    positions: Array  # (P, 2), scaled, of a grid over the presses
+    expected: Array  # (P, C, D) discriminants of the response
+    precision: Array  # (P, C, D, D), inverse of their scatter
+    offset: Array  # (C, D), discriminants of no response at all
+    floor_share: Array  # (1,), share of the scatter that does not grow with the response
+    max_strength: Array  # (1,), of either of two presses
+    limit: Array  # (L,) by number of failed fibres: root likelihood ratio that a single press does not exceed
+    usual_misfit: Array  # (L, 2), mean and standard deviation of its logarithm
+    n_presses: Array  # (1,), on which the last two rest; 0 before `calibrated`
+
+    @classmethod
+    def fit(cls, table: Floats, presses: TrainingPresses, zero: Array, n_complete: int) -> "SinglePressTest":
+        """Fit the scatter of presses about the response, when so many windows are complete.
+
+        Args:
+            table: scaled response by position, over [-1, 1] in x and y; shape (S, S, C, F + G).
+            presses: presses of training, as far from the table as if it had been fitted without them.
+            zero: scaled features of a pad that does not respond, with a minus sign; shape (C, F + G).
+            n_complete: number of complete windows; 0 if features know no moment.
+        """
+        n_timed, side = presses.seen.shape[1], len(table)
+        usable = np.ones(table.shape[3], bool)
+        usable[n_complete : n_timed + len(NOW) if n_timed else 0] = False
+        table = np.where(usable, table, 0.0)
+        positions = presses.targets[:, :2].astype(np.float64)
+        relative_depth = 1 + presses.depth_gain * presses.targets[:, 2:3] if presses.depth_gain else np.ones((1, 1))
+        at_presses = relative_depth * interpolate_grid(table.reshape(side, side, -1), positions)
+        residual = presses.inputs - at_presses.reshape(presses.inputs.shape)
+        fibres = table.shape[2]
+        projection = np.zeros((fibres, len(usable), COMPONENTS))
+        for fibre in range(fibres):
+            used, valid = table[:, :, fibre].any(axis=(0, 1)), presses.fibre_mask[:, fibre]
+            expected = table[:, :, fibre, used].reshape(side * side, -1)
+            projection[fibre, used] = fit_lda(expected, residual[valid, fibre][:, used], COMPONENTS)
+        residual = np.einsum("qcf,cfd->qcd", residual, projection) * presses.fibre_mask[:, :, None]
+        offset = np.einsum("cf,cfd->cd", zero * usable, projection)
+        responses = np.einsum("xycf,cfd->xycd", table, projection) + offset
+        low, high = positions.min(axis=0), positions.max(axis=0)
+        grid = grid_positions(side)[::COARSENING, ::COARSENING]
+        step, cell = 2 / (side - 1), float(grid[1, 0, 0] - grid[0, 0, 0])
+        inside = ((grid >= low - cell / 2) & (grid <= high + cell / 2)).all(axis=2)
+        slopes = np.stack(np.gradient(responses, step, axis=(0, 1)), axis=-1)[::COARSENING, ::COARSENING][inside]
+        width = max(cell, SCATTER_WIDTH * mean_distance(positions))
+        scatter = local_scatter(grid[inside], positions, residual, presses.fibre_mask, width)
+        # A position of the grid stands for its cell, over which the response varies by its slope.
+        blurred = scatter.reshape(-1, fibres, COMPONENTS, COMPONENTS) + cell**2 / 12 * slopes @ slopes.swapaxes(2, 3)
+        response = relative_depth * interpolate_grid(responses.reshape(side, side, -1), positions)
+        return cls(
+            projection=projection,
+            positions=grid[inside],
+            expected=responses[::COARSENING, ::COARSENING][inside],
+            precision=np.linalg.inv(blurred),
+            offset=offset,
+            floor_share=np.array([_floor_share(residual, response.reshape(residual.shape))]),
+            max_strength=np.array([MAX_STRENGTH * float(relative_depth.max())]),
+            limit=np.full(LEVELS, np.inf),
+            usual_misfit=np.tile([0.0, 1.0], (LEVELS, 1)),
+            n_presses=np.zeros(1),
+        )
+
+    def calibrated(self, presses: ScaledFeatures) -> "SinglePressTest":
+        """Learn what is usual from presses that were never trained on, with any fibres failed."""
+        fibres, n_presses = len(self.expected[0]), len(presses)
+        limit, usual = self.limit.copy(), self.usual_misfit.copy()
+        for level in range(min(LEVELS, fibres) if n_presses > 1 else 0):
+            subsets = failure_subsets(fibres, level, SUBSETS)
+            masks = [presses.fibre_mask & ~np.isin(np.arange(fibres), failed) for failed in subsets]
+            ratio = np.concatenate([self._root_likelihood_ratio(presses.inputs, mask) for mask in masks])
+            misfit = np.concatenate([self._fit(presses.inputs, mask[:, None]).log_misfit[:, 0] for mask in masks])
+            # of a normal distribution that is known from so many presses only
+            quantile = stdtrit(n_presses - 1, 1 - FALSE_RATE) * sqrt(1 + 1 / n_presses)
+            limit[level] = ratio.mean() + quantile * ratio.std()
+            usual[level] = misfit.mean(), max(misfit.std(), MIN_STD)
+        return replace(self, limit=limit, usual_misfit=usual, n_presses=np.array([float(n_presses)]))
+
+    def is_unlike(self, inputs: Floats, fibre_mask: Mask) -> Mask:
+        """Return (Q,) whether two presses explain (Q, C, F + G) scaled features much better than one."""
+        limit = self.limit[np.minimum((~fibre_mask).sum(axis=1), LEVELS - 1)]
+        # the ratio is no more than what one press leaves
+        rows = np.flatnonzero(self._fit(inputs, fibre_mask[:, None]).misfit[:, 0] > limit**2)
+        unlike = np.zeros(len(inputs), bool)
+        unlike[rows] = self._root_likelihood_ratio(inputs[rows], fibre_mask[rows]) > limit[rows]
+        return unlike
+
+    def misfits(self, inputs: Floats, fibre_mask: Mask) -> Array:
+        """Return (Q, M) misfits, in standard deviations from the usual, without each set of up to MAX_LEFT_OUT fibres.
+
+        The first is with all fibres in the (Q, C) mask.
+        """
+        fibres = fibre_mask.shape[1]
+        most = min(MAX_LEFT_OUT, fibres // 3)
+        sets = [left_out for size in range(most + 1) for left_out in combinations(range(fibres), size)]
+        masks = fibre_mask[:, None] & np.array([~np.isin(np.arange(fibres), left_out) for left_out in sets])
+        mean, std = self.usual_misfit[np.minimum((~masks).sum(axis=2), LEVELS - 1)].transpose(2, 0, 1)
+        return (self._fit(inputs, masks).log_misfit - mean) / std
+
+    def _fit(self, inputs: Floats, masks: Mask) -> "_Fit":
+        """Fit one press to each of Q, by the fibres in each of M masks; inputs (Q, C, F + G), masks (Q, M, C)."""
+        parts = [
+            self._fit_chunk(self._project(inputs[first : first + _CHUNK]), masks[first : first + _CHUNK])
+            for first in range(0, max(len(inputs), 1), _CHUNK)
+        ]
+        return _Fit(*map(np.concatenate, zip(*parts, strict=True)))
+
+    def _fit_chunk(self, z: Array, masks: Mask) -> "_Fit":
+        """Fit presses of (Q, C, D) discriminants: at each position, the strength has a closed form."""
+        first, second = np.triu_indices(COMPONENTS)
+        squares = self.precision[:, :, first, second] * np.where(first == second, 1.0, 2.0)
+        weighted = np.einsum("pcde,pce->pcd", self.precision, self.expected)
+        fibre_masks = masks.swapaxes(1, 2).astype(np.float64)
+
+        def over_fibres(part: Array) -> Array:  # (Q, P, C) or (P, C) to (Q, P, M)
+            return part @ fibre_masks
+
+        own = over_fibres(np.einsum("qcm,pcm->qpc", z[:, :, first] * z[:, :, second], squares, optimize=True))
+        cross = over_fibres(np.einsum("qcd,pcd->qpc", z, weighted, optimize=True))
+        norm = over_fibres(np.einsum("pcd,pcd->pc", weighted, self.expected))
+        strength = np.maximum(cross / np.maximum(norm, 1e-9), 0.0)
+        growth = np.maximum(self.floor_share + (1 - self.floor_share) * strength**2, 1.0)
+        misfit = (own - strength * cross) / growth
+        best = misfit.argmin(axis=1)
+        misfit, growth = (np.take_along_axis(part, best[:, None], axis=1)[:, 0] for part in (misfit, growth))
+        numbers = np.maximum(COMPONENTS * masks.sum(axis=2), 1)
+        return _Fit(np.log(np.maximum(misfit / numbers, MIN_SHARE_LEFT)), misfit, best, growth)
+
+    def _root_likelihood_ratio(self, inputs: Floats, fibre_mask: Mask) -> Array:
+        """Return (Q,) the root of twice the log-likelihood ratio of two presses over one.
+
+        Both are taken to have the scatter of the one that fits best.
+        """
+        one, z = self._fit(inputs, fibre_mask[:, None]), self._project(inputs)
+        ratios = np.empty(len(z))
+        for press, (position, valid) in enumerate(zip(one.position[:, 0], fibre_mask, strict=True)):
+            whitening = np.linalg.cholesky(self.precision[position, valid])
+            expected = (self.expected[:, valid, None] @ whitening).reshape(len(self.positions), -1)
+            measured = (z[press, valid, None] @ whitening).ravel()
+            gram, moment = expected @ expected.T, expected @ measured
+            norm = np.diag(gram)[:, None] * np.diag(gram)
+            det = np.maximum(norm - gram**2, MIN_DET * norm)  # responses may hardly differ
+            first = (np.diag(gram) * moment[:, None] - gram * moment) / np.maximum(det, 1e-9)  # strengths of both
+            second = first.T
+            is_pair = self._is_apart & (first > MIN_SHARE * second) & (second > MIN_SHARE * first)
+            is_pair &= np.maximum(first, second) < self.max_strength
+            explained = np.where(is_pair, first * moment[:, None] + second * moment, 0.0).max()
+            two = (measured @ measured - explained) / one.scatter_growth[press, 0]
+            ratios[press] = sqrt(max(one.misfit[press, 0] - two, 0.0))
+        return ratios
+
+    def _project(self, inputs: Floats) -> Array:
+        """(Q, C, D) discriminants of (Q, C, F + G) scaled features, of which missing fibres count for nothing."""
+        return np.einsum("qcf,cfd->qcd", np.nan_to_num(inputs), self.projection, optimize=True) + self.offset
+
+    @cached_property
+    def _is_apart(self) -> Mask:
+        """(P, P), which positions two fingers may press."""
+        distance = np.linalg.norm(self.positions[:, None] - self.positions, axis=2)
+        return distance > (MIN_CELLS - 0.5) * distance[distance > 0].min(initial=np.inf)
+
+    def to_arrays(self, number: int) -> dict[str, Array]:
+        """Return the arrays of the `number`-th stage by their names in files."""
+        return {f"{PREFIX}{number}.{each.name}": getattr(self, each.name) for each in fields(self)}
+
+    @classmethod
+    def from_arrays(cls, arrays: Mapping[str, Any], number: int) -> "SinglePressTest":
+        """Read what `to_arrays` returned."""
+        return cls(**{each.name: arrays[f"{PREFIX}{number}.{each.name}"] for each in fields(cls)})
+
+
+def find_unlike(tests: Sequence[SinglePressTest], presses: ScaledFeatures) -> Mask:
+    """Return (Q,) whether two presses explain the features much better than one, by the last stage that is complete.
+
+    Presses that have reached none are not judged.
+    """
+    n_complete, unlike = count_complete(presses.seen), np.zeros(len(presses), bool)
+    numbers = stages(presses.seen.shape[1])
+    for test, first, end in zip(tests, numbers, [*numbers[1:], np.inf], strict=False):
+        rows = np.flatnonzero((n_complete >= first) & (n_complete < end))
+        unlike[rows] = test.is_unlike(presses.inputs[rows], presses.fibre_mask[rows])
+    return unlike
+
+
+def stages(n_timed: int) -> tuple[int, ...]:
+    """Return the numbers of complete windows, of K, from which on there is a test; 0 alone if K is 0."""
+    return STAGES if n_timed else (0,)
+
+
+def find_misfits(tests: Sequence[SinglePressTest], presses: ScaledFeatures) -> Array:
+    """Return (Q, M) `SinglePressTest.misfits` of whole presses, MAX_PRESSES of them at most; none without tests."""
+    whole = np.flatnonzero(count_complete(presses.seen) == presses.seen.shape[1]) if tests else np.empty(0, np.int64)
+    rows = whole[np.linspace(0, len(whole) - 1, min(len(whole), MAX_PRESSES)).astype(np.int64)]
+    return tests[-1].misfits(presses.inputs[rows], presses.fibre_mask[rows]) if tests else np.empty((0, 1))
+
+
+def is_other_pad(tests: Sequence[SinglePressTest], misfits: Array) -> bool:
+    """Return whether presses with (Q, M) misfits are of another pad than that of the calibration, or one cast again.
+
+    Fewer than MIN_PRESSES are not judged. A failed fibre fits badly, too, but the others fit well without it.
+    """
+    if len(misfits) < MIN_PRESSES or tests[-1].n_presses[0] < 2:
+        return False
+    mean, uncertainty = misfits.mean(axis=0), 1 / sqrt(tests[-1].n_presses[0])
+    return bool(mean[0] > MIN_MISFIT + uncertainty and mean.min() > MIN_MISFIT_LEFT_OUT + uncertainty)
+
+
+class _Fit(NamedTuple):
+    """The press that fits best, by the fibres in each mask; shapes (Q, M)."""
+
+    log_misfit: Array  # logarithm of the misfit for each number that was measured
+    misfit: Array  # square of what it leaves, in units of the scatter
+    position: Indices  # of `SinglePressTest.positions`
+    scatter_growth: Array  # variance of a press so strong over that of those of the training
+
+
+def _floor_share(residual: Array, response: Array) -> float:
+    """Return the share of the scatter that does not grow with the response, from (Q, C, D) presses of training.
+
+    The scatter of the stronger half of the responses is compared with that of the weaker half. The strength of a press,
+    which all fibres have in common, is fitted to each press and does not count.
+    """
+    norm = np.maximum((response**2).sum(axis=(1, 2)), 1e-9)
+    strength = (residual * response).sum(axis=(1, 2)) / norm
+    residual = residual - strength[:, None, None] * response
+    scatter, energy = ((part**2).mean(axis=2).ravel() for part in (residual, response))
+    is_strong = energy > np.median(energy)
+    if not is_strong.any() or not scatter.any():
+        return 1.0
+    growth, stronger = (part[is_strong].mean() - part[~is_strong].mean() for part in (scatter, energy))
+    return float(np.clip(1 - growth / stronger * energy.mean() / scatter.mean(), 0.0, 1.0))
