@@ -65,7 +65,7 @@ def hash_calibration() -> Iterator[Result]:
     faulty[half:, 1] = faulty[half, 1]
     recordings = recording, replace(recording, readings=faulty)
     yield "health", digest([fault.text for each in recordings for fault in detector.predict(each)])
-    live = sense.Live(model, detector.live_model_, recording.fibres, recording.rate_hz)
+    live = sense.Live(model, rate_hz=recording.rate_hz, health=detector.live_model_)
     middle = slice(half - 1000, half + 3000)
     yield "live", digest(live.feed(recording.times_s[middle], faulty[middle]), live.view())
 
