@@ -201,10 +201,11 @@ class TrainingPresses(ScaledFeatures):
     speed: float  # scaled distance that 1 mm/s goes from one reading to the next; 0 where presses do not slide
 
 
-def leave_one_out_residuals(presses: TrainingPresses, table: Floats) -> TrainingPresses:
+def leave_one_out_residuals(presses: TrainingPresses, table: Floats, leverage: Array | None = None) -> TrainingPresses:
     """Move presses as far from the response table as if it had been fitted without them, and others at their position.
 
     The leave-one-out residual of a linear fit is the residual over 1 - leverage: of some hundred presses, a third more.
+    `leverage` (Q, C) is that of a fit with a prior; None without.
     """
     targets = presses.targets.astype(np.float64)
     positions, relative_depth = targets[:, :2], np.ones(len(targets))
@@ -212,6 +213,8 @@ def leave_one_out_residuals(presses: TrainingPresses, table: Floats) -> Training
         relative_depth += presses.depth_gain * targets[:, 2]
     expected = interpolate_grid(table.reshape(*table.shape[:2], -1), positions).reshape(presses.inputs.shape)
     expected = relative_depth[:, None, None] * expected
-    leverage = np.minimum(leverages(positions, relative_depth), MAX_LEVERAGE)[:, None, None]
+    if leverage is None:
+        leverage = leverages(positions, relative_depth)[:, None]
+    leverage = np.minimum(leverage, MAX_LEVERAGE)[:, :, None]
     residual = (presses.inputs - expected) / np.where(table.any(axis=(0, 1)), 1 - leverage, 1.0)
     return replace(presses, inputs=(expected + residual).astype(np.float32))
