@@ -236,20 +236,34 @@ def deploy(model: Path, files: tuple[Path, ...]) -> None:
 @click.command()
 @model_option
 @recording_argument
+@click.option(
+    "--morphology", type=FILE, help="The pad as planned: morphology.json or published .mat (default: the recording's)."
+)
 @common.seed_option
 @common.out_option()
 @common.force_option
 @common.json_option
-def recalibrate(model: Path, recording: Path, seed: int | None, out: Path | None, force: bool, as_json: bool) -> None:
-    """Adapt a model to a pad that has drifted or was cast again. RECORDING holds 20 to 500 presses at known positions.
+def recalibrate(
+    model: Path,
+    recording: Path,
+    morphology: Path | None,
+    seed: int | None,
+    out: Path | None,
+    force: bool,
+    as_json: bool,
+) -> None:
+    """Adapt a model to a pad that has drifted, was cast again or has a new fibre. RECORDING holds 20 to 500 presses at
+    known positions.
 
     \b
     padforge sense recalibrate --model out/pad out/later/recording
 
-    Writes a model and recalibration.json. Changes are kept only if they reduce the error in cross-validation. The old
-    model is replaced only if --out names its folder.
+    Writes a model and recalibration.json. Changes are kept only if they reduce the error in cross-validation. What the
+    plan says of a new fibre takes the place of many presses: with --morphology, the fibres are on the channels in its
+    order, and positions are from the middle of the pad. The old model is replaced only if --out names its folder.
     """
     from padforge.common.files import atomic_files, check_replaceable, check_writable, write_json
+    from padforge.design.morphology import Morphology
     from padforge.sense.formats.import_export import open_recording
     from padforge.sense.health.fault_detector import HEALTH_FILES, FaultDetector, has_health
     from padforge.sense.localizer import recalibration
@@ -262,7 +276,8 @@ def recalibrate(model: Path, recording: Path, seed: int | None, out: Path | None
     old, opened = LocalizerModel.load(model), open_recording(recording)
     detector = FaultDetector.load(model) if has_health(model) else None
     with common.progress_bar("recalibrating") as report:
-        localizer, result = recalibration.recalibrate(old, opened, seed=seed or 0, on_progress=report)
+        pad = None if morphology is None else Morphology.load(morphology)
+        localizer, result = recalibration.recalibrate(old, opened, pad=pad, seed=seed or 0, on_progress=report)
     with atomic_files(target, without=HEALTH_FILES) as folder:
         localizer.save(folder)
         replaced = target / "localizer.json"

@@ -22,9 +22,10 @@ earlier pad. A fibre that differs from the earlier one as much as another fibre 
 KERNELS, REMAINDER_STD = ((1.0, 0.003), (1.0, 0.03), (1.0, 0.3), (0.0, 1.0)), 0.35
 """Shares of them that the maps of a prior and a smooth remainder have, and the distance over which this changes, in
 scaled positions. The last one believes nothing of the maps."""
-MIN_LOG_ODDS = 1.0
-"""Difference of log evidence, for each press, from which on a fibre is that of the earlier pad: fibres that drifted have
-2 to 5. Windows are correlated, so that chance makes some of it."""
+MIN_LOG_ODDS, MIN_OLD_SHARE = 1.0, 0.5
+"""Difference of log evidence, for each press, from which on a fibre is that of the earlier pad: windows are correlated,
+so that chance makes some, and fibres that drifted have 2 to 5. A pad of which no more than a share are is another one,
+and these are so by chance."""
 SCATTER_SHARE, ROUNDS = 0.8, 2
 """Share of the variance of a press, in a pad as built, that grows with the square of its response; and how often the
 process is fitted, the first time as if there were none."""
@@ -64,7 +65,7 @@ def fit_response(
 ) -> ResponseFit:
     """Fit the response, fibre by fibre, to the presses in which the fibre is valid; it takes the cube of their number.
 
-    A pad of which no more than half of the fibres are those of the earlier one is another pad, and all of them are new.
+    A fibre that is valid in none stays as it was, or 0.
 
     Args:
         positions: within [-1, 1]; shape (Q, 2).
@@ -73,25 +74,25 @@ def fit_response(
         prior: what is known before.
         relative_depth: of each press over that of the table; shape (Q,). 1 if None.
     """
-    fibres, size = windows.shape[1:]
     depth = np.ones(len(positions)) if relative_depth is None else relative_depth
-    processes = []
-    for fibre in range(fibres):
+    fibres = np.flatnonzero(fibre_mask.any(axis=0))
+    table = np.zeros((GRID_CELLS + 1, GRID_CELLS + 1, *windows.shape[1:])) if prior.mean is None else prior.mean.copy()
+    processes, odds = [], np.zeros(len(fibres))
+    for number, fibre in enumerate(fibres):
         valid = fibre_mask[:, fibre]
-        maps, mean = prior.deviations[:, :, fibre], None if prior.mean is None else prior.mean[:, :, fibre]
-        presses = positions[valid], windows[valid, fibre], depth[valid]
+        presses, maps = (positions[valid], windows[valid, fibre], depth[valid]), prior.deviations[:, :, fibre]
         new = _fit_process(*presses, maps, None, SNR_NEW)
-        processes.append((new, new if mean is None else _fit_process(*presses, maps, mean, SNR_OLD)))
-    odds = np.array([old.log_evidence - new.log_evidence for new, old in processes])
-    is_old = odds > MIN_LOG_ODDS * fibre_mask.sum(axis=0)
-    is_old &= is_old.mean() > 0.5
-    side, leverage = GRID_CELLS + 1, np.zeros(fibre_mask.shape)
-    table = np.zeros((side, side, fibres, size))
-    for fibre, process in enumerate(processes):
-        chosen = process[int(is_old[fibre])]
-        table[:, :, fibre] = chosen.response_on_grid()
-        leverage[fibre_mask[:, fibre], fibre] = chosen.leverages()
-    return ResponseFit(table, leverage, ~is_old)
+        old = new if prior.mean is None else _fit_process(*presses, maps, prior.mean[:, :, fibre], SNR_OLD)
+        processes.append((new, old))
+        odds[number] = (old.log_evidence - new.log_evidence) / len(presses[0])
+    is_old = odds > MIN_LOG_ODDS
+    is_old &= is_old.mean() > MIN_OLD_SHARE
+    leverage, is_new = np.zeros(fibre_mask.shape), np.zeros(fibre_mask.shape[1], bool)
+    is_new[fibres] = ~is_old
+    for fibre, process in zip(fibres, processes, strict=True):
+        fitted = process[int(not is_new[fibre])]
+        table[:, :, fibre], leverage[fibre_mask[:, fibre], fibre] = fitted.response_on_grid(), fitted.leverages()
+    return ResponseFit(table, leverage, is_new)
 
 
 class _Process(NamedTuple):

@@ -114,7 +114,7 @@ def test_evaluate_lists_errors_of_depth_and_force(deep) -> None:
 
 @pytest.mark.usefixtures("blank")
 def test_a_drifted_pad_is_followed_into_a_new_model(few, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(training, "FINE_TUNING_STEPS", 15)
+    monkeypatch.setattr(training, "RETRAINING_STEPS", 15)
     before = files_in("model")
     assert few("record", "--presses", "20", "--seed", "2", "--out", "later/recording")[0] == 0
     assert few("recalibrate", "--model", "model", "later/recording")[0] == 0

@@ -109,7 +109,7 @@ def workshop(few_presses: Path, tmp_path_factory: pytest.TempPathFactory) -> Pat
 def test_invalid_command_fails_in_one_line(
     padforge_sense, workshop: Path, monkeypatch: pytest.MonkeyPatch, words: str, said: str
 ) -> None:
-    monkeypatch.setattr("padforge.sense.localizer.training.FINE_TUNING_STEPS", 1)
+    monkeypatch.setattr("padforge.sense.localizer.training.RETRAINING_STEPS", 1)
     monkeypatch.setattr("padforge.sense.rig.boards.due.list_due_ports", list)
     monkeypatch.chdir(workshop)
     before = {path: path.stat().st_mtime_ns for path in workshop.rglob("*") if path.is_file()}
