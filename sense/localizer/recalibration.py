@@ -31,8 +31,8 @@ from padforge.sense.localizer.model import Localization, LocalizerModel, concate
 from padforge.sense.localizer.network import Weights, answering
 from padforge.sense.localizer.response_model import grid_positions
 from padforge.sense.localizer.response_priors import map_prior, plan_prior, planned_pad, stated_contact
-from padforge.sense.localizer.response_process import ResponsePrior, fit_response
-from padforge.sense.localizer.scaler import leave_one_out_residuals
+from padforge.sense.localizer.response_process import ResponsePrior
+from padforge.sense.localizer.scaler import leave_one_out_residuals, refit_response
 from padforge.sense.recording.frames import frame_rate_hz
 from padforge.sense.recording.recording import Recording
 
@@ -238,19 +238,10 @@ class _Refit:
         # Where the depth of a press is unknown, its prediction is kept.
         known = {name: np.where(np.isnan(values), predicted[name].values, values) for name, values in measures.items()}
         presses = scaler.training_presses(features, positions_mm, known, frame_rate_hz(old.rate_hz))
-        size = features.windows.shape[2]
-        offset = (scaler.mean_v / scaler.scale_v)[:, :size]
-        maps = old.table[:, :, :, :size] + offset
+        n_windows = features.windows.shape[2]
+        maps = scaler.uncentre(old.table)[..., :n_windows]
         prior = map_prior(maps) if self.prior is None else replace(self.prior, mean=maps)
-        response = fit_response(
-            presses.targets[:, :2].astype(np.float64),
-            presses.inputs[:, :, :size] + offset,
-            presses.fibre_mask,
-            prior,
-            1 + scaler.depth_gain * presses.targets[:, 2] if scaler.measures else None,
-        )
-        table = old.table.copy()
-        table[:, :, :, :size] = response.table - offset
+        table, response = refit_response(scaler, presses, old.table, n_windows, prior)
         presses = leave_one_out_residuals(presses, table, response.leverage)
         fitted = presses.inputs, presses.fibre_mask, presses.targets[:, :2]
         bayes = fit_stages(table, *fitted, n_timed, earlier=old.bayes) if old.bayes else ()

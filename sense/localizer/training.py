@@ -26,7 +26,7 @@ from padforge.common.parallel import makespan, one_torch_thread, run_tasks
 from padforge.common.progress import OnProgress, ignore_progress
 from padforge.common.validation import InputError
 from padforge.design.published.networks import fit_batch
-from padforge.sense.arrays import Floats
+from padforge.sense.arrays import Array, Floats
 from padforge.sense.localizer.bayes import BayesianLocalizer, fit_stages
 from padforge.sense.localizer.moments import CORRECTED, PHASES, RESIDUAL, Phase
 from padforge.sense.localizer.network import (
@@ -183,16 +183,18 @@ def train_members(
     rng: np.random.Generator,
     on_progress: OnProgress,
     time_budget: float | None = None,
+    leverage: Array | None = None,
 ) -> TrainedNetworks:
     """Train the members of the localizer; the last of several is a Bayesian localizer with its residual network.
 
     A member has a network for each phase of a press. Where depths vary there is no Bayesian localizer. Networks are
     trained in threads. `table` is the (S, S, C, F + G) scaled response by position, over [-1, 1] in x and y.
     `time_budget` is in seconds, for as many members as these are good for, and the progress is in seconds then, else in
-    steps of all networks. InputError is raised if it ends before each network has taken `MIN_STEPS`.
+    steps of all networks. `leverage` is as in `leave_one_out_residuals`. InputError is raised if a budget ends before
+    each network has taken `MIN_STEPS`.
     """
     begin = time.monotonic()
-    n_timed, presses = presses.seen.shape[1], leave_one_out_residuals(presses, table)
+    n_timed, presses = presses.seen.shape[1], leave_one_out_residuals(presses, table, leverage)
     phases = PHASES[n_timed]
     steps = training_steps(len(presses.inputs), options) * (HARDER if presses.depth_gain else 1)
     length, has_bayes = sum(phase.length for phase in phases.values()), options.members > 1 and not presses.depth_gain
