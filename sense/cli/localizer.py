@@ -77,8 +77,8 @@ def calibrate(
     error_map.png, error_by_loss.png and error_by_moment.png. Exit 1 if the recording is doubtful: units that cannot be
     right, or presses that cannot lie where it says.
 
-    Of a pad whose fibres are on the channels in the order of its plan, and that is pressed at positions from its middle,
-    --morphology says what few presses do not.
+    --morphology says what few presses do not, of a pad whose fibres are on the channels in the order of its plan, and
+    that is pressed at positions from its middle.
 
     A time budget is that of the training. On top come radii and errors, which may take as long as a training, and what
     --without leaves out: health most of all. A budget in which nothing can be learnt is refused, and a line says when

@@ -44,6 +44,7 @@ R90_STD = 1.645  # standard deviations in the half-width that holds 90 % of a no
 DIFFERENCE = 0.02
 """Step of numerical derivatives, in prior standard deviations: shorter ones drown in the rounding of the network."""
 MIN_PRESSES = 10  # new presses needed: fewer can neither change much nor show that it was for the better
+MAX_PRESSES = 500  # that are looked at: a fit takes the cube of them, and of more a calibration errs no more
 FOLDS = 5
 CORRECT_FROM, REFIT_FROM = 2.0, 0.0
 """Gains, in standard errors, from which a correction, which is coarse, and refitting, which gains the more the more
@@ -106,7 +107,7 @@ def recalibrate(
 
     Args:
         model: the localizer so far.
-        recording: of the pad as it is now, with some 20 to 500 presses of known position; others are not looked at.
+        recording: of the pad as it is now, with some 20 to 500 presses of known position; of more, so many are drawn.
         pad: as planned, with its fibres on the channels in order; None for that of the recording, if it holds one.
         seed: of the folds and of the training.
         on_progress: called with (steps done, steps in all, "").
@@ -124,7 +125,7 @@ def recalibrate(
     if len(known) < MIN_PRESSES:
         raise InputError(f"recording has {len(known)} presses of known position, expected at least {MIN_PRESSES}")
     pad = planned_pad(recording, pad)
-    rows = np.random.default_rng(seed).permutation(known)
+    rows = np.random.default_rng(seed).permutation(known)[:MAX_PRESSES]
     features, positions_mm = model.raw_features(recording)[rows], recording.presses_mm[rows]
     measures = {each.name: recording.measures[each.name][rows] for each in model.scaler.measures}
     subsets = [failure_subsets(model.fibres, n_failed, SUBSETS) for n_failed in range(model.max_failures + 1)]

@@ -6,10 +6,9 @@ Both are smooth along it, so that some ten numbers, which a press at each tenth 
 
 import numpy as np
 
+from padforge.common.settings import validate
 from padforge.common.validation import InputError
 from padforge.design import Contact, Morphology
-from padforge.design.contact import quick_signals, widened
-from padforge.design.kernels.measured_signals import LAYER_PRECISION
 from padforge.sense.arrays import Array
 from padforge.sense.localizer.response_model import GRID_CELLS, grid_positions
 from padforge.sense.localizer.response_process import ResponsePrior
@@ -28,19 +27,20 @@ def planned_pad(recording: Recording, pad: Morphology | None = None) -> Morpholo
     A recording of a twin holds a plan that lay otherwise under the arm, which tells nothing of its positions.
 
     Raises:
-        InputError: a pad of another number of fibres than the recording has.
+        InputError: `pad` has another number of fibres than the recording.
     """
-    plan = recording.source.get("morphology")
-    if pad is None and plan is not None and "twin" not in recording.source:
-        pad = Morphology.from_dict(plan)
     if pad is not None and len(pad.knots) != recording.fibres:
         raise InputError(f"pad has {len(pad.knots)} fibres, the recording {recording.fibres}; expected as many")
-    return pad
+    plan = recording.source.get("morphology")
+    if pad is not None or plan is None or "twin" in recording.source:
+        return pad
+    held = Morphology.from_dict(plan)
+    return held if len(held.knots) == recording.fibres else None
 
 
 def stated_contact(recording: Recording) -> Contact:
     """Return the contact that a simulated recording states; the default one of others."""
-    return Contact(**recording.source.get("contact", {}))
+    return validate(Contact, recording.source.get("contact", {}), "recording: contact")
 
 
 def plan_prior(pad: Morphology, contact: Contact, origin_mm: Array, scale_mm: float) -> ResponsePrior:
@@ -52,6 +52,10 @@ def plan_prior(pad: Morphology, contact: Contact, origin_mm: Array, scale_mm: fl
         origin_mm: position that is 0 when scaled, mm from the middle of the pad; shape (2,).
         scale_mm: distance that is 1 when scaled, mm.
     """
+    # compiled kernels take long to import
+    from padforge.design.contact import quick_signals, widened
+    from padforge.design.kernels.measured_signals import LAYER_PRECISION
+
     side, fibres = GRID_CELLS + 1, len(pad.knots)
     grid = pad.to_grid(grid_positions(side).reshape(-1, 2) * scale_mm + origin_mm)
     nodes = np.linspace(0, 1, N_NODES)
