@@ -118,6 +118,7 @@ def calibrate(
     """
     check_type("recording", recording, Recording)
     options = or_default("options", options, LocalizerSettings)
+    pad = None if pad is None else planned_pad(recording, pad)
     time_budget = None if time_budget is None else check_float("time_budget", time_budget, 0, MAX_TIME_BUDGET_S)
     if options.method == "published" and time_budget is not None:
         raise InputError("time_budget is given: method published has no time limit, expected method ensemble")
@@ -167,7 +168,7 @@ def fit_recording(
     origin: tuple[Any, ...] = "published" if is_published else "windows", recording.rate_hz, recording.digest
     data = CalibrationData(features, detected, recording.presses_mm, measures, *origin, None if is_published else at)
     if pad is not None:
-        data = replace(data, pad=planned_pad(recording, pad), contact=stated_contact(recording))
+        data = replace(data, pad=pad, contact=stated_contact(recording))
     return fit_model(data, training, options, rng, on_progress, time_budget)
 
 

@@ -41,6 +41,8 @@ health --model model rec                        | health
 calibrate rec --seed 5 --out studied            | localizer.json: fibre_loss.json was made from it; choose another
 recalibrate --model model rec --out studied     | localizer.json: fibre_loss.json was made from it; choose another
 identify rec {straight} --out designed          | twin.json: design.json was made from it; choose another --out
+recalibrate --model model rec {five} --out n    | pad has 10 fibres, the recording 4; expected as many
+calibrate rec {five} --out n                    | pad has 10 fibres, the recording 4; expected as many
 recalibrate --model empty/../model model/recording | padforge: model: holds the old model; name a folder
 deploy --model model localizer.tflite           | localizer.tflite: cannot be written, expected a name that ends in
 deploy --model model other l.onnx               | readings are of 6 fibres, the localizer was learnt from 4
