@@ -1,13 +1,14 @@
 """Recalibration: a localizer follows its pad, or another one of the same plan, by a few new presses.
 
-Three models are compared by cross-validation over these presses, each a change of the one before:
+Three models are compared by cross-validation over these presses:
 
 1. The localizer as it is.
 2. Corrected: a gain for every fibre, and the position, angle and scale of the pad, which fold into the scaling of the
    features and the last layer of the networks.
-3. Refitted: the response of each fibre anew, with the maps so far and the plan of the pad as its prior, so that a fibre
-   that is the same keeps its map and one that is not gets another; the Bayesian localizers by it, and the networks
-   trained further on it. This is for a pad that drifted as for one cast again, or of which a fibre was replaced.
+3. Refitted: the response of each fibre anew, with the maps so far, corrected if that is more probable, and the plan of
+   the pad as its prior, so that a fibre that is the same keeps its map and one that is not gets another; the Bayesian
+   localizers by it, and the networks trained further on it. This is for a pad that drifted as for one cast again, or of
+   which a fibre was replaced.
 """
 
 from collections.abc import Callable, Sequence
@@ -31,8 +32,8 @@ from padforge.sense.localizer.model import Localization, LocalizerModel, concate
 from padforge.sense.localizer.network import Weights, answering
 from padforge.sense.localizer.response_model import grid_positions
 from padforge.sense.localizer.response_priors import map_prior, plan_prior, planned_pad, stated_contact
-from padforge.sense.localizer.response_process import ResponsePrior
-from padforge.sense.localizer.scaler import leave_one_out_residuals, refit_response
+from padforge.sense.localizer.response_process import ResponseFit, ResponsePrior
+from padforge.sense.localizer.scaler import TrainingPresses, leave_one_out_residuals, refit_response
 from padforge.sense.recording.frames import frame_rate_hz
 from padforge.sense.recording.recording import Recording
 
@@ -62,7 +63,7 @@ class Recalibration:
 
     Attributes:
         presses: number of new presses.
-        changes: that were kept, of "corrected" and "refitted".
+        change: that was kept, "corrected" or "refitted"; None if none was.
         candidates: "change" (None as it was), "mean_mm" and "standard_error_mm" of all that were compared: errors of
             presses left out, and standard errors of their gains; averaged over numbers of failed fibres.
         new_fibres: indices of the fibres that do not respond as they did, if refitted.
@@ -76,7 +77,7 @@ class Recalibration:
     """
 
     presses: int
-    changes: list[str]
+    change: str | None
     candidates: list[dict[str, Any]]
     new_fibres: list[int]
     twice_as_many_mm: float | None
@@ -137,16 +138,15 @@ def recalibrate(
     def step() -> None:
         on_progress(next(steps), total, "")
 
-    # 1. Correction
-    folds, after, changed, changes = [model] * FOLDS, before, model, []
+    folds, after, changed, change = [model] * FOLDS, before, model, None
     candidates = [validation.candidate(None, before, before)]
-    corrected = validation.change(folds, fit_correction)
-    predictions = validation.predict(corrected)
+
+    # 1. Correction
+    predictions = validation.predict(validation.change(folds, fit_correction))
     candidates.append(validation.candidate("corrected", before, predictions))
     gain, standard_error = validation.gain(before, predictions)
     if gain > CORRECT_FROM * standard_error:
-        changed, folds, after = fit_correction(model, *presses), corrected, predictions
-        changes.append("corrected")
+        changed, after, change = fit_correction(model, *presses), predictions, "corrected"
     step()
 
     # 2. Response
@@ -166,11 +166,10 @@ def recalibrate(
         candidates.append(validation.candidate("refitted", before, predictions))
         gain, standard_error = validation.gain(after, predictions)
         if gain > REFIT_FROM * standard_error:
-            half = halves.predict(halves.change([changed] * 2, refit_last))
+            half = halves.predict(halves.change([model] * 2, refit_last))
             twice_as_many_mm = _extrapolate(validation.mean_error(predictions), halves.mean_error(half))
-            changed, is_new = refit(changed, *presses)
-            after, new_fibres = predictions, np.flatnonzero(is_new).tolist()
-            changes.append("refitted")
+            changed, is_new = refit(model, *presses)
+            after, change, new_fibres = predictions, "refitted", np.flatnonzero(is_new).tolist()
     on_progress(total, total, "")
 
     # 3. Radii
@@ -181,7 +180,7 @@ def recalibrate(
     made_by |= {"inputs": inputs, "recording_kind": recording.source.get("kind")}
     result = Recalibration(
         presses=len(rows),
-        changes=changes,
+        change=change,
         candidates=candidates,
         new_fibres=new_fibres,
         twice_as_many_mm=twice_as_many_mm,
@@ -234,25 +233,35 @@ class _Refit:
         """
         from padforge.sense.localizer.training import retrain  # torch takes long to import
 
-        scaler, n_timed = old.scaler, features.seen.shape[1]
+        starts = [old, fit_correction(old, features, positions_mm, measures)]
+        fits = [self._fit_response(start, features, positions_mm, measures) for start in starts]
+        number = int(np.argmax([fit.log_evidence for *_, fit in fits]))
+        start, (presses, table, response) = starts[number], fits[number]
+        presses, n_timed = leave_one_out_residuals(presses, table, response.leverage), features.seen.shape[1]
+        fitted = presses.inputs, presses.fibre_mask, presses.targets[:, :2]
+        bayes = fit_stages(table, *fitted, n_timed, earlier=start.bayes) if start.bayes else ()
+        last = answering(start.networks, n_timed, n_timed, bool(bayes))
+        networks = {name: weights for name, weights in start.networks.items() if not only_last or name in last}
+        rng = np.random.default_rng([self.seed, len(features)])
+        retrained = retrain(networks, start.residual_network, presses, table, start.max_failures, rng, bayes)
+        networks, residual_network = {**start.networks, **retrained[0]}, retrained[1]
+        changed = replace(start, networks=networks, residual_network=residual_network, bayes=bayes, table=table)
+        return changed, response.is_new
+
+    def _fit_response(
+        self, old: LocalizerModel, features: PressFeatures, positions_mm: Array, measures: Measures
+    ) -> tuple[TrainingPresses, Floats, ResponseFit]:
+        """Scaled presses, the response table (S, S, C, F + G), and its fit, whose evidence is of windows in volts."""
+        scaler, n_windows = old.scaler, features.windows.shape[2]
         predicted = old.predict_features(scaler.transform(features)).measures
         # Where the depth of a press is unknown, its prediction is kept.
         known = {name: np.where(np.isnan(values), predicted[name].values, values) for name, values in measures.items()}
         presses = scaler.training_presses(features, positions_mm, known, frame_rate_hz(old.rate_hz))
-        n_windows = features.windows.shape[2]
         maps = scaler.uncentre(old.table)[..., :n_windows]
         prior = map_prior(maps) if self.prior is None else replace(self.prior, mean=maps)
         table, response = refit_response(scaler, presses, old.table, n_windows, prior)
-        presses = leave_one_out_residuals(presses, table, response.leverage)
-        fitted = presses.inputs, presses.fibre_mask, presses.targets[:, :2]
-        bayes = fit_stages(table, *fitted, n_timed, earlier=old.bayes) if old.bayes else ()
-        last = answering(old.networks, n_timed, n_timed, bool(bayes))
-        networks = {name: weights for name, weights in old.networks.items() if not only_last or name in last}
-        rng = np.random.default_rng([self.seed, len(features)])
-        retrained = retrain(networks, old.residual_network, presses, table, old.max_failures, rng, bayes)
-        networks, residual_network = {**old.networks, **retrained[0]}, retrained[1]
-        changed = replace(old, networks=networks, residual_network=residual_network, bayes=bayes, table=table)
-        return changed, response.is_new
+        log_scale = float(presses.fibre_mask.sum(axis=0) @ np.log(scaler.scale_v[:, :n_windows]).sum(axis=1))
+        return presses, table, replace(response, log_evidence=response.log_evidence - log_scale)
 
 
 def fit_correction(
@@ -388,13 +397,12 @@ class CrossValidation:
 
 def recalibration_lines(result: Recalibration) -> list[str]:
     """Format a recalibration: what each change gives, a table of the one that was kept, and a conclusion."""
-    kept = result.changes[-1] if result.changes else None
     names = {None: "as it was", "corrected": "corrected by gains and pose", "refitted": "response fitted again"}
     lines = [f"{result.presses} new presses, each predicted by what was changed without it; error in mm"]
     for each in result.candidates:
         error = f" +- {each['standard_error_mm']:.2f}" if each["change"] else ""
-        chosen = "  <- kept" if each["change"] == kept else ""
-        lines.append(f"{each['mean_mm']:6.2f}{error:8}  {names[each['change']]}{chosen}")
+        kept = "  <- kept" if each["change"] == result.change else ""
+        lines.append(f"{each['mean_mm']:6.2f}{error:8}  {names[each['change']]}{kept}")
     lines += [
         "failed  sets  before mm  after mm  in r90 before  in r90 after",
         *(
@@ -406,9 +414,9 @@ def recalibration_lines(result: Recalibration) -> list[str]:
     if result.new_fibres:
         numbers = ", ".join(str(fibre + 1) for fibre in result.new_fibres)
         lines.append(f"learnt again, as they respond unlike those of the old model: fibres {numbers}")
-    if result.changes:
+    if result.change:
         gain = f"{result.gain_mm:.3f} mm (standard error {result.standard_error_mm:.3f} mm)"
-        lines.append(f"{' and '.join(result.changes)}: errors shrink by {gain}")
+        lines.append(f"{result.change}: errors shrink by {gain}")
     else:
         lines.append("nothing gained: positions are predicted as before")
     if result.twice_as_many_mm is not None:

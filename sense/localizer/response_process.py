@@ -22,10 +22,10 @@ earlier pad. A fibre that differs from the earlier one as much as another fibre 
 KERNELS, REMAINDER_STD = ((1.0, 0.003), (1.0, 0.03), (1.0, 0.3), (0.0, 1.0)), 0.35
 """Shares of them that the maps of a prior and a smooth remainder have, and the distance over which this changes, in
 scaled positions. The last one believes nothing of the maps."""
-MIN_LOG_ODDS, MIN_OLD_SHARE = 1.0, 0.5
-"""Difference of log evidence, for each press, from which on a fibre is that of the earlier pad: windows are correlated,
-so that chance makes some, and fibres that drifted have 2 to 5. A pad of which no more than a share are is another one,
-and these are so by chance."""
+LOG_ODDS, MIN_OLD_SHARE = 0.05, 0.5
+"""Difference of log evidence, for each press and window, that speaks for a fibre of the earlier pad, and below minus it
+for another: windows are correlated, so that chance makes some. It speaks for more than a share of the fibres of the same
+pad, also of one that has drifted; then the others are believed to be those of before unless it speaks against them."""
 SCATTER_SHARE, ROUNDS = 0.8, 2
 """Share of the variance of a press, in a pad as built, that grows with the square of its response; and how often the
 process is fitted, the first time as if there were none."""
@@ -53,11 +53,13 @@ class ResponseFit:
         table: windows on the grid of the prior; shape (S, S, C, F).
         leverage: of presses, 0 to 1, those at one position together; shape (Q, C).
         is_new: fibres that are not those of an earlier pad; shape (C,).
+        log_evidence: of the windows, as scaled.
     """
 
     table: Array
     leverage: Array
     is_new: Mask
+    log_evidence: float
 
 
 def fit_response(
@@ -84,15 +86,17 @@ def fit_response(
         new = _fit_process(*presses, maps, None, SNR_NEW)
         old = new if prior.mean is None else _fit_process(*presses, maps, prior.mean[:, :, fibre], SNR_OLD)
         processes.append((new, old))
-        odds[number] = (old.log_evidence - new.log_evidence) / len(presses[0])
-    is_old = odds > MIN_LOG_ODDS
-    is_old &= is_old.mean() > MIN_OLD_SHARE
+        odds[number] = (old.log_evidence - new.log_evidence) / presses[1].size
+    is_same_pad = (odds > LOG_ODDS).mean() > MIN_OLD_SHARE
+    is_old = is_same_pad & (odds > -LOG_ODDS)
     leverage, is_new = np.zeros(fibre_mask.shape), np.zeros(fibre_mask.shape[1], bool)
     is_new[fibres] = ~is_old
+    log_evidence = 0.0
     for fibre, process in zip(fibres, processes, strict=True):
         fitted = process[int(not is_new[fibre])]
         table[:, :, fibre], leverage[fibre_mask[:, fibre], fibre] = fitted.response_on_grid(), fitted.leverages()
-    return ResponseFit(table, leverage, is_new)
+        log_evidence += fitted.log_evidence
+    return ResponseFit(table, leverage, is_new, log_evidence)
 
 
 class _Process(NamedTuple):

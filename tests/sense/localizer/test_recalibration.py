@@ -105,7 +105,7 @@ def test_recalibrate_follows_a_remade_pad(localizer: LocalizerModel, recording: 
         before, after, usual = (error(one, presses, LATER, lost) for one, presses in pairs)
         # Of the error with fibres lost, little is the change's: most of it no recalibration can take away.
         assert after - usual < (1.0 if lost else 0.3) * (before - usual)
-    assert "corrected" in result.changes
+    assert (result.change, result.new_fibres) in (("corrected", []), ("refitted", []))
     assert result.gain_mm > 2 * result.standard_error_mm > 0
     shrunk = [old["mean_mm"] - new["mean_mm"] for old, new in zip(result.before, result.after, strict=True)]
     assert min(shrunk) > 0
@@ -132,7 +132,7 @@ def test_recalibrate_learns_another_pad_of_the_plan_and_a_new_fibre(localizer, r
     rig = RigSettings(presses=300, seed=2)
     other = simulate(Morphology.from_dict(recording.source["morphology"]), rig)
     now, result = recalibrate(localizer, known_only(other, NEW))
-    assert (result.changes[-1], result.new_fibres) == ("refitted", [0, 1, 2, 3])
+    assert (result.change, result.new_fibres) == ("refitted", [0, 1, 2, 3])
     assert error(now, other, LATER) < 0.6 * error(localizer, other, LATER)
     assert [row["change"] for row in result.candidates] == [None, "corrected", "refitted"]
     # The same presses on the pad of before, but for one fibre.
@@ -142,7 +142,7 @@ def test_recalibrate_learns_another_pad_of_the_plan_and_a_new_fibre(localizer, r
     readings[:, 2] = other.readings[:, 2]
     mended = replace(mended, readings=readings)
     now, result = recalibrate(localizer, known_only(mended, NEW))
-    assert (result.changes[-1], result.new_fibres) == ("refitted", [2])
+    assert (result.change, result.new_fibres) == ("refitted", [2])
     assert error(now, mended, LATER) < 0.8 * error(localizer, mended, LATER)
     assert error(now, mended, LATER) < error(localizer, mended, LATER, (2,))
 
@@ -153,7 +153,7 @@ def test_recalibrate_keeps_an_unchanged_pad(
     monkeypatch.setattr("padforge.sense.localizer.recalibration.SUBSETS", 1)
     monkeypatch.setattr("padforge.sense.localizer.recalibration.FOLDS", 3)
     now, result = recalibrate(localizer, known_only(recording, NEW))
-    assert "corrected" not in result.changes
+    assert result.change != "corrected"
     assert result.gain_mm >= 0  # what does not reduce the error is not kept
     assert not result.new_fibres
     assert error(now, recording, LATER) < 1.03 * error(localizer, recording, LATER)
@@ -215,7 +215,7 @@ def test_recalibration_lines_compare_candidates_and_conclude() -> None:
         {"change": "corrected", "mean_mm": 3.4, "standard_error_mm": 0.2},
         {"change": "refitted", "mean_mm": 2.0, "standard_error_mm": 0.125},
     ]
-    result = Recalibration(60, ["refitted"], candidates, [1, 3], 1.75, before, after, 1.5, 0.125, [], {})
+    result = Recalibration(60, "refitted", candidates, [1, 3], 1.75, before, after, 1.5, 0.125, [], {})
     lines = recalibration_lines(result)
     assert lines[0].startswith("60 new presses")
     assert lines[1:4] == [
@@ -229,6 +229,6 @@ def test_recalibration_lines_compare_candidates_and_conclude() -> None:
         "refitted: errors shrink by 1.500 mm (standard error 0.125 mm)",
         "twice as many presses: about 1.75 mm",
     ]
-    same = replace(result, changes=[], new_fibres=[], twice_as_many_mm=None)
+    same = replace(result, change=None, new_fibres=[], twice_as_many_mm=None)
     assert recalibration_lines(same)[1].endswith("as it was  <- kept")
     assert recalibration_lines(same)[-1] == "nothing gained: positions are predicted as before"
