@@ -24,8 +24,8 @@ KERNELS, REMAINDER_STD = ((1.0, 0.003), (1.0, 0.03), (1.0, 0.3), (0.0, 1.0)), 0.
 scaled positions. The last one believes nothing of the maps."""
 LOG_ODDS, MIN_OLD_SHARE = 0.05, 0.5
 """Difference of log evidence, for each press and window, that speaks for a fibre of the earlier pad, and below minus it
-for another: windows are correlated, so that chance makes some. It speaks for more than a share of the fibres of the same
-pad, also of one that has drifted; then the others are believed to be those of before unless it speaks against them."""
+for another: windows are correlated, so that chance makes some. It speaks for more than a share of the fibres of the
+same pad, also of one that has drifted; then the others are those of before unless it speaks against them."""
 SCATTER_SHARE, ROUNDS = 0.8, 2
 """Share of the variance of a press, in a pad as built, that grows with the square of its response; and how often the
 process is fitted, the first time as if there were none."""
