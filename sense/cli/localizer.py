@@ -266,8 +266,9 @@ def recalibrate(
     force: bool,
     as_json: bool,
 ) -> None:
-    """Adapt a model to a pad that has drifted, was cast again or has a new fibre. RECORDING holds 20 to 500 presses at
-    known positions.
+    """Adapt a model to a changed pad. RECORDING holds 20 to 500 presses at known positions.
+
+    The pad may have drifted, have been cast again or have a new fibre.
 
     \b
     padforge sense recalibrate --model out/pad out/later/recording
