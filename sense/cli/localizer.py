@@ -34,6 +34,9 @@ from padforge.sense.cli.options import (
     type=click.Choice(METHODS),
     help="ensemble: one localizer for all failed fibres; published: the network of the paper.",
 )
+@click.option(
+    "--morphology", type=FILE, help="The pad as planned: morphology.json or published .mat, for up to 500 presses."
+)
 @click.option("--test-split", "split", type=click.Choice(SPLITS), help="How test presses are chosen.")
 @click.option(
     "--time-budget",
@@ -55,7 +58,13 @@ from padforge.sense.cli.options import (
 @common.profile_option
 @click.pass_context
 def calibrate(
-    context: click.Context, recording: Path, spec: Path | None, out: Path | None, as_json: bool, **options: Any
+    context: click.Context,
+    recording: Path,
+    morphology: Path | None,
+    spec: Path | None,
+    out: Path | None,
+    as_json: bool,
+    **options: Any,
 ) -> None:
     """Train a localizer on RECORDING. It is tested on held-out presses.
 
@@ -68,11 +77,15 @@ def calibrate(
     error_map.png, error_by_loss.png and error_by_moment.png. Exit 1 if the recording is doubtful: units that cannot be
     right, or presses that cannot lie where it says.
 
+    --morphology says what few presses do not, of a pad whose fibres are on the channels in the order of its plan, and
+    that is pressed at positions from its middle.
+
     A time budget is that of the training. On top come radii and errors, which may take as long as a training, and what
     --without leaves out: health most of all. A budget in which nothing can be learnt is refused, and a line says when
     the localizer is not trained out.
     """
     from padforge.common.files import locked_folder
+    from padforge.design.morphology import Morphology
     from padforge.sense.localizer.evaluation import calibration_lines, moment_lines
     from padforge.sense.report.calibration import calibrate_into
     from padforge.sense.settings import LocalizerSettings
@@ -82,7 +95,8 @@ def calibrate(
     with locked_folder(folder):
         settings, presses = common.load_spec(spec).section(LocalizerSettings, **options), read_recording(recording)
         with common.progress_bar("training") as show:
-            document = calibrate_into(presses, folder, settings, on_progress=show, **run)
+            pad = None if morphology is None else Morphology.load(morphology)
+            document = calibrate_into(presses, folder, settings, pad=pad, on_progress=show, **run)
     lines = [pressed_line(presses), *calibration_lines(document), *moment_lines(document["by_moment"])]
     common.show_result(document, lines, as_json)
     context.exit(int(bool(document["doubts"])))
@@ -247,20 +261,35 @@ def deploy(model: Path, files: tuple[Path, ...]) -> None:
 @click.command()
 @model_option
 @recording_argument
+@click.option(
+    "--morphology", type=FILE, help="The pad as planned: morphology.json or published .mat (default: the recording's)."
+)
 @common.seed_option
 @common.out_option()
 @common.force_option
 @common.json_option
-def recalibrate(model: Path, recording: Path, seed: int | None, out: Path | None, force: bool, as_json: bool) -> None:
-    """Adapt a model to a pad that has drifted or was cast again. RECORDING holds 20 to 500 presses at known positions.
+def recalibrate(
+    model: Path,
+    recording: Path,
+    morphology: Path | None,
+    seed: int | None,
+    out: Path | None,
+    force: bool,
+    as_json: bool,
+) -> None:
+    """Adapt a model to a changed pad. RECORDING holds 20 to 500 presses at known positions.
+
+    The pad may have drifted, have been cast again or have a new fibre.
 
     \b
     padforge sense recalibrate --model out/pad out/later/recording
 
-    Writes a model and recalibration.json. Changes are kept only if they reduce the error in cross-validation. The old
-    model is replaced only if --out names its folder.
+    Writes a model and recalibration.json. Changes are kept only if they reduce the error in cross-validation. What the
+    plan says of a new fibre takes the place of many presses: with --morphology, the fibres are on the channels in its
+    order, and positions are from the middle of the pad. The old model is replaced only if --out names its folder.
     """
     from padforge.common.files import atomic_files, check_replaceable, check_writable, write_json
+    from padforge.design.morphology import Morphology
     from padforge.sense.formats.import_export import open_recording
     from padforge.sense.health.fault_detector import HEALTH_FILES, FaultDetector, has_health
     from padforge.sense.localizer import recalibration
@@ -273,7 +302,8 @@ def recalibrate(model: Path, recording: Path, seed: int | None, out: Path | None
     old, opened = LocalizerModel.load(model), open_recording(recording)
     detector = FaultDetector.load(model) if has_health(model) else None
     with common.progress_bar("recalibrating") as report:
-        localizer, result = recalibration.recalibrate(old, opened, seed=seed or 0, on_progress=report)
+        pad = None if morphology is None else Morphology.load(morphology)
+        localizer, result = recalibration.recalibrate(old, opened, pad=pad, seed=seed or 0, on_progress=report)
     with atomic_files(target, without=HEALTH_FILES) as folder:
         localizer.save(folder)
         replaced = target / "localizer.json"

@@ -6,7 +6,7 @@ From there a few Gauss-Newton steps lead to the maximum a posteriori position, t
 (the steps of an iterated Kalman filter: M. S. Grewal and A. P. Andrews, Kalman filtering, 2015).
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
@@ -54,11 +54,19 @@ class BayesianLocalizer:
     shift: Any  # (2,), added to the rotated positions
 
     @classmethod
-    def fit(cls, table: Any, inputs: Any, fibre_mask: Mask, positions: Any) -> "BayesianLocalizer":
-        """Fit to scaled presses and the (S, S, C, F + G) table of their response over [-1, 1] in x and y."""
+    def fit(
+        cls, table: Any, inputs: Any, fibre_mask: Mask, positions: Any, earlier: "BayesianLocalizer | None" = None
+    ) -> "BayesianLocalizer":
+        """Fit to scaled presses and the (S, S, C, F + G) table of their response over [-1, 1] in x and y.
+
+        Discriminants, and the area that is pressed, are those of an `earlier` localizer, if any: how the windows of a
+        fibre scatter together depends on the silicone more than on the pad, and few presses do not tell it.
+        """
         side, _, fibres, size = table.shape
         table, inputs, positions = (part.astype(np.float64) for part in (table, inputs, positions))
         low, high = positions.min(axis=0), positions.max(axis=0)
+        if earlier is not None:
+            low, high = np.minimum(low, earlier.bounds[0]), np.maximum(high, earlier.bounds[1])
         grid = grid_positions(side)
         step, coarse = float(grid[1, 0, 0] - grid[0, 0, 0]), grid[::COARSENING, ::COARSENING]
         fine = (slice(None, None, LINEARIZED),) * 2
@@ -67,6 +75,9 @@ class BayesianLocalizer:
         residual = inputs - interpolate_grid(table.reshape(side, side, -1), positions).reshape(inputs.shape)
         projection = np.zeros((fibres, size, COMPONENTS))
         for fibre in range(fibres):
+            if earlier is not None and earlier.projection[fibre].any():
+                projection[fibre] = earlier.projection[fibre]
+                continue
             used, valid = table[:, :, fibre].any(axis=(0, 1)), fibre_mask[:, fibre]
             expected = table[:, :, fibre, used].reshape(side * side, -1)
             projection[fibre, used] = fit_lda(expected, residual[valid, fibre][:, used], COMPONENTS)
@@ -164,6 +175,7 @@ def fit_stages(
     positions: Any,
     n_timed: int,
     on_progress: OnProgress = ignore_progress,
+    earlier: Sequence[BayesianLocalizer] = (),
 ) -> tuple[BayesianLocalizer, ...]:
     """Fit a localizer for each of `STAGES`, or one if `n_timed` = K is 0; arguments as in `BayesianLocalizer.fit`.
 
@@ -175,7 +187,8 @@ def fit_stages(
         unused = slice(n_complete, n_timed + len(NOW) if n_timed else 0)
         kept = table.copy()
         kept[:, :, :, unused] = 0
-        stages.append(BayesianLocalizer.fit(kept, inputs, fibre_mask, positions))
+        before = earlier[len(stages)] if earlier else None
+        stages.append(BayesianLocalizer.fit(kept, inputs, fibre_mask, positions, before))
     return tuple(stages)
 
 

@@ -5,7 +5,7 @@ whose error ends the training.
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -16,6 +16,7 @@ from padforge.common.profiling import stage
 from padforge.common.progress import OnProgress, ignore_progress
 from padforge.common.settings import or_default
 from padforge.common.validation import InputError, check_float, check_type
+from padforge.design import Contact, Morphology
 from padforge.design.objectives.fibre_loss import failure_subsets
 from padforge.sense.arrays import Array, Indices
 from padforge.sense.localizer.bayes import N_SUMMARY
@@ -41,12 +42,14 @@ from padforge.sense.localizer.network import (
     check_weights,
     predict_members,
 )
-from padforge.sense.localizer.scaler import FeatureScaler, ScaledFeatures, leave_one_out_residuals
+from padforge.sense.localizer.response_priors import plan_prior, planned_pad, stated_contact
+from padforge.sense.localizer.scaler import FeatureScaler, ScaledFeatures, leave_one_out_residuals, refit_response
 from padforge.sense.localizer.single_press import SinglePressTest, stages
 from padforge.sense.recording.frames import frame_rate_hz, framed
 from padforge.sense.recording.recording import Recording
 from padforge.sense.settings import LocalizerSettings
 
+FEW_PRESSES = 500  # up to which the plan of a pad says more of its response than basis functions do
 MIN_TRAINING = 3  # presses that a split must leave to learn from: fewer have no scale
 CALIBRATION_SHARE = {"ensemble": 0.08, "published": 0.15 / 0.85}
 """Share of the presses of training that calibrate the uncertainty. Of the published method, 15 % of all, half of which
@@ -79,12 +82,15 @@ class CalibrationData:
     sha256: str  # of what they came from
     # features of presses when so many windows are complete; None if features know no moment
     at: Callable[[int, Indices], PressFeatures] | None = None
+    pad: Morphology | None = None  # as planned, if that is to be believed
+    contact: Contact = field(default_factory=Contact)
 
 
 def calibrate(
     recording: Recording,
     options: LocalizerSettings | None = None,
     *,
+    pad: Morphology | None = None,
     time_budget: float | None = None,
     by_moment: bool = True,
     on_progress: OnProgress = ignore_progress,
@@ -96,6 +102,8 @@ def calibrate(
     Args:
         recording: readings and presses of known position.
         options: how to train; the defaults if None.
+        pad: as planned, with its fibres on the channels in order, whose plan says what up to `FEW_PRESSES` presses do
+            not; None if it is not to be believed.
         time_budget: seconds to train for, with as many members as that is good for; the result then depends on the
             pace of the machine. None for the length and the members of `options`.
         by_moment: as in `evaluate`.
@@ -107,10 +115,11 @@ def calibrate(
 
     Raises:
         InputError: an option out of range, a time budget for the published method or too short to train in, too few
-            presses, or a training that diverged.
+            presses, a pad of another number of fibres, or a training that diverged.
     """
     check_type("recording", recording, Recording)
     options = or_default("options", options, LocalizerSettings)
+    pad = None if pad is None else planned_pad(recording, pad)
     time_budget = None if time_budget is None else check_float("time_budget", time_budget, 0, MAX_TIME_BUDGET_S)
     if options.method == "published" and time_budget is not None:
         raise InputError("time_budget is given: method published has no time limit, expected method ensemble")
@@ -120,7 +129,7 @@ def calibrate(
     made_by = provenance("padforge sense calibrate", options.seed, packages=("torch", "safetensors"))
     made_by |= {"inputs": {"recording": recording.digest}, "recording_kind": recording.source.get("kind")}
     with stage("train"):
-        model = fit_recording(recording, training, options, rng, on_progress, time_budget)
+        model = fit_recording(recording, training, options, rng, on_progress, time_budget, pad)
     origin = {"fibre_names": recording.fibre_names, "pad_sha256": recording.pad_digest, "provenance": made_by}
     model = replace(model, split=options.split, test=tuple(test.tolist()), **origin)
     with stage("evaluate"), one_thread():
@@ -137,6 +146,7 @@ def fit_recording(
     rng: np.random.Generator,
     on_progress: OnProgress = ignore_progress,
     time_budget: float | None = None,
+    pad: Morphology | None = None,
 ) -> LocalizerModel:
     """Train a localizer on the presses `training` of a recording, without a test; raises as `fit_model`."""
     from padforge.sense.signals.press_detection import align_to_detected  # compiled kernels take long to import
@@ -158,6 +168,8 @@ def fit_recording(
 
     origin: tuple[Any, ...] = "published" if is_published else "windows", recording.rate_hz, recording.digest
     data = CalibrationData(features, detected, recording.presses_mm, measures, *origin, None if is_published else at)
+    if pad is not None:
+        data = replace(data, pad=pad, contact=stated_contact(recording))
     return fit_model(data, training, options, rng, on_progress, time_budget)
 
 
@@ -191,12 +203,17 @@ def fit_model(
     on_progress(0, 0, "response model")
     scaler, table = FeatureScaler.fit(features, positions_mm, measures, phases)
     presses = scaler.training_presses(features, positions_mm, measures, frame_rate_hz(data.rate_hz))
-    unfitted = leave_one_out_residuals(presses, table)
+    leverage = None
+    if data.pad is not None and is_ensemble and len(train) <= FEW_PRESSES:
+        prior = plan_prior(data.pad, data.contact, scaler.origin_mm, scaler.scale_mm)
+        table, fit = refit_response(scaler, presses, table, features.windows.shape[2], prior)
+        leverage = fit.leverage
+    unfitted = leave_one_out_residuals(presses, table, leverage)
     zero = scaler.mean_v / scaler.scale_v
     tests = tuple(SinglePressTest.fit(table, unfitted, zero, n_complete) for n_complete in stages(n_timed))
     bayes, residual_network, trained_share = (), {}, 1.0
     if is_ensemble:
-        trained = train_members(presses, table, options, rng, on_progress, time_budget)
+        trained = train_members(presses, table, options, rng, on_progress, time_budget, leverage)
         networks, bayes, residual_network, trained_share = trained
     else:
         held_back = scaler.training_presses(data.features[early_stop], data.positions_mm[early_stop])

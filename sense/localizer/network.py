@@ -197,8 +197,18 @@ def combine_members(outputs: Floats) -> tuple[Floats, Floats]:
 
 def stack_members(members: list[Weights]) -> Weights:
     """Stack the weights of networks of one size into an ensemble."""
-    axes = {name: 1 if name.startswith("hidden") else 0 for name in members[0]}
-    return {name: np.concatenate([each[name] for each in members], axis=axis) for name, axis in axes.items()}
+    return {name: np.concatenate([each[name] for each in members], axis=_axis(name)) for name in members[0]}
+
+
+def unstack_members(weights: Weights) -> list[Weights]:
+    """Return the weights of each member of an ensemble, as ensembles of one."""
+    members = range(len(weights["last.b"]))
+    return [{name: np.take(part, [each], axis=_axis(name)) for name, part in weights.items()} for each in members]
+
+
+def _axis(name: str) -> int:
+    """Axis of the members in a part of `Weights`."""
+    return 1 if name.startswith("hidden") else 0
 
 
 def _activate(h: Floats) -> Floats:

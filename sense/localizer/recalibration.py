@@ -1,8 +1,14 @@
-"""Recalibration: a localizer trained long ago follows its pad by a few new presses, or stays as it was.
+"""Recalibration: a localizer follows its pad, or another one of the same plan, by a few new presses.
 
-A pad that was re-made or re-mounted needs a correction first, of the gain of every fibre and of the position, angle and
-scale of the pad, which folds into the scaling of features and the last layer of the networks. For a pad that drifted,
-fine tuning suffices. Cross-validation over the new presses decides whether either is worth it.
+Three models are compared by cross-validation over these presses:
+
+1. The localizer as it is.
+2. Corrected: a gain for every fibre, and the position, angle and scale of the pad, which fold into the scaling of the
+   features and the last layer of the networks.
+3. Refitted: the response of each fibre anew, with the maps so far, corrected if that is more probable, and the plan of
+   the pad as its prior, so that a fibre that is the same keeps its map and one that is not gets another; the Bayesian
+   localizers by it, and the networks trained further on it. This is for a pad that drifted as for one cast again, or of
+   which a fibre was replaced.
 """
 
 from collections.abc import Callable, Sequence
@@ -16,14 +22,19 @@ import numpy as np
 from padforge.common.files import provenance
 from padforge.common.progress import OnProgress, ignore_progress
 from padforge.common.validation import InputError, check_int, check_type
+from padforge.design import Morphology
 from padforge.design.objectives.fibre_loss import failure_subsets
-from padforge.sense.arrays import Array, Floats, Indices
+from padforge.sense.arrays import Array, Floats, Mask
+from padforge.sense.localizer.bayes import fit_stages
 from padforge.sense.localizer.evaluation import Measures, conformal, distances, error_row
 from padforge.sense.localizer.features import PressFeatures
 from padforge.sense.localizer.model import Localization, LocalizerModel, concatenate
-from padforge.sense.localizer.moments import CORRECTED, PHASES
-from padforge.sense.localizer.network import Weights
+from padforge.sense.localizer.network import Weights, answering
 from padforge.sense.localizer.response_model import grid_positions
+from padforge.sense.localizer.response_priors import map_prior, plan_prior, planned_pad, stated_contact
+from padforge.sense.localizer.response_process import ResponseFit, ResponsePrior
+from padforge.sense.localizer.scaler import TrainingPresses, leave_one_out_residuals, refit_response
+from padforge.sense.localizer.single_press import SinglePressTest, stages
 from padforge.sense.recording.frames import frame_rate_hz
 from padforge.sense.recording.recording import Recording
 
@@ -35,13 +46,16 @@ R90_STD = 1.645  # standard deviations in the half-width that holds 90 % of a no
 DIFFERENCE = 0.02
 """Step of numerical derivatives, in prior standard deviations: shorter ones drown in the rounding of the network."""
 MIN_PRESSES = 10  # new presses needed: fewer can neither change much nor show that it was for the better
+MAX_PRESSES = 500  # that are looked at: a fit takes the cube of them, and of more a calibration errs no more
 FOLDS = 5
-CORRECT_FROM, FINE_TUNE_FROM = 2.0, -1.0
-"""Gains, in standard errors, from which a correction, which is coarse, and fine tuning, which is gentle, are kept. Fine
-tuning gains almost always, but less than a hundred presses can show, so it is kept unless they speak against it."""
+CORRECT_FROM, REFIT_FROM = 2.0, 0.0
+"""Gains, in standard errors, from which a correction, which is coarse, and refitting, which gains the more the more
+presses there are, are kept."""
+MAX_EXPONENT = 0.5  # of the power of the presses with which errors fall: that of a mean
 SUBSETS = 16  # sets of failed fibres of a size that are looked at, at most
 Predictions = Sequence[Sequence[Localization]]  # by number and by set of failed fibres
 Change = Callable[[LocalizerModel, PressFeatures, Array, Measures], LocalizerModel]
+"""By features, positions and measures of new presses."""
 
 
 @dataclass(frozen=True)
@@ -50,7 +64,11 @@ class Recalibration:
 
     Attributes:
         presses: number of new presses.
-        changes: that were kept, of "corrected" and "fine_tuned".
+        change: that was kept, "corrected" or "refitted"; None if none was.
+        candidates: "change" (None as it was), "mean_mm" and "standard_error_mm" of all that were compared: errors of
+            presses left out, and standard errors of their gains; averaged over numbers of failed fibres.
+        new_fibres: indices of the fibres that do not respond as they did, if refitted.
+        twice_as_many_mm: error that twice as many presses let expect, if refitted; else None.
         before: rows of `evaluation.error_row` on the new presses, by the old localizer.
         after: the same by the new one, each press left out of what predicts it.
         gain_mm: decrease of the error, averaged over numbers of failed fibres.
@@ -60,7 +78,10 @@ class Recalibration:
     """
 
     presses: int
-    changes: list[str]
+    change: str | None
+    candidates: list[dict[str, Any]]
+    new_fibres: list[int]
+    twice_as_many_mm: float | None
     before: list[dict[str, Any]]
     after: list[dict[str, Any]]
     gain_mm: float
@@ -77,38 +98,82 @@ def recalibrate(
     model: LocalizerModel,
     recording: Recording,
     *,
+    pad: Morphology | None = None,
     seed: int = 0,
     on_progress: OnProgress = ignore_progress,
 ) -> tuple[LocalizerModel, Recalibration]:
-    """Adapt a localizer to a pad that has changed since its training.
+    """Adapt a localizer to a pad that has drifted, was cast again, or has a new fibre.
 
     Radii only ever grow: they are widened where presses left out lie outside more often than they should. The `errors`
     of the model stay those of its calibration.
 
     Args:
         model: the localizer so far.
-        recording: of the pad as it is now, with some 20 to 500 presses of known position; others are not looked at.
-        seed: of the folds and of fine tuning.
+        recording: of the pad as it is now, with some 20 to 500 presses of known position; of more, so many are drawn.
+        pad: as planned, with its fibres on the channels in order; None for that of the recording, if it holds one.
+        seed: of the folds and of the training.
         on_progress: called with (steps done, steps in all, "").
 
     Returns:
         The localizer from now on, which predicts as the old one if nothing was gained, and what changed.
 
     Raises:
-        InputError: too few presses of known position, or a recording that does not suit the localizer.
+        InputError: too few presses of known position, a recording that does not suit the localizer, or a pad of another
+            number of fibres.
     """
     check_type("model", model, LocalizerModel)
     known = np.flatnonzero(check_type("recording", recording, Recording).has_position)
     seed = check_int("seed", seed, 0, 2**32 - 1)
     if len(known) < MIN_PRESSES:
         raise InputError(f"recording has {len(known)} presses of known position, expected at least {MIN_PRESSES}")
-    rows = np.random.default_rng(seed).permutation(known)
+    pad = planned_pad(recording, pad)
+    rows = np.random.default_rng(seed).permutation(known)[:MAX_PRESSES]
     features, positions_mm = model.raw_features(recording)[rows], recording.presses_mm[rows]
     measures = {each.name: recording.measures[each.name][rows] for each in model.scaler.measures}
     subsets = [failure_subsets(model.fibres, n_failed, SUBSETS) for n_failed in range(model.max_failures + 1)]
-    validation = CrossValidation(features, positions_mm, np.array_split(np.arange(len(rows)), FOLDS), subsets, measures)
+    presses = features, positions_mm, measures
+    validation, halves = (CrossValidation(presses, n_folds, subsets) for n_folds in (FOLDS, 2))
     before = validation.predict([model] * FOLDS)
-    changed, after, changes = _select_changes(model, validation, before, seed, on_progress)
+    steps, total = count(1), FOLDS + 4 if model.method == "ensemble" else 1
+
+    def step() -> None:
+        on_progress(next(steps), total, "")
+
+    folds, after, changed, change = [model] * FOLDS, before, model, None
+    candidates = [validation.candidate(None, before, before)]
+
+    # 1. Correction
+    predictions = validation.predict(validation.change(folds, fit_correction))
+    candidates.append(validation.candidate("corrected", before, predictions))
+    gain, standard_error = validation.gain(before, predictions)
+    if gain > CORRECT_FROM * standard_error:
+        changed, after, change = fit_correction(model, *presses), predictions, "corrected"
+    step()
+
+    # 2. Response
+    new_fibres, twice_as_many_mm = [], None
+    if model.method == "ensemble":
+        prior = None
+        if pad is not None:
+            prior = plan_prior(pad, stated_contact(recording), model.scaler.origin_mm, model.scaler.scale_mm)
+        refit = _Refit(prior, seed)
+
+        def refit_last(old: LocalizerModel, *training: Any) -> LocalizerModel:
+            refitted = refit(old, *training, only_last=True)[0]
+            step()
+            return refitted
+
+        predictions = validation.predict(validation.change(folds, refit_last))
+        candidates.append(validation.candidate("refitted", before, predictions))
+        gain, standard_error = validation.gain(after, predictions)
+        if gain > REFIT_FROM * standard_error:
+            half = halves.predict(halves.change([model] * 2, refit_last))
+            twice_as_many_mm = _extrapolate(validation.mean_error(predictions), halves.mean_error(half))
+            changed, is_new = refit(model, *presses)
+            after, change, new_fibres = predictions, "refitted", np.flatnonzero(is_new).tolist()
+    on_progress(total, total, "")
+
+    # 3. Radii
     gain, standard_error = validation.gain(before, after)
     widened = validation.widening(after)
     made_by = provenance("padforge sense recalibrate", seed, packages=("torch", "safetensors"))
@@ -116,7 +181,10 @@ def recalibrate(
     made_by |= {"inputs": inputs, "recording_kind": recording.source.get("kind")}
     result = Recalibration(
         presses=len(rows),
-        changes=changes,
+        change=change,
+        candidates=candidates,
+        new_fibres=new_fibres,
+        twice_as_many_mm=twice_as_many_mm,
         before=validation.error_rows(before),
         after=validation.error_rows(after),
         gain_mm=gain,
@@ -127,65 +195,80 @@ def recalibrate(
     changed = replace(
         changed,
         interval_factors=np.minimum(changed.interval_factors * widened, 1e6),
-        single_press=changed.calibrate_tests(recording, rows),
+        single_press=changed.single_press if change == "refitted" else changed.calibrate_tests(recording, rows),
         recalibrated_by=(*model.recalibrated_by, recording.digest),
         provenance=made_by,
     )
     return changed, result
 
 
-def _select_changes(
-    model: LocalizerModel,
-    validation: "CrossValidation",
-    before: Predictions,
-    seed: int,
-    on_progress: OnProgress,
-) -> tuple[LocalizerModel, Predictions, list[str]]:
-    """The model with the changes that are worth it, predictions of presses left out, and the names of the changes."""
-    steps, total = count(1), 2 + FOLDS + 1 if model.method == "ensemble" else 1
-
-    def tune(old: LocalizerModel, features: PressFeatures, positions_mm: Array, measures: Measures) -> LocalizerModel:
-        tuned = _fine_tuned(old, features, positions_mm, measures, np.random.default_rng([seed, len(features)]))
-        on_progress(next(steps), total, "")
-        return tuned
-
-    candidates: list[tuple[str, Change, float]] = [("corrected", fit_correction, CORRECT_FROM)]
-    if model.method == "ensemble":
-        candidates.append(("fine_tuned", tune, FINE_TUNE_FROM))
-    folds, after, changes = [model] * FOLDS, before, []
-    for name, change, threshold in candidates:
-        changed = validation.change(folds, change)
-        predictions = validation.predict(changed)
-        on_progress(next(steps), total, "")
-        gain, standard_error = validation.gain(after, predictions)
-        if gain > threshold * standard_error:
-            model, folds, after = change(model, *validation.presses), changed, predictions
-            changes.append(name)
-    on_progress(total, total, "")
-    return model, after, changes
+def _extrapolate(error_mm: float, half_mm: float) -> float:
+    """Error by twice as many presses, from those by presses less a fold and by half of them: a power law."""
+    exponent = float(np.clip(np.log(half_mm / error_mm) / np.log(2 * (1 - 1 / FOLDS)), 0, MAX_EXPONENT))
+    return error_mm * (2 / (1 - 1 / FOLDS)) ** -exponent
 
 
-def _fine_tuned(
-    model: LocalizerModel, features: PressFeatures, positions_mm: Array, measures: Measures, rng: np.random.Generator
-) -> LocalizerModel:
-    from padforge.sense.localizer.training import fine_tune  # torch takes long to import
+@dataclass(frozen=True)
+class _Refit:
+    """Fit of the response, the Bayesian localizers and the networks of a localizer to new presses.
 
-    predicted = model.predict_features(model.scaler.transform(features)).measures
-    # Where the depth of a press is unknown, its prediction is kept.
-    known = {name: np.where(np.isnan(values), predicted[name].values, values) for name, values in measures.items()}
-    presses = model.scaler.training_presses(features, positions_mm, known, frame_rate_hz(model.rate_hz))
-    phases = PHASES[features.seen.shape[1]]
-    networks = {
-        name: fine_tune(weights, presses, model.table, model.max_failures, rng, phases[name])
-        for name, weights in model.networks.items()
-    }
-    residual_network = model.residual_network
-    if model.bayes:
-        phase = CORRECTED if features.seen.shape[1] else phases["press"]
-        residual_network = fine_tune(
-            residual_network, presses, model.table, model.max_failures, rng, phase, model.bayes
-        )
-    return replace(model, networks=networks, residual_network=residual_network)
+    Attributes:
+        prior: by the plan of the pad; None if that is not known.
+        seed: of the training.
+    """
+
+    prior: ResponsePrior | None
+    seed: int
+
+    def __call__(
+        self,
+        old: LocalizerModel,
+        features: PressFeatures,
+        positions_mm: Array,
+        measures: Measures,
+        *,
+        only_last: bool = False,
+    ) -> tuple[LocalizerModel, Mask]:
+        """Return the refitted localizer, and which fibres (C,) are new.
+
+        `only_last` retrains the networks alone that answer when a press has been read to its end.
+        """
+        from padforge.sense.localizer.training import retrain  # torch takes long to import
+
+        starts = [old, fit_correction(old, features, positions_mm, measures)]
+        fits = [self._fit_response(start, features, positions_mm, measures) for start in starts]
+        number = int(np.argmax([fit.log_evidence for *_, fit in fits]))
+        start, (presses, table, response) = starts[number], fits[number]
+        presses, n_timed = leave_one_out_residuals(presses, table, response.leverage), features.seen.shape[1]
+        fitted = presses.inputs, presses.fibre_mask, presses.targets[:, :2]
+        bayes = fit_stages(table, *fitted, n_timed, earlier=start.bayes) if start.bayes else ()
+        last = answering(start.networks, n_timed, n_timed, bool(bayes))
+        networks = {name: weights for name, weights in start.networks.items() if not only_last or name in last}
+        rng = np.random.default_rng([self.seed, len(features)])
+        retrained = retrain(networks, start.residual_network, presses, table, start.max_failures, rng, bayes)
+        networks, residual_network = {**start.networks, **retrained[0]}, retrained[1]
+        changed = replace(start, networks=networks, residual_network=residual_network, bayes=bayes, table=table)
+        zero = start.scaler.mean_v / start.scaler.scale_v
+        tests = [
+            SinglePressTest.fit(table, presses, zero, n_complete, test).calibrated(presses)
+            for n_complete, test in zip(stages(n_timed), start.single_press, strict=True)
+        ]
+        return replace(changed, single_press=tuple(tests)), response.is_new
+
+    def _fit_response(
+        self, old: LocalizerModel, features: PressFeatures, positions_mm: Array, measures: Measures
+    ) -> tuple[TrainingPresses, Floats, ResponseFit]:
+        """Scaled presses, the response table (S, S, C, F + G), and its fit, whose evidence is of windows in volts."""
+        scaler, n_windows = old.scaler, features.windows.shape[2]
+        predicted = old.predict_features(scaler.transform(features)).measures
+        # Where the depth of a press is unknown, its prediction is kept.
+        known = {name: np.where(np.isnan(values), predicted[name].values, values) for name, values in measures.items()}
+        presses = scaler.training_presses(features, positions_mm, known, frame_rate_hz(old.rate_hz))
+        maps = scaler.uncentre(old.table)[..., :n_windows]
+        prior = map_prior(maps) if self.prior is None else replace(self.prior, mean=maps)
+        table, response = refit_response(scaler, presses, old.table, n_windows, prior)
+        log_scale = float(presses.fibre_mask.sum(axis=0) @ np.log(scaler.scale_v[:, :n_windows]).sum(axis=1))
+        return presses, table, replace(response, log_evidence=response.log_evidence - log_scale)
 
 
 def fit_correction(
@@ -253,19 +336,18 @@ def _transformed_table(table: Floats, rotation: Array, shift: Array) -> Floats:
 class CrossValidation:
     """Cross-validation of changes on new presses: each fold is left out in turn, for each subset of failed fibres.
 
-    `subsets` are listed by the number of failed fibres, from 0.
+    `presses` are features, positions (Q, 2), mm, and measures; `subsets` are listed by the number of failed fibres,
+    from 0.
     """
 
     def __init__(
         self,
-        features: PressFeatures,
-        positions_mm: Array,
-        folds: Sequence[Indices],
+        presses: tuple[PressFeatures, Array, Measures],
+        n_folds: int,
         subsets: Sequence[Sequence[tuple[int, ...]]],
-        measures: Measures = MappingProxyType({}),
     ) -> None:
-        self.presses = features, positions_mm, measures
-        self._folds, self._subsets = folds, subsets
+        self.presses = presses
+        self._folds, self._subsets = np.array_split(np.arange(len(presses[1])), n_folds), subsets
 
     def change(self, models: Sequence[LocalizerModel], change: Change) -> list[LocalizerModel]:
         """Change the models, one a fold, each by the presses that its fold leaves."""
@@ -285,6 +367,18 @@ class CrossValidation:
             [concatenate([each.predict_features(part, failed) for each, part in parts]) for failed in level]
             for level in self._subsets
         ]
+
+    def mean_error(self, predictions: Predictions) -> float:
+        """Return the mean error, mm, numbers of failed fibres weighing alike."""
+        positions_mm = self.presses[1]
+        return float(
+            np.mean([np.mean([distances(each.positions_mm, positions_mm) for each in level]) for level in predictions])
+        )
+
+    def candidate(self, change: str | None, before: Predictions, predictions: Predictions) -> dict[str, Any]:
+        """Return a row of `Recalibration.candidates`."""
+        standard_error = self.gain(before, predictions)[1]
+        return {"change": change, "mean_mm": self.mean_error(predictions), "standard_error_mm": standard_error}
 
     def gain(self, before: Predictions, after: Predictions) -> tuple[float, float]:
         """Return the mean decrease of errors, mm, numbers of failed fibres weighing alike, and its standard error."""
@@ -309,19 +403,29 @@ class CrossValidation:
 
 
 def recalibration_lines(result: Recalibration) -> list[str]:
-    """Format a recalibration as a table and a conclusion."""
-    conclusion = "nothing gained: positions are predicted as before"
-    if result.changes:
-        names = " and ".join(result.changes).replace("_", "-")
-        gain = f"{result.gain_mm:.3f} mm (standard error {result.standard_error_mm:.3f} mm)"
-        conclusion = f"{names}: errors shrink by {gain}"
-    return [
-        f"{result.presses} new presses, each predicted by what was changed without it",
+    """Format a recalibration: what each change gives, a table of the one that was kept, and a conclusion."""
+    names = {None: "as it was", "corrected": "corrected by gains and pose", "refitted": "response fitted again"}
+    lines = [f"{result.presses} new presses, each predicted by what was changed without it; error in mm"]
+    for each in result.candidates:
+        error = f" +- {each['standard_error_mm']:.2f}" if each["change"] else ""
+        kept = "  <- kept" if each["change"] == result.change else ""
+        lines.append(f"{each['mean_mm']:6.2f}{error:8}  {names[each['change']]}{kept}")
+    lines += [
         "failed  sets  before mm  after mm  in r90 before  in r90 after",
         *(
             f"{old['n_failed']:6d} {old['subsets']:5d}  {old['mean_mm']:9.2f}  {new['mean_mm']:8.2f}  "
             f"{old['within_r90']:13.1%}  {new['within_r90']:12.1%}"
             for old, new in zip(result.before, result.after, strict=True)
         ),
-        conclusion,
     ]
+    if result.new_fibres:
+        numbers = ", ".join(str(fibre + 1) for fibre in result.new_fibres)
+        lines.append(f"learnt again, as they respond unlike those of the old model: fibres {numbers}")
+    if result.change:
+        gain = f"{result.gain_mm:.3f} mm (standard error {result.standard_error_mm:.3f} mm)"
+        lines.append(f"{result.change}: errors shrink by {gain}")
+    else:
+        lines.append("nothing gained: positions are predicted as before")
+    if result.twice_as_many_mm is not None:
+        lines.append(f"twice as many presses: about {result.twice_as_many_mm:.2f} mm")
+    return lines

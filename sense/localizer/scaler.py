@@ -16,6 +16,7 @@ from padforge.sense.arrays import MAX_MM, MAX_VOLTS, MIN_SCALE_V, Array, Floats,
 from padforge.sense.localizer.features import PressFeatures
 from padforge.sense.localizer.moments import DOWN, NOW
 from padforge.sense.localizer.response_model import ResponseModel, interpolate_grid, leverages, remove_history
+from padforge.sense.localizer.response_process import ResponseFit, ResponsePrior, fit_response
 
 MAX_INPUT = 1e4  # largest scaled feature, in standard deviations; beyond lies no press, and features are clipped
 MAX_LEVERAGE = 0.9  # of a press far from all others; its residual grows tenfold at most
@@ -137,6 +138,10 @@ class FeatureScaler:
         """Scale (..., C, F + G) windows without history and modulations."""
         return np.clip((windows - self.mean_v) / self.scale_v, -MAX_INPUT, MAX_INPUT).astype(np.float32)
 
+    def uncentre(self, scaled: Floats) -> Array:
+        """Shift (..., C, F + G) scaled windows so that 0 is no response."""
+        return scaled + self.mean_v / self.scale_v
+
     @property
     def depth_gain(self) -> float:
         """Relative growth of the response for a scaled depth that is 1 larger; 0 where depths do not vary."""
@@ -201,10 +206,25 @@ class TrainingPresses(ScaledFeatures):
     speed: float  # scaled distance that 1 mm/s goes from one reading to the next; 0 where presses do not slide
 
 
-def leave_one_out_residuals(presses: TrainingPresses, table: Floats) -> TrainingPresses:
+def refit_response(
+    scaler: FeatureScaler, presses: TrainingPresses, table: Floats, n_windows: int, prior: ResponsePrior
+) -> tuple[Floats, ResponseFit]:
+    """Return a response table whose F windows are fitted anew to presses, of which there are few, and that fit.
+
+    The mean of the `prior`, if any, is as `FeatureScaler.uncentre` returns it.
+    """
+    relative_depth = 1 + presses.depth_gain * presses.targets[:, 2] if presses.depth_gain else None
+    positions, windows = presses.targets[:, :2].astype(np.float64), scaler.uncentre(presses.inputs)[..., :n_windows]
+    fit, refitted = fit_response(positions, windows, presses.fibre_mask, prior, relative_depth), table.copy()
+    refitted[..., :n_windows] = fit.table - scaler.uncentre(np.zeros_like(table[0, 0]))[:, :n_windows]
+    return refitted, fit
+
+
+def leave_one_out_residuals(presses: TrainingPresses, table: Floats, leverage: Array | None = None) -> TrainingPresses:
     """Move presses as far from the response table as if it had been fitted without them, and others at their position.
 
     The leave-one-out residual of a linear fit is the residual over 1 - leverage: of some hundred presses, a third more.
+    `leverage` (Q, C) is that of a fit with a prior; None without.
     """
     targets = presses.targets.astype(np.float64)
     positions, relative_depth = targets[:, :2], np.ones(len(targets))
@@ -212,6 +232,8 @@ def leave_one_out_residuals(presses: TrainingPresses, table: Floats) -> Training
         relative_depth += presses.depth_gain * targets[:, 2]
     expected = interpolate_grid(table.reshape(*table.shape[:2], -1), positions).reshape(presses.inputs.shape)
     expected = relative_depth[:, None, None] * expected
-    leverage = np.minimum(leverages(positions, relative_depth), MAX_LEVERAGE)[:, None, None]
+    if leverage is None:
+        leverage = leverages(positions, relative_depth)[:, None]
+    leverage = np.minimum(leverage, MAX_LEVERAGE)[:, :, None]
     residual = (presses.inputs - expected) / np.where(table.any(axis=(0, 1)), 1 - leverage, 1.0)
     return replace(presses, inputs=(expected + residual).astype(np.float32))

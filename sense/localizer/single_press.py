@@ -67,7 +67,14 @@ class SinglePressTest:
     n_presses: Array  # (1,), on which the last two rest; 0 before `calibrated`
 
     @classmethod
-    def fit(cls, table: Floats, presses: TrainingPresses, zero: Array, n_complete: int) -> "SinglePressTest":
+    def fit(
+        cls,
+        table: Floats,
+        presses: TrainingPresses,
+        zero: Array,
+        n_complete: int,
+        earlier: "SinglePressTest | None" = None,
+    ) -> "SinglePressTest":
         """Fit the scatter of presses about the response, when so many windows are complete.
 
         Args:
@@ -75,6 +82,7 @@ class SinglePressTest:
             presses: presses of training, as far from the table as if it had been fitted without them.
             zero: scaled features of a pad that does not respond, with a minus sign; shape (C, F + G).
             n_complete: number of complete windows; 0 if features know no moment.
+            earlier: test of the pad before, whose discriminants are kept: few presses do not say how windows vary.
         """
         n_timed, side = presses.seen.shape[1], len(table)
         usable = np.ones(table.shape[3], bool)
@@ -85,8 +93,8 @@ class SinglePressTest:
         at_presses = relative_depth * interpolate_grid(table.reshape(side, side, -1), positions)
         residual = presses.inputs - at_presses.reshape(presses.inputs.shape)
         fibres = table.shape[2]
-        projection = np.zeros((fibres, len(usable), COMPONENTS))
-        for fibre in range(fibres):
+        projection = np.zeros((fibres, len(usable), COMPONENTS)) if earlier is None else earlier.projection
+        for fibre in range(fibres) if earlier is None else ():
             used, valid = table[:, :, fibre].any(axis=(0, 1)), presses.fibre_mask[:, fibre]
             expected = table[:, :, fibre, used].reshape(side * side, -1)
             projection[fibre, used] = fit_lda(expected, residual[valid, fibre][:, used], COMPONENTS)

@@ -26,10 +26,18 @@ from padforge.common.parallel import makespan, one_thread, run_tasks
 from padforge.common.progress import OnProgress, ignore_progress
 from padforge.common.validation import InputError
 from padforge.design.published.networks import fit_batch
-from padforge.sense.arrays import Array, Floats, Indices
+from padforge.sense.arrays import Array, Floats
 from padforge.sense.localizer.bayes import BayesianLocalizer, fit_stages
-from padforge.sense.localizer.moments import CORRECTED, PHASES, Phase
-from padforge.sense.localizer.network import MAX_LOG_ERROR, MIN_LOG_ERROR, N_OUTPUTS, Networks, Weights, stack_members
+from padforge.sense.localizer.moments import CORRECTED, PHASES, RESIDUAL, Phase
+from padforge.sense.localizer.network import (
+    MAX_LOG_ERROR,
+    MIN_LOG_ERROR,
+    N_OUTPUTS,
+    Networks,
+    Weights,
+    stack_members,
+    unstack_members,
+)
 from padforge.sense.localizer.press_sampler import PressSampler
 from padforge.sense.localizer.scaler import TrainingPresses, leave_one_out_residuals
 from padforge.sense.localizer.torch_network import EnsembleMlp
@@ -175,16 +183,18 @@ def train_members(
     rng: np.random.Generator,
     on_progress: OnProgress,
     time_budget: float | None = None,
+    leverage: Array | None = None,
 ) -> TrainedNetworks:
     """Train the members of the localizer; the last of several is a Bayesian localizer with its residual network.
 
     A member has a network for each phase of a press. Where depths vary there is no Bayesian localizer. Networks are
     trained in threads. `table` is the (S, S, C, F + G) scaled response by position, over [-1, 1] in x and y.
     `time_budget` is in seconds, for as many members as these are good for, and the progress is in seconds then, else in
-    steps of all networks. InputError is raised if it ends before each network has taken `MIN_STEPS`.
+    steps of all networks. `leverage` is as in `leave_one_out_residuals`. InputError is raised if a budget ends before
+    each network has taken `MIN_STEPS`.
     """
     begin = time.monotonic()
-    n_timed, presses = presses.seen.shape[1], leave_one_out_residuals(presses, table)
+    n_timed, presses = presses.seen.shape[1], leave_one_out_residuals(presses, table, leverage)
     phases = PHASES[n_timed]
     steps = training_steps(len(presses.inputs), options) * (HARDER if presses.depth_gain else 1)
     length, has_bayes = sum(phase.length for phase in phases.values()), options.members > 1 and not presses.depth_gain
@@ -290,6 +300,7 @@ class Training:
         seed: int,
         phase: Phase,
         bayes: Sequence[BayesianLocalizer] = (),
+        start: Weights | None = None,
     ) -> None:
         rng = np.random.default_rng(seed)
         self._presses = sampler = PressSampler(presses, table, options.max_failures, rng, phase, bayes)
@@ -306,6 +317,9 @@ class Training:
         generator = torch.Generator().manual_seed(seed)
         self.network = EnsembleMlp.random(sampler.n_inputs, n_outputs, options, generator)
         self._directions, self._shrinkage = self._fit_directions()
+        if start is not None:
+            first = self.scale_up(torch.from_numpy(start["first.w"]).mT).mT
+            self.network = EnsembleMlp.from_numpy({**start, "first.w": first.contiguous().numpy()})
 
     def weights(self, fitted: Weights) -> Weights:
         """Return the weights for inputs as they are, of `fitted` parameters for scaled ones."""
@@ -349,6 +363,11 @@ class Training:
         """Scale (..., D) inputs down, most in the directions in which they vary most."""
         return (x - x @ self._directions * self._shrinkage @ self._directions.T) / COMMON_SQUARE**0.5
 
+    def scale_up(self, x: Tensor) -> Tensor:
+        """Undo `scale_down`."""
+        growth = self._shrinkage / (1 - self._shrinkage)
+        return (x + x @ self._directions * growth @ self._directions.T) * COMMON_SQUARE**0.5
+
     def _augment_position(self, targets: Floats) -> Floats:
         """Move (B, 2 + T) targets at random, and their force with their depth; reflect them at the bounds."""
         low, high = self._bounds
@@ -361,53 +380,42 @@ class Training:
         return np.concatenate([moved, forces], axis=1).astype(np.float32)
 
 
-FINE_TUNING_STEPS, FINE_TUNING_BATCH, FINE_TUNING_RATE = 200, 128, 1e-4
-"""Enough to follow drift and too little to forget: errors hardly change for half and twice as much."""
-PRIOR_PRESSES = 100  # new presses that weigh as much as what was learnt before
-NEAR_STD, FAR_NOISE = 0.09, 0.1
-"""Standard deviations of augmented scaled positions, 2 mm on a pad of 45 mm, and of noise on presses moved anywhere."""
-KEEP_LOG_ERROR_WEIGHT = 0.02  # weight of keeping log errors, beside the positions
+RETRAINING_STEPS, RETRAINING_RATE = 150, 1e-3
+"""Steps by which networks follow another response, which is near theirs; with 400 they err no less, and are surer."""
 
 
-def fine_tune(
-    weights: Weights,
+def retrain(
+    networks: Networks,
+    residual_network: Weights,
     presses: TrainingPresses,
     table: Floats,
     max_failures: int,
     rng: np.random.Generator,
-    phase: Phase,
     bayes: Sequence[BayesianLocalizer] = (),
-) -> Weights:
-    """Fine-tune the networks of a phase, or the residual network of the Bayesian localizers, by new presses.
+) -> tuple[Networks, Weights]:
+    """Train networks further, from where they are, on presses of a pad that responds by another table.
 
-    A step looks at new presses, augmented near their positions, and at the same presses moved anywhere on the pad,
-    where predictions must stay as they were (Li & Hoiem 2016, Learning without forgetting).
+    Networks that are not to be retrained are left out, and a residual network without weights stays so.
     """
-    rng = np.random.default_rng(int(rng.integers(2**63)))
-    before, network = EnsembleMlp.from_numpy(weights), EnsembleMlp.from_numpy(weights)
-    sampler = PressSampler(presses, table, max_failures, rng, phase, bayes)
-    share = len(presses.inputs) / (len(presses.inputs) + PRIOR_PRESSES)
+    phases = PHASES[presses.seen.shape[1]]
+    options = LocalizerSettings(max_failures=max_failures)
+    tasks = [(name, weights, phases[name], ()) for name, weights in networks.items()]
+    if residual_network:
+        phase = CORRECTED if presses.seen.shape[1] else phases["press"]
+        tasks.append((RESIDUAL, residual_network, phase, bayes))
+    seeds = rng.integers(2**63, size=len(tasks)).tolist()
 
-    def inputs(rows: Indices, positions: Array, noise: float) -> tuple[Tensor, Tensor]:
-        """Inputs of the members, and what they should answer."""
-        targets = np.concatenate([positions, sampler.targets[rows, 2:]], axis=1, dtype=np.float32)
-        x, position = sampler.inputs(rows, targets, noise)
-        return torch.from_numpy(x).expand(network.n_members, -1, -1), torch.from_numpy(targets - position)
+    def train(number: int) -> Weights:
+        _, weights, phase, corrected = tasks[number]
+        members = []
+        for member in unstack_members(weights):
+            training = Training(presses, table, options, seeds[number], phase, corrected, member)
+            parameters, steps = dict(training.network.named_parameters()), round(RETRAINING_STEPS * phase.length)
+            members.append(training.weights(fit_network(parameters, training.loss, steps, RETRAINING_RATE)))
+        return stack_members(members)
 
-    def loss_of_batch() -> Tensor:
-        rows = sampler.draw(FINE_TUNING_BATCH)
-        moves = NEAR_STD * rng.standard_normal((FINE_TUNING_BATCH, 2))
-        x, wanted = inputs(rows, (sampler.targets[rows, :2] + moves).clip(-1, 1), INPUT_NOISE)
-        new = _loss(network(x)[..., : wanted.shape[1]] - wanted).mean(dim=1).sum()
-        rows = sampler.draw(FINE_TUNING_BATCH)
-        x, _ = inputs(rows, rng.uniform(-1, 1, (FINE_TUNING_BATCH, 2)), FAR_NOISE)
-        with torch.no_grad():
-            outputs = before(x)
-        change, log_change = (network(x) - outputs).chunk(2, dim=2)
-        kept = (_loss(change) + KEEP_LOG_ERROR_WEIGHT * log_change.abs().mean(dim=2)).mean(dim=1).sum()
-        return share * new + (1 - share) * kept
-
-    parameters, steps = dict(network.named_parameters()), FINE_TUNING_STEPS
     with one_thread():
-        fitted = fit_network(parameters, loss_of_batch, steps, FINE_TUNING_RATE, weight_decay=0.0, averaged=False)
-    return EnsembleMlp.join(fitted)
+        trained = dict(run_tasks((number, partial(train, number)) for number in range(len(tasks))))
+    by_name = {name: trained[number] for number, (name, *_) in enumerate(tasks)}
+    residual_network = by_name.pop(RESIDUAL, residual_network)
+    return by_name, residual_network

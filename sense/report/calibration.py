@@ -16,6 +16,7 @@ from padforge.common.plotting import ALARM, CURVES, FAINT, INK, add_caption, new
 from padforge.common.profiling import stage
 from padforge.common.progress import OnProgress, ignore_progress
 from padforge.common.validation import InputError
+from padforge.design import Morphology
 from padforge.sense.health.fault_detector import HEALTH_FILES, FaultDetector
 from padforge.sense.localizer.calibration import calibrate, unlearnt_lines
 from padforge.sense.localizer.evaluation import Evaluation
@@ -36,6 +37,7 @@ def calibrate_into(
     out: Path,
     options: LocalizerSettings,
     *,
+    pad: Morphology | None = None,
     time_budget: float | None = None,
     without: Collection[str] = (),
     on_progress: OnProgress = ignore_progress,
@@ -49,6 +51,7 @@ def calibrate_into(
         recording: with presses of known position.
         out: folder.
         options: of the localizer.
+        pad: as planned, see `calibrate`.
         time_budget: seconds to train for, see `calibrate`.
         without: parts that are left out, of "health", "figures" and "moments".
         on_progress: as in `calibrate`, and called with (0, 0, "health") when that is learnt.
@@ -65,7 +68,7 @@ def calibrate_into(
     check_replaceable(path, origin, FILES, force)
     by_moment = "moments" not in without
     model, evaluation = calibrate(
-        recording, options, time_budget=time_budget, by_moment=by_moment, on_progress=on_progress
+        recording, options, pad=pad, time_budget=time_budget, by_moment=by_moment, on_progress=on_progress
     )
     for line in unlearnt_lines(recording, model):
         _log.warning(line)

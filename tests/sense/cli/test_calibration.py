@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from padforge.design import Morphology
 from padforge.sense import Recording
 from padforge.sense.localizer import training
 from padforge.sense.localizer.moments import MOMENTS
@@ -114,10 +115,12 @@ def test_evaluate_lists_errors_of_depth_and_force(deep) -> None:
 
 @pytest.mark.usefixtures("blank")
 def test_a_drifted_pad_is_followed_into_a_new_model(few, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(training, "FINE_TUNING_STEPS", 15)
+    monkeypatch.setattr(training, "RETRAINING_STEPS", 15)
+    Morphology.straight(2).save(Path("plan.json"))
     before = files_in("model")
     assert few("record", "--presses", "20", "--seed", "2", "--out", "later/recording")[0] == 0
-    assert few("recalibrate", "--model", "model", "later/recording")[0] == 0
-    assert Path("later/recalibration.json").exists()
+    assert few("recalibrate", "--model", "model", "later/recording", "--morphology", "plan.json")[0] == 0
+    document = json.loads(Path("later/recalibration.json").read_text())
+    assert [each["change"] for each in document["candidates"]] == [None, "corrected", "refitted"]
     assert Path("later/localizer.json").read_bytes() != before["localizer.json"]
     assert files_in("model") == before

@@ -41,6 +41,8 @@ health --model model rec                        | health
 calibrate rec --seed 5 --out studied            | localizer.json: fibre_loss.json was made from it; choose another
 recalibrate --model model rec --out studied     | localizer.json: fibre_loss.json was made from it; choose another
 identify rec {straight} --out designed          | twin.json: design.json was made from it; choose another --out
+recalibrate --model model rec {five} --out n    | pad has 10 fibres, the recording 4; expected as many
+calibrate rec {five} --out n                    | pad has 10 fibres, the recording 4; expected as many
 recalibrate --model empty/../model model/recording | padforge: model: holds the old model; name a folder
 deploy --model model localizer.tflite           | localizer.tflite: cannot be written, expected a name that ends in
 deploy --model model other l.onnx               | readings are of 6 fibres, the localizer was learnt from 4
@@ -109,7 +111,7 @@ def workshop(few_presses: Path, tmp_path_factory: pytest.TempPathFactory) -> Pat
 def test_invalid_command_fails_in_one_line(
     padforge_sense, workshop: Path, monkeypatch: pytest.MonkeyPatch, words: str, said: str
 ) -> None:
-    monkeypatch.setattr("padforge.sense.localizer.training.FINE_TUNING_STEPS", 1)
+    monkeypatch.setattr("padforge.sense.localizer.training.RETRAINING_STEPS", 1)
     monkeypatch.setattr("padforge.sense.rig.boards.due.list_due_ports", list)
     monkeypatch.chdir(workshop)
     before = {path: path.stat().st_mtime_ns for path in workshop.rglob("*") if path.is_file()}

@@ -1,6 +1,7 @@
 """The Bayesian localizer finds what least squares find of linear responses, and what a fine grid finds of others."""
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -196,3 +197,23 @@ def test_fit_stages_know_only_what_is_complete() -> None:
 def test_stage_of_is_the_latest_that_is_complete() -> None:
     assert [stage_of(count, N_TIMED) for count in range(N_TIMED + 1)] == [None] * 12 + [0, 1, 2, 3, 3, 4]
     assert stage_of(0, 0) == 0
+
+
+def test_fit_takes_discriminants_and_area_of_an_earlier_localizer(fitted_waves: Fitted) -> None:
+    """Of few presses of the same response, with their directions of scatter, positions are nearly as good."""
+    earlier, inputs, positions = fitted_waves
+    few = np.flatnonzero((np.abs(positions) < 0.8).all(axis=1))[:25]
+    grid = np.stack(np.meshgrid(*[np.linspace(-1, 1, SIDE)] * 2, indexing="ij"), axis=-1).reshape(-1, 2)
+    table = waves(grid).reshape(SIDE, SIDE, FIBRES, WINDOWS).astype(np.float32)
+    mask = np.ones((len(few), FIBRES), bool)
+    bayes = BayesianLocalizer.fit(table, inputs[few], mask, positions[few], earlier)
+    np.testing.assert_array_equal(bayes.projection, earlier.projection)
+    np.testing.assert_array_equal(bayes.bounds, earlier.bounds)
+    later, everywhere = np.ones((500, FIBRES), bool), slice(-500, None)
+    errors = [
+        np.hypot(*(each.predict(inputs[everywhere], later)[0] - positions[everywhere]).T).mean()
+        for each in (earlier, bayes)
+    ]
+    assert errors[1] < 1.2 * errors[0]
+    dead = replace(earlier, projection=earlier.projection * (np.arange(FIBRES) != 1)[:, None, None])
+    assert BayesianLocalizer.fit(table, inputs[few], mask, positions[few], dead).projection[1].any()

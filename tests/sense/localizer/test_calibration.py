@@ -15,6 +15,7 @@ from sklearn.model_selection import cross_val_score
 
 from padforge.common.progress import OnProgress, ignore_progress
 from padforge.common.validation import InputError
+from padforge.design import Morphology
 from padforge.sense import Evaluation, Localizer, Recording, calibrate, evaluate, import_mat
 from padforge.sense.health.fault_detector import FibreFault, mask_faults
 from padforge.sense.localizer import training
@@ -383,3 +384,22 @@ def test_localizer_refuses_unfit_input(brief: Recording, arrays: tuple[np.ndarra
         fitted.predict(brief)
     with pytest.raises(InputError, match=r"expected a recording, or \(Q, C, F\)"):
         fitted.predict(x[:, :, :2])
+
+
+@pytest.mark.slow
+def test_calibrate_needs_fewer_presses_with_the_plan_of_the_pad(recording: Recording) -> None:
+    few = replace(recording, presses_mm=np.where(np.arange(300)[:, None] < 60, recording.presses_mm, np.nan))
+    later = recording[np.arange(60, 300)]
+    pad = Morphology.from_dict(recording.source["morphology"])
+    options = Options(hidden=64, layers=2, epochs=30, members=2, max_failures=1)
+    with_plan, without = (calibrate(few, options, pad=plan, by_moment=False)[0] for plan in (pad, None))
+    plain, told = (
+        distances(
+            each.predict_features(each.scaled_features(recording)[later.presses]).positions_mm,
+            recording.presses_mm[later.presses],
+        ).mean()
+        for each in (without, with_plan)
+    )
+    assert told < 0.9 * plain
+    with pytest.raises(InputError, match="pad has 6 fibres, the recording 4; expected as many"):
+        calibrate(few, options, pad=Morphology.random(3, knots=2, seed=0))

@@ -74,7 +74,7 @@ def test_calibrate_learns_or_refuses(brief: Recording, seed: int, method: str) -
 def test_recalibrate_follows_or_refuses(localizer: LocalizerModel, brief: Recording, seed: int) -> None:
     one = worst(seed, brief)
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(training, "FINE_TUNING_STEPS", 15)
+        patched.setattr(training, "RETRAINING_STEPS", 15)
         try:
             now, result = recalibrate(localizer, one)
         except InputError:

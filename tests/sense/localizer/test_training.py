@@ -13,6 +13,7 @@ from padforge.sense.localizer import network, torch_network, training
 from padforge.sense.localizer.features import N_FEATURES
 from padforge.sense.localizer.moments import CORRECTED, N_DOWN, N_TIMED, PHASES
 from padforge.sense.localizer.press_sampler import PressSampler, sample_fibre_dropout
+from padforge.sense.localizer.response_model import interpolate_grid
 from padforge.sense.localizer.torch_network import EnsembleMlp
 from padforge.sense.settings import LocalizerSettings as Options
 from tests.helpers.presses import training_presses
@@ -169,6 +170,44 @@ def test_inputs_are_scaled_down_in_training_alone() -> None:
     weights = {name: weight.detach().numpy() for name, weight in trained.network.named_parameters()}
     expected = trained.network(scaled).detach().numpy()
     np.testing.assert_allclose(network.forward(trained.weights(weights), x[0].numpy()), expected, atol=1e-4)
+    # A training from these weights starts with a network that answers alike.
+    phase, start = PHASES[N_TIMED]["released"], trained.weights(weights)
+    further = training.Training(presses, table, Options(), 1, phase, start=start)
+    answers = further.network(further.scale_down(x)).detach().numpy()
+    np.testing.assert_allclose(answers, expected, atol=1e-3)
+
+
+def test_retrain_follows_another_response_from_where_networks_are() -> None:
+    """Networks are left out, or stay, as asked; one that is retrained errs less on the response of now."""
+    rng = np.random.default_rng(0)
+    grid = np.stack(np.meshgrid(*[np.linspace(-1, 1, 21)] * 2, indexing="ij"), axis=-1)
+    table = np.tile((grid @ rng.normal(0, 1, (2, 3)))[..., None], N_FEATURES).astype(np.float32)
+    positions = rng.uniform(-1, 1, (60, 2))
+    inputs = interpolate_grid(table.reshape(21, 21, -1), positions).reshape(60, 3, N_FEATURES)
+    presses = training_presses(inputs, np.ones((60, 3), bool), positions, N_TIMED)
+    options = Options(hidden=16, layers=1, members=2)
+    phase = PHASES[N_TIMED]["released"]
+    members = [training.Training(presses, table, options, seed, phase) for seed in (0, 1)]
+    old = network.stack_members(
+        [
+            each.weights({name: part.detach().numpy() for name, part in each.network.named_parameters()})
+            for each in members
+        ]
+    )
+    assert len(network.unstack_members(old)) == 2
+    for name, part in network.stack_members(network.unstack_members(old)).items():
+        np.testing.assert_array_equal(part, old[name])
+    retrained, residual = training.retrain({"released": old}, {}, presses, table, 1, np.random.default_rng(3))
+    assert (list(retrained), residual) == (["released"], {})
+    mask = np.ones((60, 3), bool)
+    x = network.network_inputs(inputs.astype(np.float32), mask, np.ones((60, N_TIMED), bool))
+    before, after = (
+        np.abs(network.forward(each, x)[:, :, :2] - positions).mean() for each in (old, retrained["released"])
+    )
+    assert after < 0.5 * before
+    same, _ = training.retrain({"released": old}, {}, presses, table, 1, np.random.default_rng(3))
+    for name, part in same["released"].items():
+        np.testing.assert_array_equal(part, retrained["released"][name])
 
 
 @pytest.mark.parametrize(("capabilities", "tolerance"), [({"avx512_bf16": True}, 0.05), ({"avx512_bf16": False}, 0.0)])

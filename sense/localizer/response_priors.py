@@ -1,0 +1,90 @@
+"""Priors of the response of a pad: what its plan says, or the maps of an earlier pad.
+
+The signal of a fibre is linear in the sensitivity along it, and nearly so in how far its path lies beside the plan.
+Both are smooth along it, so that some ten numbers, which a press at each tenth of it can tell, make its whole map.
+"""
+
+import numpy as np
+
+from padforge.common.settings import validate
+from padforge.common.validation import InputError
+from padforge.design import Contact, Morphology
+from padforge.sense.arrays import Array
+from padforge.sense.localizer.response_model import GRID_CELLS, grid_positions
+from padforge.sense.localizer.response_process import ResponsePrior
+from padforge.sense.recording.recording import Recording
+
+N_NODES = 9  # points along a fibre between which its sensitivity and its lateral offset are linear
+CORRELATION_LENGTH = 0.2  # of both, as a share of the fibre
+OFFSET_MM = 2.0  # prior standard deviation of the lateral offset, over that of the logarithm of the sensitivity
+WIDTHS = 1.0, 0.7  # of a press, and of its onset and what remains of it, over that of the contact; see `[rig]`
+BLOBS, BLOB_STD = 6, 0.4  # basis functions along a side by which the maps of an earlier pad are scaled; scaled position
+
+
+def planned_pad(recording: Recording, pad: Morphology | None = None) -> Morphology | None:
+    """Return the plan of the pad of a recording: `pad`, or the one that the recording holds, if any.
+
+    A recording of a twin holds a plan that lay otherwise under the arm, which tells nothing of its positions.
+
+    Raises:
+        InputError: `pad` has another number of fibres than the recording.
+    """
+    if pad is not None and len(pad.knots) != recording.fibres:
+        raise InputError(f"pad has {len(pad.knots)} fibres, the recording {recording.fibres}; expected as many")
+    plan = recording.source.get("morphology")
+    if pad is not None or plan is None or "twin" in recording.source:
+        return pad
+    held = Morphology.from_dict(plan)
+    return held if len(held.knots) == recording.fibres else None
+
+
+def stated_contact(recording: Recording) -> Contact:
+    """Return the contact that a simulated recording states; the default one of others."""
+    return validate(Contact, recording.source.get("contact", {}), "recording: contact")
+
+
+def plan_prior(pad: Morphology, contact: Contact, origin_mm: Array, scale_mm: float) -> ResponsePrior:
+    """Return the prior of a pad by its plan: fibres of uneven sensitivity that lie beside their planned paths.
+
+    Args:
+        pad: the plan, which lies under the arm as it was drawn.
+        contact: by which the pad is pressed.
+        origin_mm: position that is 0 when scaled, mm from the middle of the pad; shape (2,).
+        scale_mm: distance that is 1 when scaled, mm.
+    """
+    # compiled kernels take long to import
+    from padforge.design.contact import quick_signals, widened
+    from padforge.design.kernels.measured_signals import LAYER_PRECISION
+
+    side, fibres = GRID_CELLS + 1, len(pad.knots)
+    grid = pad.to_grid(grid_positions(side).reshape(-1, 2) * scale_mm + origin_mm)
+    nodes = np.linspace(0, 1, N_NODES)
+    covariance = np.exp(-0.5 * ((nodes[:, None] - nodes) / CORRELATION_LENGTH) ** 2)
+    smooth, with_gain = (np.linalg.cholesky(covariance + gain + 1e-6 * np.eye(N_NODES)) for gain in (0.0, 1.0))
+    parts = []
+    for width in WIDTHS:
+        hats = [
+            quick_signals(pad, grid, widened(contact, width), LAYER_PRECISION, np.tile(hat, (fibres, 1)))
+            for hat in np.eye(N_NODES)
+        ]
+        maps = np.stack(hats, axis=2).reshape(side, side, fibres, N_NODES)
+        maps /= np.linalg.norm(maps @ with_gain, axis=3).max(axis=(0, 1))[:, None]
+        step = 2 / GRID_CELLS
+        offsets = [OFFSET_MM / scale_mm * slope @ smooth for slope in np.gradient(maps, step, axis=(0, 1))]
+        parts += [maps @ with_gain, *offsets]
+    return ResponsePrior(np.concatenate(parts, axis=3))
+
+
+def map_prior(maps: Array) -> ResponsePrior:
+    """Return the prior of a pad by the (S, S, C, F) responses of an earlier one, each fibre scaled smoothly.
+
+    Args:
+        maps: not centred.
+    """
+    envelope = np.sqrt((maps**2 / np.maximum((maps**2).max(axis=(0, 1)), 1e-12)).mean(axis=3))
+    centres = np.linspace(-1, 1, BLOBS)
+    weights = np.exp(-0.5 * ((np.linspace(-1, 1, len(maps))[:, None] - centres) / BLOB_STD) ** 2)
+    blobs = np.einsum("xi,yj->xyij", weights, weights).reshape(*maps.shape[:2], -1)
+    deviations = envelope[..., None] * blobs[:, :, None]
+    scale = np.linalg.norm(deviations, axis=3).max(axis=(0, 1))
+    return ResponsePrior(deviations / np.maximum(scale, 1e-12)[:, None], maps)
