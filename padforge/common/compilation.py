@@ -25,7 +25,8 @@ from numba.core import event as events
 import padforge
 
 PATIENCE_S = 1.5  # time spent on compiling, s, after which the user is told why nothing happens
-SOURCES = [Path(base) / stage for base in padforge.__path__ for stage in ("design", "sense")]  # that have kernels
+_STAGES = next(base for base in map(Path, padforge.__path__) if (base / "design").is_dir())  # those that are imported
+SOURCES = [_STAGES / stage for stage in ("design", "sense")]  # that have kernels
 MAX_CACHES = 4  # in a folder, of the latest versions of the sources
 _PREFIX = "padforge-kernels-"
 
