@@ -20,7 +20,7 @@ from padforge import design, fabricate, sense
 
 # %%
 size = design.PadSettings(grid=3)
-quick = design.SearchSettings(starts=2, steps=100)
+quick = design.SearchSettings(starts=1, steps=100)
 found = design.search(size, settings=quick)
 for failed in range(4):
     name = f"expected_error_mm_{failed}"
@@ -50,7 +50,7 @@ Image("mould/mould.png")
 # sense record`, from files, or from arrays of your own.
 
 # %%
-recording = sense.simulate(found.morphology, sense.RigSettings(presses=300), size=size)
+recording = sense.simulate(found.morphology, sense.RigSettings(presses=240), size=size)
 shown = recording.times_s < 30
 plt.plot(recording.times_s[shown], recording.readings[shown])
 plt.xlabel("time (s)")
@@ -72,7 +72,7 @@ print(f"{len(yours)} presses of {yours.fibres} fibres, {yours.rate_hz:.1f} readi
 # set of failed ones.
 
 # %%
-localizer = sense.Localizer(epochs=30).fit(recording)
+localizer = sense.Localizer(epochs=20).fit(recording)
 evaluation = localizer.calibration_
 evaluation.to_frame()[["n_failed", "mean_mm", "median_mm", "p95_mm", "within_r90"]].round(2)
 
@@ -91,4 +91,4 @@ plt.show()
 # in mm.
 
 # %%
--cross_val_score(sense.Localizer(epochs=6), recording, cv=3)
+-cross_val_score(sense.Localizer(epochs=3), recording, cv=3)

@@ -135,6 +135,8 @@ def test_recalibrate_learns_another_pad_of_the_plan_and_a_new_fibre(localizer, r
     assert (result.change, result.new_fibres) == ("refitted", [0, 1, 2, 3])
     assert error(now, other, LATER) < 0.6 * error(localizer, other, LATER)
     assert [row["change"] for row in result.candidates] == [None, "corrected", "refitted"]
+    assert localizer.is_other_pad(localizer.scaled_features(other)[LATER])
+    assert not now.is_other_pad(now.scaled_features(other)[LATER])
     # The same presses on the pad of before, but for one fibre.
     monkeypatch.setattr("padforge.sense.simulation.simulated_recording.build_pad", lambda pad, _: build_pad(pad, OLD))
     mended = simulate(Morphology.from_dict(recording.source["morphology"]), rig)
