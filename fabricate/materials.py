@@ -88,7 +88,10 @@ PLASTICS = {False: ("PLA", 1.24), True: ("resin", 1.1)}
 """Common material of a filament (False) and a resin printer (True), and its density, g/ml."""
 
 PRODUCTS = {
-    "fibre": ("conductive and elastic", "Adafruit 519, cord of 2 mm; thinner ones are extruded from carbon-black TPE"),
+    "fibre": (
+        "conductive and elastic",
+        "extruded from carbon-black TPE or TPU; a cord of 2 mm, such as Adafruit 519, needs a mould of its own",
+    ),
     "silicone": ("two parts, cures at room temperature", "grades of Smooth-On Ecoflex and Dragon Skin"),
     "adhesive": ("one part, sticks to cured silicone", "Smooth-On Sil-Poxy, DOWSIL 732"),
     "filament": ("1.75 mm", "Prusament PLA"),

@@ -265,7 +265,7 @@ def _order_lines(document: Document) -> Iterator[str]:
         "resin" if resin else "filament": f"{order['plastic_g']:.0f} g of {PLASTICS[resin][0]}",
         "connectors": f"{2 * n_fibres}",
         "wire": f"{2 * n_fibres} pieces, from the pad to the board",
-        "resistors": f"{n_fibres}, of the values below",
+        "resistors": f"{n_fibres}, of values by the resistance of the fibre",
         "board": f"for {n_fibres} fibres",
     }
     rows = [(kind, amount, *PRODUCTS[kind]) for kind, amount in amounts.items()]

@@ -331,7 +331,7 @@ def test_page_orders_materials_by_kind_and_estimates_the_work():
         ["| filament", "13 g of PLA"],
         ["| connectors", "4"],
         ["| wire", "4 pieces, from the pad to the board"],
-        ["| resistors", "2, of the values below"],
+        ["| resistors", "2, of values by the resistance of the fibre"],
         ["| board", "for 2 fibres"],
     ]
     assert order[10].startswith("The fibre includes 17 % for waste. The mould prints in about 1.3 h, by rules of thumb")
