@@ -4,6 +4,7 @@ import os
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -125,8 +126,9 @@ def predict_despite_faults(
     is_other_pad = localizer.is_other_pad(presses)
     faults = detector.predict(recording) if detector and not is_other_pad else []
     fibre_mask = mask_faults(faults, len(recording.down_command), localizer.fibres)
-    until = None if moment is None else _until(localizer, recording, *moment)
-    localization = localizer.predict(recording, excluded, fibre_mask, until)
+    if moment is not None:
+        presses = localizer.scaled_features(recording, _until(localizer, recording, *moment))
+    localization = localizer.localize(replace(presses, fibre_mask=presses.fibre_mask & fibre_mask), excluded)
     fibre_mask[:, list(excluded)] = False
     is_known = detector is not None and not is_other_pad
     shifts = detect_shifts(localizer, detector.model_, recording, fibre_mask) if is_known else []

@@ -73,14 +73,8 @@ class BayesianLocalizer:
         cell = float(coarse[1, 0, 0] - coarse[0, 0, 0])
         inside = ((coarse >= low - cell) & (coarse <= high + cell)).all(axis=2)
         residual = inputs - interpolate_grid(table.reshape(side, side, -1), positions).reshape(inputs.shape)
-        projection = np.zeros((fibres, size, COMPONENTS))
-        for fibre in range(fibres):
-            if earlier is not None and earlier.projection[fibre].any():
-                projection[fibre] = earlier.projection[fibre]
-                continue
-            used, valid = table[:, :, fibre].any(axis=(0, 1)), fibre_mask[:, fibre]
-            expected = table[:, :, fibre, used].reshape(side * side, -1)
-            projection[fibre, used] = fit_lda(expected, residual[valid, fibre][:, used], COMPONENTS)
+        before = np.zeros((fibres, size, COMPONENTS)) if earlier is None else earlier.projection
+        projection = fit_projection(table, residual, fibre_mask, before)
         residual = np.einsum("qcf,cfd->qcd", residual, projection) * fibre_mask[:, :, None]
         width = max(cell, SCATTER_WIDTH * mean_distance(positions))
         scatter = local_scatter(coarse.reshape(-1, 2), positions, residual, fibre_mask, width)
@@ -192,7 +186,24 @@ def fit_stages(
     return tuple(stages)
 
 
-def fit_lda(expected: Array, residual: Array, components: int) -> Array:
+def fit_projection(table: Array, residual: Array, fibre_mask: Mask, earlier: Array) -> Array:
+    """Return the whitened discriminants of each fibre (C, F, D): `earlier` ones where there are any, else fitted.
+
+    Args:
+        table: response by position, 0 where a feature is not used; shape (S, S, C, F).
+        residual: of presses; shape (Q, C, F).
+        fibre_mask: whether a fibre is valid in a press; shape (Q, C).
+        earlier: discriminants of the pad before, 0 for a fibre that had none; shape (C, F, D).
+    """
+    projection = earlier.copy()
+    for fibre in np.flatnonzero(~earlier.any(axis=(1, 2))):
+        used, valid = table[:, :, fibre].any(axis=(0, 1)), fibre_mask[:, fibre]
+        expected = table[:, :, fibre, used].reshape(len(table) ** 2, -1)
+        projection[fibre, used] = _fit_lda(expected, residual[valid, fibre][:, used], earlier.shape[2])
+    return projection
+
+
+def _fit_lda(expected: Array, residual: Array, components: int) -> Array:
     """Return (F, D) whitened linear discriminants of (S, F) inputs at positions and (Q, F) residuals of presses."""
     size = residual.shape[1]
     scatter = residual.T @ residual / max(len(residual), 1) + MIN_VARIANCE * np.eye(size)

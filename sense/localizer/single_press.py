@@ -18,7 +18,7 @@ from scipy.special import stdtrit
 
 from padforge.design.objectives.fibre_loss import failure_subsets
 from padforge.sense.arrays import Array, Floats, Indices, Mask
-from padforge.sense.localizer.bayes import SCATTER_WIDTH, fit_lda, local_scatter, mean_distance
+from padforge.sense.localizer.bayes import SCATTER_WIDTH, fit_projection, local_scatter, mean_distance
 from padforge.sense.localizer.moments import N_DOWN, N_TIMED, NOW, count_complete
 from padforge.sense.localizer.response_model import grid_positions, interpolate_grid
 from padforge.sense.localizer.scaler import ScaledFeatures, TrainingPresses
@@ -93,11 +93,8 @@ class SinglePressTest:
         at_presses = relative_depth * interpolate_grid(table.reshape(side, side, -1), positions)
         residual = presses.inputs - at_presses.reshape(presses.inputs.shape)
         fibres = table.shape[2]
-        projection = np.zeros((fibres, len(usable), COMPONENTS)) if earlier is None else earlier.projection
-        for fibre in range(fibres) if earlier is None else ():
-            used, valid = table[:, :, fibre].any(axis=(0, 1)), presses.fibre_mask[:, fibre]
-            expected = table[:, :, fibre, used].reshape(side * side, -1)
-            projection[fibre, used] = fit_lda(expected, residual[valid, fibre][:, used], COMPONENTS)
+        before = np.zeros((fibres, len(usable), COMPONENTS)) if earlier is None else earlier.projection
+        projection = fit_projection(table, residual, presses.fibre_mask, before)
         residual = np.einsum("qcf,cfd->qcd", residual, projection) * presses.fibre_mask[:, :, None]
         offset = np.einsum("cf,cfd->cd", zero * usable, projection)
         responses = np.einsum("xycf,cfd->xycd", table, projection) + offset
