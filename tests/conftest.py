@@ -37,11 +37,17 @@ hypothesis.settings.load_profile("padforge")
 
 from padforge.common import compilation, plotting  # noqa: E402
 from tests.helpers import kernels  # noqa: E402
+from tests.helpers.golden import Golden  # noqa: E402
 from tests.helpers.once import Once  # noqa: E402
 
 compilation.PATIENCE_S = 3600.0  # what a test compiles is no output of the command that it looks at
 plotting.DPI = 40  # pixels take most of the time of a picture, and no test looks at them
 PUBLISHED = ROOT.parent / "shared" / "data" / "published"
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """An option that renews the whole outputs in tests/golden."""
+    parser.addoption("--renew", action="store_true", help="keep outputs in tests/golden as they are now")
 
 
 @pytest.hookimpl(optionalhook=True)
@@ -73,6 +79,27 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
 def once(tmp_path_factory: pytest.TempPathFactory) -> Once:
     """Makes what is dear once for all workers."""
     return Once(tmp_path_factory.getbasetemp())
+
+
+@pytest.fixture
+def golden(request: pytest.FixtureRequest, tmp_path: Path) -> Golden:
+    """Compares an output with the one in tests/golden."""
+    return Golden(tmp_path, renew=request.config.getoption("--renew"))
+
+
+@pytest.fixture
+def figures(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
+    """All figures that the test has drawn, in the order in which they were begun."""
+    from matplotlib.figure import Figure
+
+    drawn, begin = [], Figure.__init__
+
+    def remember(figure: Figure, *args: Any, **options: Any) -> None:
+        begin(figure, *args, **options)
+        drawn.append(figure)
+
+    monkeypatch.setattr(Figure, "__init__", remember)
+    return drawn
 
 
 @pytest.fixture(scope="session")

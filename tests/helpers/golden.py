@@ -1,0 +1,182 @@
+"""Whole outputs are kept in `tests/golden` and compared; `pytest --renew` writes them as they are now.
+
+What a person or a program reads is kept as text, so that a reviewer reads the difference: printed lines, JSON, CSV and
+Markdown as they are, a page as its words and tables (`page_text`), a figure as what it shows (`figure_text`).
+"""
+
+import difflib
+import json
+import re
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import lxml.html
+import numpy as np
+import pytest
+from matplotlib.colors import to_hex
+from matplotlib.figure import Figure
+
+FOLDER = Path(__file__).parents[1] / "golden"
+
+NUMBER = re.compile(r"(?<![\w.])[-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?(?![\w.]*\d)", re.IGNORECASE)
+DIGEST = re.compile(r"\b[0-9a-f]{64}\b")
+TIME = re.compile(r"\b\d{4}-\d\d-\d\d[T ]\d\d:\d\d:\d\d(?:\.\d+)?(?:Z|[+-]\d\d:\d\d)?")
+MANY_DIGITS = 8  # from here on the last digits are those of a processor
+
+
+class Golden:
+    """Compares outputs with those that are kept.
+
+    Args:
+        folder: whose path outputs may state.
+        renew: write what differs instead of failing.
+    """
+
+    def __init__(self, folder: Path, renew: bool) -> None:
+        self._folder, self._renew = folder, renew
+
+    def __call__(self, name: str, output: Any, *, forget: Iterable[str] = (), rtol: float = 1e-6) -> None:
+        """Compare an output with the one that is kept.
+
+        Words must be the same. Numbers may differ by one in the last decimal that is printed, or by `rtol`; whole
+        numbers by `rtol` alone. Digests, times of the day and the test's folder are left out.
+
+        Args:
+            name: of the file in `tests/golden`, as "design/score.txt".
+            output: a text, a figure, or what JSON can hold.
+            forget: regular expressions of what else differs from run to run, such as seconds.
+            rtol: relative tolerance of numbers: more than the default for what was trained.
+        """
+        if isinstance(output, Figure):
+            output = figure_text(output)
+        text = output if isinstance(output, str) else json.dumps(output, indent=1, ensure_ascii=False, default=_plain)
+        text = TIME.sub("<time>", DIGEST.sub("<digest>", text.replace(str(self._folder), "<folder>")))
+        for pattern in forget:
+            text = re.sub(pattern, "<differs>", text)
+
+        file = FOLDER / name
+        kept = file.read_text(encoding="utf-8").splitlines() if file.exists() else []
+        lines = settle([line.rstrip() for line in text.splitlines()], kept, rtol)
+        if self._renew and lines != kept:
+            file.parent.mkdir(parents=True, exist_ok=True)
+            file.write_text("\n".join(lines) + "\n", encoding="utf-8", newline="\n")
+        elif lines != kept:
+            difference = list(difflib.unified_diff(kept, lines, f"kept {name}", "now", lineterm="", n=1))
+            pytest.fail("\n".join([*difference[:80], "(pytest --renew keeps what is now)"]), pytrace=False)
+
+
+def settle(lines: list[str], kept: list[str], rtol: float) -> list[str]:
+    """Lines, with those that are close enough to a kept one as they are kept."""
+    settled = list(lines)
+    words = [[NUMBER.sub("#", line) for line in text] for text in (kept, lines)]
+    for i, j, size in difflib.SequenceMatcher(None, *words, autojunk=False).get_matching_blocks():
+        for k in range(size):
+            if _same_line(lines[j + k], kept[i + k], rtol):
+                settled[j + k] = kept[i + k]
+    return settled
+
+
+def _same_line(new: str, old: str, rtol: float) -> bool:
+    if new == old:
+        return True
+    if NUMBER.split(new) != NUMBER.split(old):
+        return False
+    return all(_same_number(a, b, rtol) for a, b in zip(NUMBER.findall(new), NUMBER.findall(old), strict=True))
+
+
+def _same_number(a: str, b: str, rtol: float) -> bool:
+    difference, largest = abs(float(a) - float(b)), max(abs(float(a)), abs(float(b)))
+    mantissas = [re.split("[eE]", number)[0] for number in (a, b)]
+    decimals = [len(mantissa.partition(".")[2]) for mantissa in mantissas]
+    if max(decimals) >= MANY_DIGITS:  # as computers write numbers, of which rounding leaves any number of digits
+        return difference <= max(rtol * largest, 1e-12)
+    exponent = int(re.split("[eE]", a)[1]) if "e" in a.lower() else 0
+    last = 1.001 * 10.0 ** (exponent - decimals[0]) if decimals[0] else 0.0
+    return decimals[0] == decimals[1] and difference <= max(rtol * largest, last)
+
+
+def _plain(value: Any) -> Any:
+    """What JSON can hold of an array or a number of NumPy."""
+    return value.tolist()
+
+
+def page_text(page: str) -> str:
+    """The words of a HTML page as a reader meets them: headings, paragraphs, tables by row, and what pictures hold."""
+    root, lines = lxml.html.fromstring(page), []
+    for element in root.iter():
+        if not isinstance(element.tag, str):
+            continue
+        tag, words = element.tag, " ".join(element.text_content().split())
+        if tag in ("h1", "h2", "h3", "h4"):
+            lines.append(f"{'#' * int(tag[1])} {words}")
+        elif tag == "tr":
+            lines.append(" | ".join(" ".join(cell.text_content().split()) for cell in element))
+        elif tag in ("p", "li", "pre", "summary", "figcaption", "button", "label", "title") and words:
+            lines.append(f"{tag}: {words}")
+        elif tag == "img":
+            lines.append(f"img: {element.get('alt')}")
+        elif tag == "svg":
+            parts = sorted({child.tag for child in element.iter() if isinstance(child.tag, str)})
+            counts = ", ".join(f"{len(element.findall(f'.//{part}'))} {part}" for part in parts if part != "svg")
+            lines.append(f"svg: {element.get('viewbox') or element.get('viewBox')} {counts}")
+        elif tag == "a" and element.get("href", "").startswith(("#", "http")):
+            lines.append(f"a: {words} -> {element.get('href')}")
+    return "\n".join(lines)
+
+
+def figure_text(figure: Figure) -> str:
+    """What a figure shows: titles, axes, limits, and the data and colours of lines, marks, images and texts."""
+    lines = [f"figure {figure.get_figwidth():.3g} x {figure.get_figheight():.3g} in: {figure.get_suptitle()!r}"]
+    for axes in figure.axes:
+        limits = f"x {_numbers(axes.get_xlim())} {axes.get_xscale()}, y {_numbers(axes.get_ylim())} {axes.get_yscale()}"
+        lines.append(f"axes {axes.get_title()!r}: {axes.get_xlabel()!r}, {axes.get_ylabel()!r}; {limits}")
+        for name in ("x", "y"):
+            ticks = [label.get_text() for label in getattr(axes, f"get_{name}ticklabels")()]
+            if any(ticks) and axes.axison:
+                lines.append(f"  {name} ticks {' '.join(ticks)}")
+        for line in axes.lines:
+            xy = np.asarray(line.get_xydata(), dtype=float)
+            style = f"{to_hex(line.get_color())} {line.get_linestyle()} {line.get_marker()}"
+            lines.append(f"  line {line.get_label()!r} {style}: {_summary(xy)}")
+        for collection in axes.collections:
+            data = collection.get_offsets() if len(collection.get_offsets()) > 1 else _vertices(collection)
+            values = collection.get_array()
+            shown = "" if values is None else f", {collection.get_cmap().name} {_numbers(collection.get_clim())}: "
+            shown += "" if values is None else _summary(np.asarray(values, dtype=float).reshape(-1, 1))
+            faces = sorted({to_hex(colour) for colour in collection.get_facecolor()}) if values is None else []
+            kind = type(collection).__name__
+            lines.append(f"  {kind} {collection.get_label()!r} {' '.join(faces)}: {_summary(data)}{shown}")
+        for image in axes.images:
+            values = np.asarray(image.get_array(), dtype=float)
+            extent = f"{_numbers(image.get_extent())} {image.get_cmap().name} {_numbers(image.get_clim())}"
+            lines.append(f"  image {values.shape} {extent}: {_summary(values.reshape(-1, 1))}")
+        for patch in axes.patches:
+            lines.append(f"  {type(patch).__name__} {to_hex(patch.get_facecolor())}: {_summary(_path_of(patch))}")
+        for text in axes.texts:
+            lines.append(f"  text {text.get_text()!r} at {_numbers(text.get_position())}")
+        if legend := axes.get_legend():
+            lines.append(f"  legend {[text.get_text() for text in legend.get_texts()]}")
+    return "\n".join(lines)
+
+
+def _vertices(collection: Any) -> Any:
+    paths = [path.vertices for path in collection.get_paths()]
+    return np.concatenate(paths) if paths else np.empty((0, 2))
+
+
+def _path_of(patch: Any) -> Any:
+    return patch.get_patch_transform().transform_path(patch.get_path()).vertices
+
+
+def _summary(data: Any) -> str:
+    """The number of rows, and of each column first, last, least, mean and greatest values."""
+    data = np.asarray(np.ma.filled(data, np.nan), dtype=float)
+    if not data.size or not np.isfinite(data).any():
+        return f"{len(data)} rows"
+    parts = [data[0], data[-1], np.nanmin(data, axis=0), np.nanmean(data, axis=0), np.nanmax(data, axis=0)]
+    return f"{len(data)} rows, " + " | ".join(_numbers(part) for part in parts)
+
+
+def _numbers(values: Any) -> str:
+    return " ".join(f"{value:#.4g}" for value in np.ravel(np.asarray(values, dtype=float)) + 0.0)
