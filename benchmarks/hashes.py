@@ -39,7 +39,7 @@ def digest(*parts: Any) -> str:
 def hash_pads() -> Iterator[Result]:
     """Yield the digests of what is computed of a pad, of a short search and of a mould."""
     presses = np.random.default_rng(0).uniform(0, 1, (50, 2))
-    yield "exact signals", digest(design.signals(PAD, presses))
+    yield "signals", digest(design.signals(PAD, presses))
     yield "published signals", digest(design.signals_quantized(PAD, presses))
     yield "published objective", digest(published_terms(PAD))
     yield "score", digest(design.score(PAD))

@@ -16,7 +16,8 @@ from padforge.common import profiling
 from padforge.common.parallel import map_chunks
 from padforge.common.settings import or_default
 from padforge.common.validation import MAX_VALUES, InputError, check_array, check_float, check_int, check_type
-from padforge.design.kernels import geometry, measured_signals
+from padforge.design.kernels import element_signals, geometry
+from padforge.design.kernels.element_signals import FINE_PRECISION, LAYER_PRECISION, PROFILE_PRECISION
 from padforge.design.kernels.exact_signals import exact_signals
 from padforge.design.kernels.pchip import population_slopes
 from padforge.design.layer import REDUCED_MODULUS_KPA, LayerPress, solve_press
@@ -40,8 +41,10 @@ if TYPE_CHECKING:
 
 _WEIGHTS = {"uniform": geometry.UNIFORM, "inverse_square": geometry.INVERSE_SQUARE, "inverse": geometry.INVERSE}
 _LENGTHS = {"manhattan": geometry.MANHATTAN, "euclidean": geometry.EUCLIDEAN}
+FINEST_PRECISION = 1e-6  # a `weight_table` agrees to about 1e-7 of the largest weight
 _Sparse = tuple[Ints, Ints]
 _DENSE = np.empty(0, np.int64), np.empty(0, np.int64)
+_SPARSE_BLOCK = 1000  # presses whose signals are dense for a moment
 LAYER_REACH = {"bonded": 8.0, "slipping": 16.0}
 """Distance beyond the contact at which strains of a layer end, thicknesses. What is left out is less than 1 % of a
 straight fibre's largest signal; strains of a slipping layer fall only with the square of the distance."""
@@ -62,10 +65,18 @@ PressShape = tuple[tuple[Array, Array], Array, geometry.WeightLaw]
 """Chains, extents and weight law of a press."""
 
 
-def signals(pad: Morphology | Array, presses: ArrayLike, contact: Contact | None = None) -> Array:
-    """Compute exact signals: the weighted length of each fibre's PCHIP curve in the press, without sampling.
+def signals(
+    pad: Morphology | Array,
+    presses: ArrayLike,
+    contact: Contact | None = None,
+    *,
+    precision: float = FINE_PRECISION,
+    sensitivity: Array | None = None,
+) -> Array:
+    """Compute signals: the weighted length of each fibre's PCHIP curve in the press.
 
-    The boundary belongs to the press: a straight fibre that runs along an edge counts with its full length there.
+    Those of a shape are exact, without sampling: its boundary belongs to the press, so that a straight fibre that runs
+    along an edge counts with its full length there. Those of a layer or a profile are sums over short elements.
 
     Args:
         pad: a morphology; or knots of a population of square pads of the default pitch, 11.25 mm; shape
@@ -73,77 +84,64 @@ def signals(pad: Morphology | Array, presses: ArrayLike, contact: Contact | None
         presses: centres; shape (Q, 2), grid units. Or C simultaneous presses whose signals add, shape (Q, C, 2); where
             their shapes overlap a fibre counts once for each.
         contact: contact model; the default layer, `Contact()`, if None.
+        precision: error of signals of a layer or a profile near a press, as a share of the largest one: the root of its
+            mean square for a layer, the largest for a profile; 1e-6 to 1. It does not matter for a shape, where uniform
+            Manhattan signals are closed forms between roots, to rounding, and others Gauss-Kronrod integrals, to 1e-11.
+        sensitivity: factors on the response of each fibre to a layer or a profile, at K >= 2 even steps along its axis;
+            shape (F, K). 1 if None, and for a shape.
 
     Returns:
-        Signals; shape (Q, F), or (..., Q, F) of a population; grid units for weights without unit. Uniform Manhattan
-        signals are a closed form between roots exact to rounding, others Gauss-Kronrod integrals: to 1e-11 in a shape,
-        and in a layer or a profile to 1e-9 for a largest weight of about 1.
+        Signals; shape (Q, F), or (..., Q, F) of a population; grid units for weights without unit.
 
     Raises:
-        InputError: presses of the wrong shape or not finite.
+        InputError: presses of the wrong shape or not finite, or a precision out of range.
     """
     contact = or_default("contact", contact, Contact)
     along, across, ends, batch = fibre_axes(pad)
     centres, press_counts = check_presses(presses, several=True)
     fibres = along.shape[1]
     check_memory(len(along) * len(centres) * fibres)
-    out = np.zeros(len(along) * len(centres) * fibres)
-    _run_exact(along, across, ends, centres, press_shape(contact, grid_unit_mm(pad)), _DENSE, out)
+    out = np.zeros((len(along), len(centres), fibres))
+    if contact.model == "shape":
+        shape = press_shape(contact, grid_unit_mm(pad))
+        _run_exact(along, across, ends, centres, shape, _DENSE, out.reshape(-1))
+    elif len(centres):
+        precision = check_float("precision", precision, FINEST_PRECISION, 1.0)
+        for curves in zip(along, across, out, strict=True):
+            _sum_elements(*curves, ends, centres, contact, grid_unit_mm(pad), precision, sensitivity)
     return _sum_simultaneous(out, (*batch, *press_counts, fibres))
 
 
 def relative_stretch(pad: Morphology, presses: ArrayLike, contact: Contact) -> Array:
     """Compute the relative stretch (Q, F) of each fibre, which is what a voltage divider measures: signal over length.
 
-    A fibre is a strain gauge: its resistance grows with its relative stretch, less on a longer fibre. Of a layer and of
-    a profile it is summed over elements of the fibres, with a root mean squared error below 1e-3 of the largest, in a
-    tenth of the time of `signals`.
+    A fibre is a strain gauge: its resistance grows with its relative stretch, less on a longer fibre.
     """
-    return evaluated_signals(pad, presses, contact) / lengths(pad)
+    return signals(pad, presses, contact) / lengths(pad)
 
 
-def evaluated_signals(pad: Morphology, presses: ArrayLike, contact: Contact) -> Array:
-    """Compute `signals` (Q, F) to evaluate a pad: by elements to FINE_PRECISION, those of a shape exactly."""
-    return quick_signals(pad, presses, contact, measured_signals.FINE_PRECISION)
-
-
-def quick_signals(
-    pad: Morphology,
-    presses: ArrayLike,
+def _sum_elements(
+    along: Array,
+    across: Array,
+    out: Array,
+    ends: geometry.Ends,
+    presses: Array,
     contact: Contact,
-    precision: float | None = None,
-    sensitivity: Array | None = None,
-) -> Array:
-    """Compute `signals` (Q, F) of a layer or a profile by elements of the fibres, as a search does.
-
-    Args:
-        pad: the fibres.
-        presses: centres; shape (Q, 2), grid units.
-        contact: contact model; signals of a shape are exact.
-        precision: as of `element_spacings`.
-        sensitivity: factors on the response of each fibre, at K >= 2 even steps along its axis; shape (F, K). 1 if
-            None, and for a shape.
-    """
-    if contact.model == "shape":
-        return signals(pad, presses, contact)
-    centres, _ = check_presses(presses)
-    fibres = len(check_type("pad", pad, Morphology).knots)
-    check_memory(len(centres) * fibres)
-    along, across, ends, _ = fibre_axes(pad)
-    shape, out = press_shape(contact, pad.unit_mm), np.zeros((len(centres), fibres))
-    if not len(centres):
-        return out
-    slope, spacings = population_slopes(along, across)[0], element_spacings(contact, pad.unit_mm, precision)
-    elements = measured_signals.fibre_elements(
-        along[0], across[0], slope, ends.horizontals, centres, shape[2], spacings
-    )
+    unit_mm: float,
+    precision: float,
+    sensitivity: Array | None,
+) -> None:
+    """Write the signals (Q, F) of one pad, whose knots have coordinates (F, N + 2), by elements of its fibres."""
+    shape, slope = press_shape(contact, unit_mm), population_slopes(along[None], across[None])[0]
+    law, spacings = shape[2], element_spacings(contact, unit_mm, precision)
+    elements = element_signals.fibre_elements(along, across, slope, ends.horizontals, presses, law, spacings)
     if sensitivity is not None:
-        measured_signals.weigh_elements(elements, along[0], sensitivity)
-    table = weight_table(contact, pad.unit_mm)
-    visited = measured_signals.element_signals(along[0], across[0], elements, centres, shape[2], table, out)
+        element_signals.weigh_elements(elements, along, sensitivity)
+    table = weight_table(contact, unit_mm)
+    visited = element_signals.element_signals(along, across, elements, presses, law, table, out)
     if profiling.is_profiling():
-        record_visits(along, geometry.max_offsets(across, ends), ends, centres, shape[1], visited)
-    return out
+        offsets = geometry.max_offsets(across[None], ends)
+        record_visits(along[None], offsets, ends, presses, shape[1], visited)
 
 
 def widened(contact: Contact, factor: float) -> Contact:
@@ -191,7 +189,7 @@ def indented_signals(
     check_memory(len(centres) * fibres)
     out = np.zeros((len(centres), fibres))
     for rows, weight, pressed in depth_terms(np.broadcast_to(depths_mm, len(centres)), contact):
-        out[rows] += weight[:, None] * evaluated_signals(pad, centres[rows], pressed)
+        out[rows] += weight[:, None] * signals(pad, centres[rows], pressed)
     return out
 
 
@@ -286,11 +284,14 @@ def signals_sparse(pad: Morphology, presses: ArrayLike, contact: Contact | None 
         presses: centres; shape (Q, 2), grid units.
         contact: as in `signals`.
     """
-    from scipy.sparse import csr_array
+    from scipy.sparse import csr_array, vstack
 
     contact = or_default("contact", contact, Contact)
     along, across, ends, _ = fibre_axes(check_type("pad", pad, Morphology))
     centres, max_offsets = check_presses(presses)[0], geometry.max_offsets(across, ends)
+    if contact.model != "shape":
+        blocks = np.array_split(centres, range(_SPARSE_BLOCK, len(centres), _SPARSE_BLOCK))
+        return csr_array(vstack([csr_array(signals(pad, block, contact)) for block in blocks], format="csr"))
     shape = press_shape(contact, pad.unit_mm)
     starts = geometry.count_touched(max_offsets[0], centres, shape[1], ends)
     check_memory(int(starts[-1]))
@@ -375,23 +376,27 @@ def press_shape(contact: Contact, unit_mm: float) -> PressShape:
     return *geometry.frame_shape(law.radius, None), law
 
 
+def search_precision(contact: Contact) -> float:
+    """Return the precision of `signals` in a search, far lower for a layer, whose strains step at a contact's edge."""
+    return LAYER_PRECISION if contact.model == "layer" else PROFILE_PRECISION
+
+
 @lru_cache(maxsize=128)
-def element_spacings(contact: Contact, unit_mm: float, precision: float | None = None) -> tuple[float, float]:
-    """Return the spacings of elements of `measured_signals` for a contact with a profile, grid units of `unit_mm`.
+def element_spacings(contact: Contact, unit_mm: float, precision: float) -> tuple[float, float]:
+    """Return the spacings of elements of `element_signals` for a contact with a profile, grid units of `unit_mm`.
 
     Args:
         contact: a layer or a profile.
         unit_mm: the grid unit, mm.
-        precision: error as a share of the largest signal; that of a search if None.
+        precision: as of `signals`.
     """
-    search = measured_signals.LAYER_PRECISION if contact.model == "layer" else measured_signals.PRECISION
-    return measured_signals.element_spacings(contact_law(contact, unit_mm), precision or search)
+    return element_signals.element_spacings(contact_law(contact, unit_mm), precision)
 
 
 @lru_cache(maxsize=32)
 def weight_table(contact: Contact, unit_mm: float) -> Array:
-    """Return the table of `measured_signals` for a contact with a profile, in grid units of `unit_mm`."""
-    return measured_signals.weight_table(contact_law(contact, unit_mm))
+    """Return the table of `element_signals` for a contact with a profile, in grid units of `unit_mm`."""
+    return element_signals.weight_table(contact_law(contact, unit_mm))
 
 
 @lru_cache(maxsize=128)  # DEPTH_STEPS of several tools

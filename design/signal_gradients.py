@@ -7,12 +7,12 @@ from functools import cached_property
 import numpy as np
 
 from padforge.common import profiling
-from padforge.design.contact import element_spacings, press_shape, record_visits, weight_table
+from padforge.design.contact import element_spacings, press_shape, record_visits, search_precision, weight_table
+from padforge.design.kernels.element_signals import element_signals, elements_gradient, fibre_elements
 from padforge.design.kernels.exact_gradient import signals_gradient
 from padforge.design.kernels.exact_signals import exact_signals
 from padforge.design.kernels.geometry import Ends
 from padforge.design.kernels.geometry import max_offsets as compute_max_offsets
-from padforge.design.kernels.measured_signals import element_signals, elements_gradient, fibre_elements
 from padforge.design.kernels.pchip import arc_lengths_gradient, fibre_slopes_gradient, population_slopes
 from padforge.design.morphology import Array
 from padforge.design.settings import Contact
@@ -51,16 +51,13 @@ class FibreCurves:
     def signals(self, presses: Array, contact: Contact) -> tuple[Array, Differentiate]:
         """Compute the signals (F, Q) of presses (Q, 2), grid units for weights without unit, and what differentiates.
 
-        They are exact for a shape, and within PRECISION of `measured_signals` for a layer or a profile.
+        They are exact for a shape, and of the `search_precision` for a layer or a profile.
         """
         t, v, d, ends, shape = self.along, self.across, self.slope, self.ends, press_shape(contact, self.unit_mm)
         out = np.zeros((len(presses), len(t)))
         if contact.model != "shape":  # elements are cut once for both directions
-            law, spacings, table = (
-                shape[2],
-                element_spacings(contact, self.unit_mm),
-                weight_table(contact, self.unit_mm),
-            )
+            law, table = shape[2], weight_table(contact, self.unit_mm)
+            spacings = element_spacings(contact, self.unit_mm, search_precision(contact))
             elements = fibre_elements(t, v, d, ends.horizontals, presses, law, spacings)
             visited = element_signals(t, v, elements, presses, law, table, out)
             kernel = lambda upstream: elements_gradient(t, v, d, elements, presses, upstream, law, table)  # noqa: E731

@@ -24,8 +24,8 @@ from padforge.common.validation import (
 )
 from padforge.common.validation import check_path as as_path
 from padforge.design.contact import check_presses
+from padforge.design.kernels.element_signals import sum_elements
 from padforge.design.kernels.geometry import EUCLIDEAN, profile_law
-from padforge.design.kernels.measured_signals import sum_elements
 from padforge.design.morphology import Array, Morphology
 from padforge.design.paths.curves import lengths
 from padforge.design.settings import Contact

@@ -115,7 +115,7 @@ def _add_inner_term(
     while top >= 0:
         low, high = stack[top]
         pieces += 1
-        if top < MAX_HALVINGS and not is_precise(integrate_kronrod(span, low, high, law)[1], pieces, law):
+        if top < MAX_HALVINGS and not is_precise(integrate_kronrod(span, low, high, law)[1], pieces):
             stack[top, 1] = 0.5 * (low + high)
             top += 1
             stack[top, 0], stack[top, 1] = 0.5 * (low + high), high
@@ -174,7 +174,7 @@ def signals_gradient(
     """Compute the gradient (3, F, n) of sum(upstream * signals) by along, across and slope of one pad.
 
     Slopes are held independent of knots. `upstream` is (Q, F), `max_offsets` (2,); the law has any weight but PROFILE,
-    which `measured_signals` differentiates.
+    which `element_signals` differentiates.
     """
     (fibres, n), (chains, extents, law) = along.shape, shape
     out, change = np.zeros((3, fibres, n)), np.empty(6)

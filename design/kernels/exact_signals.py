@@ -1,4 +1,4 @@
-"""Exact signals: line integrals along PCHIP spans inside the press, without sampling.
+"""Exact signals of a shape: line integrals along PCHIP spans inside the press, without sampling.
 
 Frame: a fibre runs along t and deviates across it, v; both are measured from the press centre. A span is the cubic
 t = r + h s, v = e0 + e1 s + e2 s^2 + e3 s^3 in a parameter s whose zero is the point of the span abreast of the
@@ -19,15 +19,13 @@ from padforge.design.kernels.geometry import (
     EPS,
     INVERSE,
     MANHATTAN,
-    PROFILE,
     SCRATCH,
     UNIFORM,
     find_touched_range,
     find_unit_roots,
-    refine_root,
     select_frame,
     shell_sort,
-    weigh_element,
+    weigh,
 )
 from padforge.design.kernels.pchip import piece_of
 
@@ -55,8 +53,8 @@ GAUSS = np.array(
     ]
 )
 MAX_HALVINGS = 48
-PRECISION, PROFILE_PRECISION = 1e-11, 5e-10
-"""Relative error of a piece without a closed form; of a profile, relative to weight 1."""
+PRECISION = 1e-11
+"""Relative error of a piece without a closed form."""
 MAX_TURN = 8.0
 """Ratio of the steepest rise of a piece to its least one, or to its run, up to which the quadrature converges fast."""
 PIECES, PATIENCE = 500, 100
@@ -83,17 +81,12 @@ def _density(span: Any, s: float, law: Any) -> float:
     if law.weight == UNIFORM:
         return run
     t, v = span[0] + span[1] * s, evaluate_cubic(span, s)
-    return run * weigh_element(t, v, span[1], rise, law)
+    return run * weigh(t * t + v * v, law)
 
 
 @kernel
 def integrate_kronrod(span: Any, a: float, b: float, law: Any) -> tuple[float, float]:
-    """Integrate over [a, b] by the 15-point Kronrod rule and estimate the relative error by the 7-point Gauss rule.
-
-    For a profile, whose weights may cancel, the estimate is relative to the integral at weight 1, so that those of all
-    pieces add up to no more than it says of the whole fibre; and it is the plain difference, without QUADPACK's
-    sharpening (200 d)^1.5.
-    """
+    """Integrate over [a, b] by the 15-point Kronrod rule and estimate the relative error by the 7-point Gauss rule."""
     middle, half = 0.5 * (a + b), 0.5 * (b - a)
     fine, coarse = 0.0, 0.0
     for i in range(15):
@@ -102,18 +95,14 @@ def integrate_kronrod(span: Any, a: float, b: float, law: Any) -> tuple[float, f
         fine += KRONROD[k] * value
         if k % 2 == 1:
             coarse += GAUSS[k // 2] * value
-    if law.weight == PROFILE:
-        run = span[1] + abs(evaluate_cubic(span, b) - evaluate_cubic(span, a)) / (b - a)  # spans are monotone
-        return fine * half, abs(fine - coarse) / run
     gap = abs(fine - coarse) / fine if fine > 0 else 0.0
     return fine * half, min(1.0, (200 * gap) ** 1.5)
 
 
 @kernel
-def is_precise(error: float, pieces: int, law: Any) -> bool:
+def is_precise(error: float, pieces: int) -> bool:
     """Whether the error of a piece, the `pieces`-th that was integrated, is acceptable."""
-    least = PROFILE_PRECISION if law.weight == PROFILE else PRECISION
-    return not error > least * 2.0 ** (max(pieces - PIECES, 0) / PATIENCE)  # that of a piece without length is NaN
+    return not error > PRECISION * 2.0 ** (max(pieces - PIECES, 0) / PATIENCE)  # that of a piece without length is NaN
 
 
 @kernel
@@ -151,7 +140,7 @@ def _integrate_stretch(span: Any, a: float, b: float, law: Any, stack: Any) -> f
         if top >= MAX_HALVINGS or not _has_turn(span, low, high, law):
             part, error = integrate_kronrod(span, low, high, law)
             pieces += 1
-            if top >= MAX_HALVINGS or is_precise(error, pieces, law):
+            if top >= MAX_HALVINGS or is_precise(error, pieces):
                 total += part
                 top -= 1
                 continue
@@ -394,44 +383,9 @@ def find_stretches_inside(
 
 
 @kernel
-def _compute_profile_signal(span: Any, a: float, b: float, law: Any, scratch: Any) -> float:
-    """Return the signal of a stretch inside a profile, split where the profile bends.
-
-    The quadrature might miss a bend between its nodes. Bends are crossed one by one where the squared distance, of
-    degree 6, is monotone: from one point at which it is stationary to the next.
-    """
-    roots, work, p, stack = scratch
-    w, profile = b - a, law.profile
-    _expand_square(span, a, b, 0.0, p)
-    for i in range(6):
-        p[i] = (i + 1) * p[i + 1]
-    count = find_unit_roots(p, np.int64(5), 0.0, roots, np.int64(0), work)
-    roots[count] = 1.0
-    _expand_square(span, a, b, 0.0, p)
-    first, total, low, before = p[0], 0.0, 0.0, p[0]
-    for i in range(count + 1):
-        high, after = roots[i], p[6]
-        for k in range(5, -1, -1):
-            after = after * high + p[k]
-        for k in range(1, len(profile)):
-            square = profile[k if after > before else len(profile) - k, 0]
-            if min(before, after) < square < max(before, after):
-                p[0] = first - square
-                cut = refine_root(p, 6, low, high, after > before)
-                p[0] = first
-                total += _integrate_stretch(span, a + w * low, a + w * cut, law, stack)
-                low = cut
-        total += _integrate_stretch(span, a + w * low, a + w * high, law, stack)
-        low, before = high, after
-    return total
-
-
-@kernel
 def _compute_stretch_signal(span: Any, a: float, b: float, law: Any, scratch: Any) -> float:
     """Return the signal of a stretch inside the press, split where the weight bends."""
     roots, work, p, stack = scratch
-    if law.weight == PROFILE:
-        return _compute_profile_signal(span, a, b, law, scratch)
     count = np.int64(0)
     if law.weight == INVERSE:
         count = find_circle_roots(span, a, b, law.radius / 100, roots, count, work, p)

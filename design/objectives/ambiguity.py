@@ -16,7 +16,7 @@ import numpy as np
 
 from padforge.common.compilation import kernel
 from padforge.common.validation import InputError
-from padforge.design.contact import grid_positions, quick_signals, relative_stretch
+from padforge.design.contact import grid_positions, relative_stretch, search_precision, signals
 from padforge.design.morphology import Array, Morphology
 from padforge.design.objectives.fibre_loss import failure_shares, failure_subsets
 from padforge.design.paths.curves import lengths
@@ -55,10 +55,11 @@ def ambiguity_map(
 ) -> Array:
     """Compute the ambiguity (K, Q), grid units, of every press with 0, 1, ... K - 1 fibres failed, fast enough to edit.
 
-    Each of the `presses` (Q, 2) may be taken for any other. Signals are exact, but for a layer or a profile within the
-    PRECISION of `measured_signals`; `noise` is a share of full scale.
+    Each of the `presses` (Q, 2) may be taken for any other. Signals have the precision of a search; `noise` is a share
+    of full scale.
     """
-    return _by_press(quick_signals(pad, presses, contact) / lengths(pad), presses, max_failures, noise)
+    stretch = signals(pad, presses, contact, precision=search_precision(contact)) / lengths(pad)
+    return _by_press(stretch, presses, max_failures, noise)
 
 
 def _by_press(stretch: Array, presses: Array, max_failures: int | tuple[float, ...], noise: float) -> Array:

@@ -16,7 +16,7 @@ import numpy as np
 
 from padforge.common.settings import or_default
 from padforge.common.validation import check_type
-from padforge.design.contact import evaluated_signals, fibre_axes, serpentine_presses
+from padforge.design.contact import fibre_axes, serpentine_presses, signals
 from padforge.design.morphology import Array, Morphology
 from padforge.design.objectives.ambiguity import AMBIGUITY_NOISE, ambiguities
 from padforge.design.objectives.bayes_error import expected_errors
@@ -56,7 +56,7 @@ class ScoredPad:
     @cached_property
     def serpentine_signals(self) -> Array:
         """(Q, F) signals of presses in an order of neighbours."""
-        return evaluated_signals(self.pad, serpentine_presses(self.size.sensed, 32, 5 / 49), self.contact)
+        return signals(self.pad, serpentine_presses(self.size.sensed, 32, 5 / 49), self.contact)
 
     @property
     def published_contact(self) -> Contact:

@@ -13,11 +13,11 @@ from padforge.common.validation import InputError, check_array, check_int, check
 from padforge.design.contact import (
     check_presses,
     check_samples,
-    evaluated_signals,
     fibre_axes,
     grid_unit_mm,
     press_shape,
     serpentine_presses,
+    signals,
 )
 from padforge.design.morphology import Array, Morphology
 from padforge.design.published import kernels
@@ -75,7 +75,7 @@ def information(pad: Morphology, contact: Contact | None = None, noise: float = 
     contact = or_default("contact", contact, Contact)
     step = 1e-2 if contact.model == "layer" else 1e-4  # a layer's signals are less precise
     around = (positions[:, None] + step * np.array([[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1]])).reshape(-1, 2)
-    values = evaluated_signals(pad, around, contact).reshape(len(positions), 5, -1)
+    values = signals(pad, around, contact).reshape(len(positions), 5, -1)
     values = values[..., values.any(axis=(0, 1))]  # the other fibres, most of a large pad's, have no information
     if not values.size:
         return 0.0

@@ -53,8 +53,8 @@ def plan_prior(pad: Morphology, contact: Contact, origin_mm: Array, scale_mm: fl
         scale_mm: distance that is 1 when scaled, mm.
     """
     # compiled kernels take long to import
-    from padforge.design.contact import quick_signals, widened
-    from padforge.design.kernels.measured_signals import LAYER_PRECISION
+    from padforge.design.contact import signals, widened
+    from padforge.design.kernels.element_signals import LAYER_PRECISION
 
     side, fibres = GRID_CELLS + 1, len(pad.knots)
     grid = pad.to_grid(grid_positions(side).reshape(-1, 2) * scale_mm + origin_mm)
@@ -64,7 +64,9 @@ def plan_prior(pad: Morphology, contact: Contact, origin_mm: Array, scale_mm: fl
     parts = []
     for width in WIDTHS:
         hats = [
-            quick_signals(pad, grid, widened(contact, width), LAYER_PRECISION, np.tile(hat, (fibres, 1)))
+            signals(
+                pad, grid, widened(contact, width), precision=LAYER_PRECISION, sensitivity=np.tile(hat, (fibres, 1))
+            )
             for hat in np.eye(N_NODES)
         ]
         maps = np.stack(hats, axis=2).reshape(side, side, fibres, N_NODES)

@@ -13,8 +13,7 @@ from typing import Generic, NamedTuple, TypeVar
 import numpy as np
 
 from padforge.design import Contact, Morphology
-from padforge.design.contact import quick_signals, widened
-from padforge.design.kernels.measured_signals import FINE_PRECISION
+from padforge.design.contact import signals, widened
 from padforge.design.morphology import split_axes
 from padforge.design.paths.curves import lengths
 from padforge.sense.arrays import Array
@@ -73,8 +72,7 @@ class BuiltPad:
         """Compute the relative stretch (Q, F) of the fibres by presses (Q, 2), of which each part has its contact."""
         presses, parts = self.paths.to_grid(positions_mm), []
         for contact, sensitivity in zip(contacts, self.sensitivities or [None] * len(contacts), strict=True):
-            signals = quick_signals(self.paths, presses, contact, FINE_PRECISION, sensitivity)
-            parts.append(signals / self._lengths)
+            parts.append(signals(self.paths, presses, contact, sensitivity=sensitivity) / self._lengths)
         return PressParts(*parts)
 
 

@@ -15,7 +15,7 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from padforge.design.contact import contact_law
-from padforge.design.kernels.measured_signals import sum_elements
+from padforge.design.kernels.element_signals import sum_elements
 from padforge.design.settings import Contact
 from padforge.design.twin import PlanTransform
 from padforge.sense.arrays import Array

@@ -5,7 +5,6 @@ import pytest
 
 from padforge import InputError
 from padforge.design import Contact, Morphology, indented_signals, press_forces_n, signals
-from padforge.design.contact import evaluated_signals
 from padforge.design.layer import solve_press
 
 PAD = Morphology.random(2, 3, 1)
@@ -28,7 +27,7 @@ def test_indented_signals_are_those_of_solved_contacts(contact: Contact) -> None
     solved = [signals(PAD, presses, contact.model_copy(update={"depth_mm": each})) for each in depths_mm]
     np.testing.assert_allclose(interpolated, np.concatenate(solved), rtol=0, atol=0.01 * full_scale)
     deepest = indented_signals(PAD, presses, contact.depth_mm, contact)
-    np.testing.assert_array_equal(deepest, evaluated_signals(PAD, presses, contact))
+    np.testing.assert_array_equal(deepest, signals(PAD, presses, contact))
     assert not indented_signals(PAD, presses, 0.0, contact).any()
     assert indented_signals(PAD, [], [], contact).shape == (0, 4)
 
@@ -36,7 +35,7 @@ def test_indented_signals_are_those_of_solved_contacts(contact: Contact) -> None
 def test_indented_signals_of_a_flat_end_grow_in_proportion_to_the_depth() -> None:
     contact, presses = Contact(tool="flat", tool_radius_mm=5.0), presses_on(PAD, 3)
     depths_mm = np.array([0.0, 0.02, 4.9])
-    expected = depths_mm[:, None] / 5.0 * evaluated_signals(PAD, presses, contact)
+    expected = depths_mm[:, None] / 5.0 * signals(PAD, presses, contact)
     np.testing.assert_allclose(indented_signals(PAD, presses, depths_mm, contact), expected, rtol=1e-6, atol=1e-9)
 
 

@@ -1,11 +1,11 @@
-"""Signals of a pressed layer: exact ones against a dense oracle, those of a search beside them, and lengths."""
+"""Signals of a pressed layer against a dense oracle, those of a search beside them, and lengths."""
 
 import numpy as np
 import pytest
 
-from padforge.design import Contact, Morphology, signals, signals_quantized, signals_sparse
+from padforge.design import Contact, Morphology, signals, signals_quantized
 from padforge.design.contact import fibre_axes
-from padforge.design.kernels.measured_signals import LAYER_PRECISION
+from padforge.design.kernels.element_signals import LAYER_PRECISION
 from padforge.design.settings import BUILT_CONTACT
 from padforge.design.signal_gradients import FibreCurves
 from tests.design.kernels.oracle import dense_oracle
@@ -27,11 +27,16 @@ def curves(pad, move: np.ndarray | float = 0.0):
 
 
 @pytest.mark.parametrize("contact", CONTACTS.values(), ids=CONTACTS)
-def test_layer_signals_equal_the_oracle(contact):
+def test_layer_signals_are_as_precise_as_asked(contact):
     pad, rng = Morphology.random((1, 1), 3, seed=1), np.random.default_rng(1)
     presses = rng.uniform(0.3, 1.7, (2, 2))
-    expected = [[dense_oracle(pad, press, contact, fibre) for fibre in range(2)] for press in presses]
-    np.testing.assert_allclose(signals(pad, presses, contact), expected, rtol=0, atol=1e-11)
+    expected = np.array([[dense_oracle(pad, press, contact, fibre) for fibre in range(2)] for press in presses])
+    largest = np.abs(expected).max()
+    for precision in (1e-3, 1e-5, 1e-6):
+        found = signals(pad, presses, contact, precision=precision)
+        np.testing.assert_allclose(found, expected, rtol=0, atol=precision * largest)
+    sampled = signals_quantized(pad, presses, contact, samples=50_001)
+    np.testing.assert_allclose(sampled, expected, rtol=0, atol=2e-3 * largest)
 
 
 @pytest.mark.parametrize(
@@ -47,20 +52,16 @@ def test_signals_are_precise_where_a_bend_may_be_missed(contact, seed, press, fi
     pad = Morphology.random((2, 2), 4, seed=seed, pitch_mm=4.0)
     at = np.random.default_rng(seed).uniform(0, 3, (3, 2))[press]
     expected = dense_oracle(pad, at, contact, fibre)
-    assert signals(pad, [at], contact)[0, fibre] == pytest.approx(expected, rel=0, abs=1e-10)
+    assert signals(pad, [at], contact)[0, fibre] == pytest.approx(expected, rel=1e-3)
 
 
 @pytest.mark.parametrize("contact", CONTACTS.values(), ids=CONTACTS)
-def test_layer_signals_agree_in_every_form(contact):
+def test_signals_of_a_search_are_within_its_precision(contact):
     pad = Morphology.random((3, 2), 5, seed=2, pitch_mm=(8.0, 12.0))
     presses = np.random.default_rng(2).uniform(0, pad.layout.extent, (60, 2))
-    exact = signals(pad, presses, contact)
-    largest = np.abs(exact).max()
-    np.testing.assert_array_equal(signals_sparse(pad, presses, contact).toarray(), exact)
-    sampled = signals_quantized(pad, presses[:10], contact, samples=50_001)
-    np.testing.assert_allclose(sampled, exact[:10], rtol=0, atol=2e-3 * largest)
-    error = curves(pad).signals(presses, contact)[0].T - exact
-    assert np.sqrt((error**2).mean()) < LAYER_PRECISION * largest
+    fine = signals(pad, presses, contact, precision=1e-6)
+    error = curves(pad).signals(presses, contact)[0].T - fine
+    assert np.sqrt((error**2).mean()) < LAYER_PRECISION * np.abs(fine).max()
 
 
 @pytest.mark.parametrize("contact", CONTACTS.values(), ids=CONTACTS)
@@ -82,12 +83,12 @@ def test_layer_gradient_equals_differences_of_search_signals(contact):
 def test_families_at_other_depths_respond_differently():
     """On a pad that is its own transpose, pressed along its diagonal; `test_rectangles` has any other."""
     pad, presses = Morphology.straight(1), np.outer(np.linspace(0.2, 1.8, 9), [1, 1])
-    shallow, deep = signals(pad, presses, Contact(fibre_depths_mm=(0.5, 4.0))).T
+    shallow, deep = signals(pad, presses, Contact(fibre_depths_mm=(0.5, 4.0)), precision=1e-6).T
     assert np.abs(shallow - deep).max() > 0.05 * deep.max()
-    exchanged = signals(pad, presses, Contact(fibre_depths_mm=(4.0, 0.5)))
-    np.testing.assert_allclose(exchanged, np.column_stack([deep, shallow]), rtol=0, atol=1e-9)
-    alike = signals(pad, presses, Contact(fibre_depths_mm=(4.0, 4.0)))
-    np.testing.assert_allclose(alike, np.column_stack([deep, deep]), rtol=0, atol=1e-9)
+    exchanged = signals(pad, presses, Contact(fibre_depths_mm=(4.0, 0.5)), precision=1e-6)
+    np.testing.assert_allclose(exchanged, np.column_stack([deep, shallow]), rtol=0, atol=2e-6)
+    alike = signals(pad, presses, Contact(fibre_depths_mm=(4.0, 4.0)), precision=1e-6)
+    np.testing.assert_allclose(alike, np.column_stack([deep, deep]), rtol=0, atol=2e-6)
 
 
 def half_width_and_elongation_mm(pitch_mm, contact):
@@ -99,7 +100,7 @@ def half_width_and_elongation_mm(pitch_mm, contact):
     x, y = (extent / 2 for extent in pad.layout.extent)
     away = np.linspace(0, 12, 121)
     presses = np.column_stack([x + away / pitch_mm, np.full_like(away, y)])
-    response = signals(pad, presses, contact)[:, -1]
+    response = signals(pad, presses, contact, precision=1e-5)[:, -1]
     return float(np.interp(0.5, response[::-1] / response[0], away[::-1])), response[0] * pitch_mm
 
 

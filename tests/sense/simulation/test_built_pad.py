@@ -5,7 +5,7 @@ import pytest
 from scipy.interpolate import PchipInterpolator
 
 from padforge.design import Contact, Morphology
-from padforge.design.contact import evaluated_signals, signals, widened
+from padforge.design.contact import signals, widened
 from padforge.design.paths.curves import lengths
 from padforge.design.settings import PUBLISHED_CONTACT
 from padforge.sense import RigSettings
@@ -19,7 +19,7 @@ PRESSES_MM = np.random.default_rng(0).uniform(-15, 15, (20, 2))
 def test_pad_as_planned_responds_as_its_plan() -> None:
     built = build_pad(PLAN, IDEAL_RIG)
     assert built.paths is PLAN
-    expected = evaluated_signals(PLAN, PLAN.to_grid(PRESSES_MM), Contact()) / lengths(PLAN)
+    expected = signals(PLAN, PLAN.to_grid(PRESSES_MM), Contact()) / lengths(PLAN)
     for part in built.stretch(PRESSES_MM, press_contacts(Contact(), IDEAL_RIG)):
         np.testing.assert_array_equal(part, expected)
 
@@ -28,7 +28,7 @@ def test_parts_of_a_press_are_as_wide_as_stated() -> None:
     rig = IDEAL_RIG.model_copy(update={"onset_width": 0.8, "after_width": 0.6})
     _, *parts = build_pad(PLAN, rig).stretch(PRESSES_MM, press_contacts(Contact(), rig))
     for part, width in zip(parts, (0.8, 0.6, 0.6), strict=True):
-        narrow = evaluated_signals(PLAN, PLAN.to_grid(PRESSES_MM), Contact(scale=width)) / lengths(PLAN)
+        narrow = signals(PLAN, PLAN.to_grid(PRESSES_MM), Contact(scale=width)) / lengths(PLAN)
         np.testing.assert_array_equal(part, narrow)
 
 

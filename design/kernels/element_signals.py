@@ -1,4 +1,4 @@
-"""Signals of a measured profile and their gradient by Gauss quadrature, to the precision that a search needs.
+"""Signals of a layer or a profile and their gradient, by Gauss quadrature over elements of the fibres.
 
 Gauss rules cut the spans of a fibre into elements whose positions and lengths do not depend on the press. The signal of
 a press is the sum of the weights of the elements within its profile. In the reverse pass the gradient with respect to
@@ -26,12 +26,14 @@ from padforge.design.kernels.pchip import extremes
 
 Array = NDArray[np.float64]
 
-PRECISION = 5e-5
-"""Error of signals here, as a share of the largest one: far below that of measured profiles."""
-LAYER_PRECISION, FINE_PRECISION = 1.5e-2, 1e-3
-"""Root of the mean squared error of signals of a layer near a press, as a share of the largest one, in a search and
-where a pad is evaluated; over a pad it is a tenth to a quarter of it. Strains of a shallow fibre step at the edge
-of the contact, and to resolve the step takes twice as long."""
+PROFILE_PRECISION = 5e-5
+"""Error of signals of a profile in a search, as a share of the largest one: far below that of measured profiles."""
+LAYER_PRECISION = 1.5e-2
+"""Root of the mean squared error of signals of a layer near a press in a search, as a share of the largest one. Over a
+pad it is a tenth to a quarter of it. Strains of a shallow fibre step at the edge of the contact, and to resolve the
+step takes twice as long."""
+FINE_PRECISION = 1e-3
+"""The same where a pad is evaluated."""
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(8)  # fewer do not resolve the bends of a span
 _NODES, _WEIGHTS = (1 + _NODES) / 2, _WEIGHTS / 2  # on [0, 1]
 _LAYER_NODES, _LAYER_WEIGHTS = np.polynomial.legendre.leggauss(5)

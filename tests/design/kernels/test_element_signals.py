@@ -1,4 +1,4 @@
-"""Signals of a measured profile: exact ones against dense quadrature, and those that a search takes beside them."""
+"""Signals of a measured profile against dense quadrature, to the precision that is asked for."""
 
 import numpy as np
 import pytest
@@ -6,10 +6,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.interpolate import CubicSpline
 
+from padforge import InputError
 from padforge.common.profiling import profiled
 from padforge.design import Contact, Morphology, signals, signals_quantized, signals_sparse
 from padforge.design.contact import fibre_axes
-from padforge.design.kernels.measured_signals import PRECISION
+from padforge.design.kernels.element_signals import PROFILE_PRECISION
 from padforge.design.settings import DEFAULT_PITCH_MM
 from padforge.design.signal_gradients import FibreCurves
 from tests.design.kernels.oracle import dense_oracle
@@ -41,23 +42,41 @@ def searched(pad, presses, contact):
 
 
 @pytest.mark.parametrize("length", ["manhattan", "euclidean"])
-def test_profile_signals_match_the_oracle(length):
+@pytest.mark.parametrize("profile", PROFILES.values(), ids=PROFILES)
+def test_profile_signals_are_as_precise_as_asked(profile, length):
     for knots in (0, 5):
         rng = np.random.default_rng(knots)
-        pad, contact = Morphology.random(1, knots, rng), contact_of(PROFILES["broad"], length)
+        pad, contact = Morphology.random(1, knots, rng), contact_of(profile, length)
         presses = rng.uniform(0, 2, (2, 2))
-        found = signals(pad, presses, contact)
-        expected = [[dense_oracle(pad, press, contact, fibre) for fibre in range(2)] for press in presses]
-        np.testing.assert_allclose(found, expected, rtol=0, atol=1e-9)
-        np.testing.assert_array_equal(signals_sparse(pad, presses, contact).toarray(), found)
+        expected = np.array([[dense_oracle(pad, press, contact, fibre) for fibre in range(2)] for press in presses])
+        for precision in (1e-3, 1e-5, 1e-6):
+            found = signals(pad, presses, contact, precision=precision)
+            assert np.abs(found - expected).max() < precision * np.abs(expected).max()
         sampled = signals_quantized(pad, presses, contact, samples=200_001)
-        np.testing.assert_allclose(sampled, found, atol=1e-3)
+        np.testing.assert_allclose(sampled, expected, atol=1e-3)
+
+
+@pytest.mark.parametrize("contact", [contact_of(PROFILES["broad"]), Contact()], ids=["profile", "layer"])
+def test_signals_of_elements_agree_in_every_form(contact):
+    """One press by one, of several pads, of presses at once, sparse, and in blocks."""
+    pads = [Morphology.random(2, 3, seed=seed) for seed in (1, 2)]
+    presses = np.random.default_rng(0).uniform(0, 3, (2200, 2))
+    found = signals(np.array([pad.knots for pad in pads]), presses, contact)
+    np.testing.assert_array_equal(signals(pads[1], presses[[7]], contact), found[1, [7]])
+    np.testing.assert_array_equal(signals_sparse(pads[0], presses, contact).toarray(), found[0])
+    together = signals(pads[0], presses.reshape(1100, 2, 2), contact)
+    np.testing.assert_allclose(together, found[0, ::2] + found[0, 1::2], rtol=1e-12, atol=1e-12)
+
+
+def test_precision_is_refused_beyond_its_range():
+    with pytest.raises(InputError, match="precision is 1e-07, allowed is 1e-06 to 1"):
+        signals(Morphology.straight(1), [[1, 1]], Contact(), precision=1e-7)
 
 
 def test_profile_signals_are_0_beyond_its_end():
     contact = contact_of(PROFILES["broad"])
     with profiled() as profile:
-        found = signals(Morphology.straight(4), [[1.0, 1.0], [9.0, 9.0]], contact)
+        found = signals(Morphology.straight(4), [[1.0, 1.0], [9.0, 9.0]], contact, precision=1e-6)
     assert profile.counts["spans, press by press"][0] == 4  # fibres 1 and 2 of both families
     assert not found[1].any()
     assert found[0, 0] == found[0, 4] > 0 > found[0, 1] == found[0, 5]
@@ -78,11 +97,10 @@ def test_profile_signals_on_wild_pads_are_bounded(pad, end_mm, points, seed):
         assert (np.abs(found) <= longest_signals(pad, length) * heaviest * 1.01 + 1e-9).all()
 
 
-@pytest.mark.parametrize("length", ["manhattan", "euclidean"])
 @pytest.mark.parametrize("profile", PROFILES.values(), ids=PROFILES)
-def test_element_signals_are_within_precision(profile, length):
-    contact = contact_of(profile, length)
+def test_signals_of_a_search_are_within_precision(profile):
+    contact = contact_of(profile)
     for pad in pads():
         presses = np.random.default_rng(0).uniform(0, 4, (60, 2))
-        exact = signals(pad, presses, contact)
-        assert abs(searched(pad, presses, contact) - exact).max() < PRECISION * abs(exact).max()
+        fine = signals(pad, presses, contact, precision=1e-6)
+        assert abs(searched(pad, presses, contact) - fine).max() < PROFILE_PRECISION * abs(fine).max()
