@@ -174,10 +174,10 @@ def solve_press(
         return float(shape.sum() - depth_mm * unit.sum())
 
     hertz = math.sqrt(radius_mm * depth_mm)
-    whole = radius_mm if tool == "flat" else radius_mm * (1 - 1e-6) if tool == "ball" else math.inf
-    widest = min(3 * hertz, whole, MAX_CONTACT * thickness_mm)
+    largest = radius_mm if tool == "flat" else radius_mm * (1 - 1e-6) if tool == "ball" else math.inf
+    widest = min(3 * hertz, largest, MAX_CONTACT * thickness_mm)
     if tool == "flat" or excess(widest) < 0:
-        a = whole
+        a = largest
         if a > MAX_CONTACT * thickness_mm:
             raise InputError(
                 f"tool_radius_mm is {radius_mm:g}, by which the contact is too wide for a thickness_mm of "
@@ -230,11 +230,11 @@ def _transfer(base: Base, k: Array, height: float, thickness: float) -> tuple[Ar
     cosh, sinh = (1 + decayed) / 2, (1 - decayed) / 2
     cosh_y, sinh_y = (np.exp(y - x) + np.exp(-y - x)) / 2, (np.exp(y - x) - np.exp(-y - x)) / 2
     if base == "slipping":
-        whole = sinh * cosh + x * decayed
-        down = ((sinh + x * cosh) * sinh_y - sinh * y * cosh_y) / whole
-        return down, (x * cosh * cosh_y - sinh * y * sinh_y) / whole
-    whole = cosh**2 + x**2 * decayed
-    first, second = (cosh + x * sinh) / whole, x * cosh / whole
+        determinant = sinh * cosh + x * decayed
+        down = ((sinh + x * cosh) * sinh_y - sinh * y * cosh_y) / determinant
+        return down, (x * cosh * cosh_y - sinh * y * sinh_y) / determinant
+    determinant = cosh**2 + x**2 * decayed
+    first, second = (cosh + x * sinh) / determinant, x * cosh / determinant
     return first * (sinh_y - y * cosh_y) + second * y * sinh_y, second * (sinh_y + y * cosh_y) - first * y * sinh_y
 
 

@@ -729,9 +729,9 @@ class PadSettings(Settings):
             return stated
         pitches = tuple(side / (count + 1) for side, count in zip(size_mm, counts, strict=True))
         if not all(0.1 <= pitch <= 1000 for pitch in pitches):
-            apart = " and ".join(f"{pitch:.3g}" for pitch in pitches)
+            wanted = " and ".join(f"{pitch:.3g}" for pitch in pitches)
             raise ValueError(
-                f"size_mm is {short_repr(size_mm)}, which makes pitches of {apart} mm, allowed is 0.1 to 1000"
+                f"size_mm is {short_repr(size_mm)}, which makes pitches of {wanted} mm, allowed is 0.1 to 1000"
             )
         return {**stated, "size_mm": None, "pitch_mm": pitches}
 

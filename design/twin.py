@@ -260,10 +260,10 @@ class Twin:
         if (self.residual is not None) != bool(self.parts):
             raise InputError("residual and parts go together, got one without the other")
         if self.residual is not None:
-            found, side = self.residual.volts.shape, self.residual.volts.shape[-1]
+            shape, side = self.residual.volts.shape, self.residual.volts.shape[-1]
             expected = len(PARTS), len(self.channels), side, side
-            if side < 2 or found != expected:
-                raise InputError(f"volts of residual have the shape {found}, expected {expected}, of 2 or more a side")
+            if side < 2 or shape != expected:
+                raise InputError(f"volts of residual have the shape {shape}, expected {expected}, of 2 or more a side")
 
     def contact(self) -> Contact:
         """Return the measured contact."""

@@ -84,7 +84,7 @@ def once(tmp_path_factory: pytest.TempPathFactory) -> Once:
 @pytest.fixture
 def golden(request: pytest.FixtureRequest, tmp_path: Path) -> Golden:
     """Compares an output with the one in tests/golden."""
-    return Golden(tmp_path, renew=request.config.getoption("--renew"))
+    return Golden(tmp_path, renew=bool(request.config.getoption("--renew")))
 
 
 @pytest.fixture

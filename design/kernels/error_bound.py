@@ -28,7 +28,7 @@ def error_bound(responses: Any, step: Any, cells: Any, masks: Any, scatter: Any,
     """
     floor, share, common = scatter
     fibres, side = len(responses), int(math.sqrt(responses.shape[1]) + 0.5)
-    own, shared = share * share * (1 - common), math.sqrt(common) * share
+    independent, shared = share * share * (1 - common), math.sqrt(common) * share
     out = np.zeros(len(masks))
     gradient[:] = 0
     is_asked = gradient.shape[1] > 0
@@ -39,7 +39,7 @@ def error_bound(responses: Any, step: Any, cells: Any, masks: Any, scatter: Any,
             a, b = responses[f, first], responses[f, first + 1]
             c, d = responses[f, first + side], responses[f, first + side + 1]
             middle[f] = (a + b + c + d) / 4
-            deviation[f] = math.sqrt(floor * floor + own * middle[f] * middle[f])
+            deviation[f] = math.sqrt(floor * floor + independent * middle[f] * middle[f])
             x[f] = (b + d - a - c) / (2 * step[0]) / deviation[f]
             y[f] = (c + d - a - b) / (2 * step[1]) / deviation[f]
             u[f] = shared * middle[f] / deviation[f]
@@ -60,9 +60,9 @@ def error_bound(responses: Any, step: Any, cells: Any, masks: Any, scatter: Any,
             along_x, rr, ur = xy / xx if xx > 0 else 0.0, 0.0, 0.0
             for f in range(fibres):
                 if masks[k, f] > 0:
-                    rest = y[f] - along_x * x[f]
-                    rr += rest * rest
-                    ur += u[f] * rest
+                    residual = y[f] - along_x * x[f]
+                    rr += residual * residual
+                    ur += u[f] * residual
             rr -= ur * ur / total
             volume = xx * rr + prior[0] * yy + prior[1] * xx + prior[0] * prior[1]
             trace = xx + yy + prior[0] + prior[1]
@@ -79,13 +79,13 @@ def error_bound(responses: Any, step: Any, cells: Any, masks: Any, scatter: Any,
             by_total = (by_xx * ux * ux + by_yy * uy * uy + by_rr * ur * ur) / (total * total)
             for f in range(fibres):
                 if masks[k, f] > 0:
-                    rest = y[f] - along_x * x[f]
-                    by_rest = 2 * by_rr * rest + by_ur * u[f]
-                    by_x = 2 * by_xx * x[f] + by_ux * u[f] - along_x * by_rest
-                    by_y = 2 * by_yy * y[f] + by_uy * u[f] + by_rest
-                    by_u = by_ux * x[f] + by_uy * y[f] + by_ur * rest + 2 * by_total * u[f]
+                    residual = y[f] - along_x * x[f]
+                    by_residual = 2 * by_rr * residual + by_ur * u[f]
+                    by_x = 2 * by_xx * x[f] + by_ux * u[f] - along_x * by_residual
+                    by_y = 2 * by_yy * y[f] + by_uy * u[f] + by_residual
+                    by_u = by_ux * x[f] + by_uy * y[f] + by_ur * residual + 2 * by_total * u[f]
                     by_deviation = -(by_x * x[f] + by_y * y[f] + by_u * u[f]) / deviation[f]
-                    by_middle = (by_u * shared + by_deviation * own * middle[f]) / deviation[f] / 4
+                    by_middle = (by_u * shared + by_deviation * independent * middle[f]) / deviation[f] / 4
                     along, across = by_x / (2 * step[0] * deviation[f]), by_y / (2 * step[1] * deviation[f])
                     gradient[k, f, first] += by_middle - along - across
                     gradient[k, f, first + 1] += by_middle + along - across

@@ -142,19 +142,19 @@ def _weigh(matrix: Any, weights: Any, out: Any) -> None:
 
 
 @kernel(fastmath=_FAST)
-def _add_rows(factors: Any, rows: Any, out: Any, width: int, known: int) -> None:
+def _add_rows(factors: Any, rows: Any, out: Any, width: int, n_filled: int) -> None:
     """Add factors (K,) times rows (K, N) to the first `width` columns of out (N,); row k is 0 from k + `known` on."""
     count = len(factors)
     k = 0
     while k + 4 <= count:  # four at a time: what is added to is read and written as rarely
         c0, c1, c2, c3 = factors[k], factors[k + 1], factors[k + 2], factors[k + 3]
         r0, r1, r2, r3 = rows[k], rows[k + 1], rows[k + 2], rows[k + 3]
-        for j in range(min(width, k + 3 + known)):
+        for j in range(min(width, k + 3 + n_filled)):
             out[j] += c0 * r0[j] + c1 * r1[j] + c2 * r2[j] + c3 * r3[j]
         k += 4
     for last in range(k, count):
         c0, r0 = factors[last], rows[last]
-        for j in range(min(width, last + known)):
+        for j in range(min(width, last + n_filled)):
             out[j] += c0 * r0[j]
 
 

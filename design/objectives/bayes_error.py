@@ -81,12 +81,12 @@ def expected_errors(pad: Morphology, contact: Contact, search: SearchSettings, s
         positions = possible_positions(pad, contact, size, window, scale)
         errors.append([])
         for sets in masks:
-            count, found = max(len(pressed) // len(sets), MIN_PRESSES), []
+            count, means = max(len(pressed) // len(sets), MIN_PRESSES), []
             for number, working in enumerate(sets):  # each set has presses of its own, as far as there are enough
                 rows = np.arange(number * count, (number + 1) * count) % len(pressed)
                 located = bayes_positions(readings[rows], positions, scatter, working)
-                found.append(np.hypot(*(located - pressed[rows]).T).mean())
-            errors[-1].append(np.mean(found))
+                means.append(np.hypot(*(located - pressed[rows]).T).mean())
+            errors[-1].append(np.mean(means))
     return (LEARNING * np.mean(errors, axis=0)).tolist()
 
 

@@ -137,12 +137,12 @@ def penalties(
     arc = np.pad(np.linalg.norm(np.diff(points, axis=1), axis=-1).cumsum(axis=1), ((0, 0), (1, 0)))
     fibres = FibreSamples(along, across, knot_slope, points, slope, arc, pad, pad.layout, rules, margin, all_bends)
     by = Gradient(slope, along)
-    found = {name: value for name, penalty in PENALTIES.items() if (value := penalty(fibres, by)) is not None}
+    values = {name: value for name, penalty in PENALTIES.items() if (value := penalty(fibres, by)) is not None}
     add_arc_gradient(points, by.arc, by.points)
     where = along, across, knot_slope
     add_samples_gradient(*where, SPAN_SHARES, by.points, by.slope, by.along, by.across, by.knot_slope)
     through_slopes = fibre_slopes_gradient(*where, by.knot_slope)
-    return Penalties(found, by.along + through_slopes[0], by.across + through_slopes[1])
+    return Penalties(values, by.along + through_slopes[0], by.across + through_slopes[1])
 
 
 def check_comparisons(fibres: int, samples: int) -> None:

@@ -135,9 +135,9 @@ class Adam:
         """Take a step of a learning rate; what is not finite of a gradient counts as 0."""
         self.steps += 1
         for x, (mean, square), gradient in zip(self.variables, self.moments, gradients, strict=True):
-            known = _finite(gradient)
-            mean += (1 - BETAS[0]) * (known - mean)
-            square += (1 - BETAS[1]) * (known**2 - square)
+            finite = _finite(gradient)
+            mean += (1 - BETAS[0]) * (finite - mean)
+            square += (1 - BETAS[1]) * (finite**2 - square)
             unbiased = mean / (1 - BETAS[0] ** self.steps), square / (1 - BETAS[1] ** self.steps)
             x -= rate * unbiased[0] / (np.sqrt(unbiased[1]) + 1e-8)
 
@@ -363,8 +363,8 @@ class GradientSearch:
         self, curves: FibreCurves, rules: RulesSettings, margin: float, all_bends: bool = True
     ) -> Array:
         """Return the gradient (2, F, n) of the sum of all penalties by the knots."""
-        found = penalties(curves.along, curves.across, self.problem.pad, rules, margin, all_bends)
-        return np.stack([found.by_along, found.by_across])
+        total = penalties(curves.along, curves.across, self.problem.pad, rules, margin, all_bends)
+        return np.stack([total.by_along, total.by_across])
 
     def _objective(self, curves: FibreCurves, noise_factor: float) -> tuple[float, Array]:
         """Return the relative error on random presses and failures, and the weighted terms; and a gradient.

@@ -247,9 +247,9 @@ def _flatten_shape(shape: Any) -> Iterator[tuple[Array, bool]]:
     from ezdxf.path import Path as BezierPath
     from svgelements import Close, CubicBezier, Move, Path, QuadraticBezier
 
-    whole: Any = abs(Path(shape))
-    whole.approximate_arcs_with_cubics()
-    for part in whole.as_subpaths():
+    outline: Any = abs(Path(shape))
+    outline.approximate_arcs_with_cubics()
+    for part in outline.as_subpaths():
         segments: list[Any] = [segment for segment in part if not isinstance(segment, Move)]
         if not segments:
             continue

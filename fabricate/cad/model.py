@@ -290,12 +290,12 @@ def fuse(parts: Sequence[CadPart], name: str) -> Solid:
         paths = [Path(folder) / f"{k}.brep" for k in range(len(solids))]
         for path, solid in zip(paths, solids, strict=True):
             export_brep(solid, path)
-        whole = Path(folder) / "whole.brep"
+        fused = Path(folder) / "whole.brep"
         with suppress(subprocess.SubprocessError):
             subprocess.run(
-                [sys.executable, "-c", _FUSE, whole, *paths], timeout=FUSE_S, check=True, capture_output=True
+                [sys.executable, "-c", _FUSE, fused, *paths], timeout=FUSE_S, check=True, capture_output=True
             )
-        shape = import_brep(whole) if whole.exists() else None
+        shape = import_brep(fused) if fused.exists() else None
     solids = shape.solids() if shape else []
     if len(solids) != 1 or not solids[0].is_valid:
         raise InputError(f"{name}: the CAD kernel makes no single solid of it within {FUSE_S:g} s; use the parts")

@@ -47,11 +47,11 @@ class _Decorator(Protocol):
 
 def cache_bases() -> Iterator[Path]:
     """Yield the folders that a cache of kernels may be in, the best first."""
-    if given := os.environ.get("NUMBA_CACHE_DIR"):
-        yield Path(given)
+    if chosen := os.environ.get("NUMBA_CACHE_DIR"):
+        yield Path(chosen)
     yield Path(__file__).parent / "__pycache__"
-    if given := os.environ.get("XDG_CACHE_HOME") or os.environ.get("LOCALAPPDATA"):
-        yield Path(given)
+    if chosen := os.environ.get("XDG_CACHE_HOME") or os.environ.get("LOCALAPPDATA"):
+        yield Path(chosen)
     with suppress(RuntimeError):  # this user has no home
         yield Path.home() / ".cache"
 

@@ -263,10 +263,10 @@ class _PageHandler(BaseHTTPRequestHandler):
 
         Browsers leave out the origin of images and the like, and say in Sec-Fetch-Site that they are foreign.
         """
-        own = f"http://{self.headers['Host']}"
+        origin = f"http://{self.headers['Host']}"
         is_linked = self._url.path == "/"
         is_foreign = not is_linked and self.headers.get("Sec-Fetch-Site", "none") not in ("same-origin", "none")
-        return is_foreign or self.headers.get("Origin", own) != own
+        return is_foreign or self.headers.get("Origin", origin) != origin
 
     def _send(self, status: HTTPStatus, content_type: str = "", body: bytes = b"", **headers: str) -> None:
         self.send_response(status)

@@ -194,7 +194,7 @@ class EventPrinter:
 
     def __init__(self, as_json: bool) -> None:
         self._as_json = as_json
-        self._told: Estimate | None = None
+        self._latest: Estimate | None = None
 
     def print(self, events: "Iterable[Event]") -> None:
         """Print events, one a line."""
@@ -210,12 +210,12 @@ class EventPrinter:
                 echo(event.text)
 
     def _is_news(self, estimate: "Estimate") -> bool:
-        told = self._told
-        if told is not None and told.press == estimate.press:
-            is_news = estimate.final or estimate.is_sharper_than(told) or estimate.has_moved_from(told)
+        latest = self._latest
+        if latest is not None and latest.press == estimate.press:
+            is_news = estimate.final or estimate.is_sharper_than(latest) or estimate.has_moved_from(latest)
         else:
             is_news = True
-        self._told = estimate if is_news else told
+        self._latest = estimate if is_news else latest
         return is_news
 
 

@@ -101,8 +101,8 @@ class _FeatureModule(nn.Module):
         means = [mean(down_command, each, down_command, held) for each in moments.DOWN]
         means += [mean(up_command, each, down_command, until) for each in moments.UP]
         means += [mean(held, each, down_command, held) for each in moments.NOW]
-        rest = mean(down_command, moments.REST, previous_end, down_command)
-        windows = functional.pad(torch.stack(means, dim=2) - rest[:, :, None], (0, len(moments.MODULATED)))
+        baseline = mean(down_command, moments.REST, previous_end, down_command)
+        windows = functional.pad(torch.stack(means, dim=2) - baseline[:, :, None], (0, len(moments.MODULATED)))
         history = _history(readings, down_command) - self.history_mean_v
         effect = (history.transpose(0, 1) @ self.history_coef).transpose(0, 1)
         scaled = torch.clip((windows - effect - self.mean_v) / self.scale_v, -MAX_INPUT, MAX_INPUT).float()
@@ -186,12 +186,12 @@ class _LocalizerModule(nn.Module):
     def forward(
         self, readings: Tensor, down_command: Tensor, up_command: Tensor, fibre_mask: Tensor
     ) -> tuple[Tensor, ...]:
-        scaled, seen = self.features(readings, down_command, up_command)
+        scaled, complete = self.features(readings, down_command, up_command)
         fibre_mask = fibre_mask & ~torch.isnan(scaled).any(dim=2)  # or one missing reading would spoil all presses
-        n_complete = seen.sum(dim=1)
-        x = network_inputs(scaled, fibre_mask, seen)
+        n_complete = complete.sum(dim=1)
+        x = network_inputs(scaled, fibre_mask, complete)
         targets, std = self._predict(scaled, fibre_mask, x, n_complete)
-        *followed, moved = self._follow(scaled, fibre_mask, seen)
+        *followed, moved = self._follow(scaled, fibre_mask, complete)
         slid = (n_complete >= N_DOWN) & (moved > LEAST_SLIDE)
         targets, std = (torch.where(slid[:, None], *pair) for pair in zip(followed, (targets, std), strict=True))
         n_failed, moment = (~fibre_mask).sum(dim=1), torch.where(slid, N_DOWN - 1, n_complete)
@@ -228,12 +228,12 @@ class _LocalizerModule(nn.Module):
         targets, std = (torch.where(is_corrected, *pair) for pair in zip(corrected, combined, strict=True))
         return targets, std
 
-    def _follow(self, scaled: Tensor, fibre_mask: Tensor, seen: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def _follow(self, scaled: Tensor, fibre_mask: Tensor, complete: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """`Sliding.follow`."""
         network, n_timed = self.networks[FOLLOWING], moments.N_TIMED
 
         def predict_from(scaled: Tensor, n_complete: int) -> tuple[Tensor, Tensor]:
-            x = network_inputs(scaled, fibre_mask, seen & (torch.arange(n_timed) < n_complete))
+            x = network_inputs(scaled, fibre_mask, complete & (torch.arange(n_timed) < n_complete))
             return _combine_members(network(x.expand(network.n_members, -1, -1)))
 
         targets, std = predict_from(scaled, N_DOWN)
@@ -241,8 +241,10 @@ class _LocalizerModule(nn.Module):
             scaled[:, :, SOON - 1 - k] * self.now_factor[:, k, SOON - 1 - k] + self.now_offset[:, k, SOON - 1 - k]
             for k in range(len(moments.NOW))
         ]
-        rest = scaled[:, :, n_timed + len(now) :]
-        soon, soon_std = predict_from(torch.cat([scaled[:, :, :n_timed], torch.stack(now, dim=2), rest], dim=2), SOON)
+        modulation = scaled[:, :, n_timed + len(now) :]
+        soon, soon_std = predict_from(
+            torch.cat([scaled[:, :, :n_timed], torch.stack(now, dim=2), modulation], dim=2), SOON
+        )
         distance, expected = (torch.linalg.vector_norm(each[:, :2], dim=1) for each in (targets - soon, soon_std))
         return targets, std, distance / torch.clamp(expected, min=1e-9)
 

@@ -196,10 +196,10 @@ def _fibre_names(entry: ColumnEntry, values: Array) -> list[str]:
 
 def _check_volts(readings: Array, source: Mapping[str, Any]) -> None:
     """Raise InputError if finite readings are beyond what is allowed, with the factor that counts would have."""
-    rest = float(np.nanmedian(np.abs(readings)))
-    if np.isfinite(rest) and rest > MAX_VOLTS:
+    level_v = float(np.nanmedian(np.abs(readings)))
+    if np.isfinite(level_v) and level_v > MAX_VOLTS:
         hint = suggest_unit(source, "fibres", readings)
-        raise InputError(f"fibres rest at {rest:.4g} V, allowed is {MAX_VOLTS:g} V; are they {hint}?")
+        raise InputError(f"fibres rest at {level_v:.4g} V, allowed is {MAX_VOLTS:g} V; are they {hint}?")
 
 
 def _hold(values: Array) -> Array:
@@ -382,8 +382,8 @@ def _bridge_gaps(positions: Array, jitter_mm: float) -> Indices:
     A gap is short if it has MAX_GAP readings at most, fewer than half a rest between presses, and the same position
     before and after.
     """
-    known = np.flatnonzero(~np.isnan(positions[:, 0]))
-    before, after = known[:-1], known[1:]
+    positioned = np.flatnonzero(~np.isnan(positions[:, 0]))
+    before, after = positioned[:-1], positioned[1:]
     n_missing = after - before - 1
     is_same = (np.abs(positions[after] - positions[before]) <= jitter_mm).all(axis=1) & (
         positions[before, 0] != UNKNOWN

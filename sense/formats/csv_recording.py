@@ -90,9 +90,9 @@ def read_presses(path: Path, columns: str = "", encoding: str = "") -> Arrays:
     """
     path, columns = check_import(path, columns)
     table = read_table(path, encoding)
-    own = [ColumnEntry(quantity, name) for quantity, name in PRESS_COLUMNS.items() if name in table.names]
+    usual = [ColumnEntry(quantity, name) for quantity, name in PRESS_COLUMNS.items() if name in table.names]
     with naming_file(path):
-        entries = parse_columns(columns, tuple(PRESS_COLUMNS)) if columns else own
+        entries = parse_columns(columns, tuple(PRESS_COLUMNS)) if columns else usual
         named = {entry.quantity for entry in entries}
         if "down" not in named or len(named & {"up", "duration"}) != 1:
             allowed = "down (down_s) and one of up (up_s) and duration (duration_s)"
@@ -107,8 +107,8 @@ def read_presses(path: Path, columns: str = "", encoding: str = "") -> Arrays:
         if name in ("down", "up", "duration")
     }
     times["up"] = times["up"] if "up" in times else times["down"] + times["duration"]
-    rest = [array for name, array in arrays.items() if name not in times]
-    return [*((ColumnEntry(f"{name}_command", name, 1.0), times[name]) for name in ("down", "up")), *rest]
+    others = [array for name, array in arrays.items() if name not in times]
+    return [*((ColumnEntry(f"{name}_command", name, 1.0), times[name]) for name in ("down", "up")), *others]
 
 
 def describe_table(path: Path, encoding: str = "") -> list[str]:

@@ -114,9 +114,9 @@ def import_mat(path: str | Path, columns: str = "", presses: Arrays = ()) -> Rec
         if not columns:
             if missing := [name for name in ("voltage", "tim") if name not in content]:
                 _refuse_tables(content, list(content))
-                there = f"has no variable {', '.join(missing)} (found {join_names(sorted(content))})"
+                problem = f"has no variable {', '.join(missing)} (found {join_names(sorted(content))})"
                 raise InputError(
-                    f"{there}; --columns says what others hold, as time=data.t,fibres=data.v or fibres=x[1:5]"
+                    f"{problem}; --columns says what others hold, as time=data.t,fibres=data.v or fibres=x[1:5]"
                 )
             check_no_presses(path, presses)
             return _import_published(path, content)
@@ -152,11 +152,11 @@ def describe_arrays(path: Path) -> list[str]:
                 for name in file.names
             ]
     content = flatten_variables(load_mat(path, ()))
-    shown = {
+    texts = {
         name: f"{value.shape} {value.dtype}{_first_values(value)}" if isinstance(value, np.ndarray) else value
         for name, value in content.items()
     }
-    return [f"{name}: {text}" for name, text in shown.items()]
+    return [f"{name}: {text}" for name, text in texts.items()]
 
 
 def _first_values(values: Array) -> str:

@@ -199,8 +199,8 @@ def encode(store: "Typestore", topic: str, series: TopicSeries) -> list[memoryvi
     for stamp, row in zip(series.stamps.tolist(), np.ascontiguousarray(series.values), strict=True):
         if header is not None:
             header.stamp.sec, header.stamp.nanosec = divmod(stamp, 10**9)
-        for column, (parent, name, rest) in enumerate(zip(parents, names, is_array, strict=True)):
-            setattr(parent, name, row[column:] if rest else float(row[column]))  # an array is the last path
+        for column, (parent, name, takes_array) in enumerate(zip(parents, names, is_array, strict=True)):
+            setattr(parent, name, row[column:] if takes_array else float(row[column]))  # an array is the last path
         encoded.append(store.serialize_cdr(message, msgtype))
     return encoded
 

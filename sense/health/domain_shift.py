@@ -86,10 +86,10 @@ def rest_levels(recording: Recording) -> Array:
 def _rest_shifts(health: HealthModel, recording: Recording, fibre_mask: Mask) -> list[DomainShift]:
     rests, shifts = rest_levels(recording), []
     for fibre, (low, high) in zip(health.living.tolist(), health.rest_range_v.T.tolist(), strict=True):
-        rest = rests[fibre_mask[:, fibre] & np.isfinite(rests[:, fibre]), fibre]
+        levels = rests[fibre_mask[:, fibre] & np.isfinite(rests[:, fibre]), fibre]
         margin = REST_MARGIN * (high - low)
         usual = low - margin, high + margin
-        if len(rest) and not usual[0] <= (median := float(np.median(rest))) <= usual[1]:
+        if len(levels) and not usual[0] <= (median := float(np.median(levels))) <= usual[1]:
             shifts.append(DomainShift("rest", (fibre,), median, usual))
     return shifts
 

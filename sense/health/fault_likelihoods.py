@@ -62,9 +62,11 @@ class FaultLikelihoods:
         log_noise = _log_noise(traces, noise_v)
         log_noise_mean = np.median(log_noise, axis=0)
         calibrated = np.hypot(std * std_scale, std_floor)
-        rest = ((targets - mean) / calibrated)[:, :, -1]
-        autocorr = np.clip([(rest[1:] * rest[:-1]).mean() / (rest**2).mean()], 0.0, 0.95)
-        innovation_std = np.array([np.median(np.abs(rest[1:] - autocorr * rest[:-1])) / MEDIAN_T])
+        offset_residual = ((targets - mean) / calibrated)[:, :, -1]
+        autocorr = np.clip(
+            [(offset_residual[1:] * offset_residual[:-1]).mean() / (offset_residual**2).mean()], 0.0, 0.95
+        )
+        innovation_std = np.array([np.median(np.abs(offset_residual[1:] - autocorr * offset_residual[:-1])) / MEDIAN_T])
         library = rng.choice(len(traces), LIBRARY)
         return cls(
             std_scale=std_scale,
@@ -104,8 +106,8 @@ class FaultLikelihoods:
         log_noise = (_log_noise(traces, self.noise_v) - self.log_noise_mean) / self.log_noise_std
         common = [constant, *self._response_llrs(targets, mean, std), _shift_llr(log_noise, noise_shift)]
         # The residual of the rest decays slowly by itself: only its innovation is evidence of an offset.
-        rest = ((targets - mean) / self._calibrated(std))[..., -1]
-        innovation = (rest - self.rest_autocorr * _previous(rest)) / self.innovation_std
+        offset_residual = ((targets - mean) / self._calibrated(std))[..., -1]
+        innovation = (offset_residual - self.rest_autocorr * _previous(offset_residual)) / self.innovation_std
         step = self.largest_step(traces)
         step = np.stack([step, _previous(step)])
         continuing, onset = list(common), [np.clip(llr, -MAX_LLR, MAX_LLR) for llr in common]

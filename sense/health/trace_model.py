@@ -39,10 +39,10 @@ def extract_trace(readings: Array, down_command: int, up_command: int, first: in
 
     It has NaN after the release if the press has no reading from there on.
     """
-    rest = np.arange(down_command - REST, down_command).clip(min(first, down_command - 1))
+    before = np.arange(down_command - REST, down_command).clip(min(first, down_command - 1))
     held = np.minimum(np.arange(down_command, down_command + HELD), up_command - 1)
     released = np.minimum(np.arange(up_command, up_command + RELEASED), end - 1)
-    trace = readings[np.concatenate([rest, held, released])].T
+    trace = readings[np.concatenate([before, held, released])].T
     if end <= up_command:
         # The last reading is of the pressed pad: the fibres would look as if they had not come back.
         trace[:, -RELEASED:] = np.nan
@@ -110,11 +110,11 @@ class TracePCA:
 
         A fibre with NaN in its trace has NaN, and its history stays.
         """
-        rest = trace[:, :REST].mean(axis=1)
-        response = np.einsum("cw,cwd->cd", trace - rest[:, None], self.components)
+        baseline = trace[:, :REST].mean(axis=1)
+        response = np.einsum("cw,cwd->cd", trace - baseline[:, None], self.components)
         valid = np.isfinite(response).all(axis=1)
-        history.level = np.where(np.isnan(history.level), rest, history.level)
-        offset = rest - history.level
+        history.level = np.where(np.isnan(history.level), baseline, history.level)
+        offset = baseline - history.level
         inputs = np.concatenate([response, offset[:, None], history.residue], axis=1)
         targets = np.concatenate([response, offset[:, None]], axis=1)
         history.n_presses = history.n_presses + valid

@@ -134,7 +134,7 @@ class BufferedPress:
     touched: int  # first reading that shows it
     down_command: int  # first reading after the probe was sent down, or would have been
     previous_end: int  # `up_command` of the press before, < `down_command`
-    rest: Array  # (1, C) V before it
+    baseline: Array  # (1, C) V before it
     history: Array  # (1, C, J) V, see `PressFeatures`
     up_command: int | None = None  # first reading after the probe was sent up; None while it is held
     up_s: float = 0.0  # its time
@@ -273,8 +273,8 @@ class Live:
         """
         swings, end = np.full(len(self._response_v), np.nan), self._buffer.end
         if end:
-            rest = self._buffer.rest(end) if self._press is None else self._press.rest[0]
-            swings = (self._buffer.rows(end - 1, end)[0, 1:] - rest) / self._response_v
+            baseline = self._buffer.baseline(end) if self._press is None else self._press.baseline[0]
+            swings = (self._buffer.rows(end - 1, end)[0, 1:] - baseline) / self._response_v
         return {
             "pressed": self.pressed,
             "fibres": [
@@ -309,9 +309,9 @@ class Live:
         readings = interpolate_gaps(self._buffer.rows(down_command - HISTORY, self._buffer.end)[:, 1:])
         first = self._buffer.end - len(readings)
         down, previous_end = (np.array([max(index - first, 0)]) for index in (down_command, self._previous_end))
-        rest, history = mean_at_rest(readings, down, previous_end), compute_history(readings, down)
+        baseline, history = mean_at_rest(readings, down, previous_end), compute_history(readings, down)
         self._press = BufferedPress(
-            self._n_presses, time_s, touched, down_command, self._previous_end, rest=rest, history=history
+            self._n_presses, time_s, touched, down_command, self._previous_end, baseline=baseline, history=history
         )
         self.track.clear()
         self._n_presses += 1
@@ -342,7 +342,7 @@ class Live:
         scaled = self._localizer.scaler.transform(self._features(press, until))
         fibre_mask = scaled.fibre_mask.copy()
         fibre_mask[:, list(self.failed)] = False
-        result = self._localizer.localize(ScaledFeatures(scaled.inputs, fibre_mask, scaled.seen))
+        result = self._localizer.localize(ScaledFeatures(scaled.inputs, fibre_mask, scaled.complete))
         numbers = np.concatenate([result.positions_mm[0], result.std_mm[0], result.r50_mm, result.r90_mm]).tolist()
         measures = {
             column: float(values[0])
@@ -369,7 +369,7 @@ class Live:
                 downs, ups = [previous_end - 1, down], [previous_end, up]
             return compute_features(readings, np.array(downs), np.array(ups), is_published=True)[-1:]
         moment = np.array([down]), np.array([up]), np.array([len(readings)])
-        windows = windows_from_rest(interpolate_gaps(readings), press.rest, *moment)
+        windows = windows_from_rest(interpolate_gaps(readings), press.baseline, *moment)
         return PressFeatures(windows, press.history, valid_fibres(readings, *moment), complete_windows(*moment))
 
     def _show(self, estimate: Estimate) -> None:

@@ -179,10 +179,10 @@ def fit_stages(
     for n_complete in numbers:
         on_progress(len(stages), len(numbers), "Bayesian localizer")
         unused = slice(n_complete, n_timed + len(NOW) if n_timed else 0)
-        kept = table.copy()
-        kept[:, :, :, unused] = 0
+        masked = table.copy()
+        masked[:, :, :, unused] = 0
         before = earlier[len(stages)] if earlier else None
-        stages.append(BayesianLocalizer.fit(kept, inputs, fibre_mask, positions, before))
+        stages.append(BayesianLocalizer.fit(masked, inputs, fibre_mask, positions, before))
     return tuple(stages)
 
 

@@ -124,8 +124,10 @@ def calibrate(
     if options.method == "published" and time_budget is not None:
         raise InputError("time_budget is given: method published has no time limit, expected method ensemble")
     rng = np.random.default_rng(options.seed)
-    known = np.flatnonzero(recording.has_position)
-    training, test = (known[part] for part in split_presses(len(known), options.split, options.test_share, rng))
+    positioned = np.flatnonzero(recording.has_position)
+    training, test = (
+        positioned[part] for part in split_presses(len(positioned), options.split, options.test_share, rng)
+    )
     made_by = provenance("padforge sense calibrate", options.seed, packages=("torch", "safetensors"))
     made_by |= {"inputs": {"recording": recording.digest}, "recording_kind": recording.source.get("kind")}
     with stage("train"):
@@ -197,7 +199,7 @@ def fit_model(
     features, rows = data.features[train], train
     if data.detected is not None:
         features, rows = features + data.detected[train], np.concatenate([train, train])
-    n_timed = data.features.seen.shape[1]
+    n_timed = data.features.complete.shape[1]
     phases = MODULATED if n_timed else ()
     positions_mm, measures = data.positions_mm[rows], {name: values[rows] for name, values in data.measures.items()}
     on_progress(0, 0, "response model")
@@ -306,28 +308,30 @@ def _calibrate_scales(
     """
     targets = (positions_mm - model.scaler.origin_mm) / model.scaler.scale_mm
     subsets = [subset for level in range(levels) for subset in failure_subsets(model.fibres, level, SCALE_SUBSETS)]
-    found: list[tuple[list[str], Array]] = []  # members that answer together, and the ratio of error to expected error
+    # members that answer together, and the ratio of error to expected error
+    group_ratios: list[tuple[list[str], Array]] = []
     first = int(len(moments) > 1)
     for n_complete, presses in enumerate(moments, first):
         on_progress(n_complete - first, len(moments), "expected errors")
-        rows = np.flatnonzero(count_complete(presses.seen) == n_complete)  # not those that the next press cuts off
-        names = answering(model.networks, n_complete, presses.seen.shape[1], bool(model.bayes))
+        rows = np.flatnonzero(count_complete(presses.complete) == n_complete)  # not those that the next press cuts off
+        names = answering(model.networks, n_complete, presses.complete.shape[1], bool(model.bayes))
         for failed in subsets if len(rows) else ():
             fibre_mask = presses.fibre_mask[rows] & ~np.isin(np.arange(model.fibres), failed)
-            inputs = presses.inputs[rows], fibre_mask, presses.seen[rows]
+            inputs = presses.inputs[rows], fibre_mask, presses.complete[rows]
             outputs = predict_members(model.networks, *inputs, *model.corrected)
             predicted, log_error = (each[:, :, :2] for each in np.split(outputs, 2, axis=2))
             expected = np.exp(np.clip(log_error, MIN_LOG_ERROR, MAX_LOG_ERROR)).mean(axis=2)
-            found.append((names, (np.abs(predicted - targets[rows]).mean(axis=2) / expected).mean(axis=1)))
+            group_ratios.append((names, (np.abs(predicted - targets[rows]).mean(axis=2) / expected).mean(axis=1)))
     presses, expected_ratio, is_typical = len(positions_mm), 1.0, False
     if n_trained:
         growth = 1 + HALF_KNOWN / n_trained
-        excess = np.mean([ratio.mean() for _, ratio in found]) / growth - 1
+        excess = np.mean([ratio.mean() for _, ratio in group_ratios]) / growth - 1
         is_typical = bool(abs(excess) < CONTRADICTION * RATIO_SHAPE**-0.5 / np.sqrt(presses))
         if is_typical:
-            expected_ratio, found = growth, [(names, growth * ratio / ratio.mean()) for names, ratio in found]
+            expected_ratio = growth
+            group_ratios = [(names, growth * ratio / ratio.mean()) for names, ratio in group_ratios]
     ratios: dict[str, list[Array]] = {}
-    for names, ratio in found:
+    for names, ratio in group_ratios:
         for name in names:
             members = 1 if name == RESIDUAL else len(model.networks[name]["last.b"])
             ratios.setdefault(name, []).append(ratio[:members])
@@ -407,12 +411,12 @@ def split_unseen(
     recording: Recording, model: LocalizerModel | None, options: LocalizerSettings
 ) -> tuple[Indices, Indices]:
     """Return presses of known position to train on, and those to test on, which `model`, if any, has not seen."""
-    known = np.flatnonzero(recording.has_position)
+    positioned = np.flatnonzero(recording.has_position)
     if model is not None and (test := held_back_presses(model, recording)) is not None:
-        return np.setdiff1d(known, test), test
+        return np.setdiff1d(positioned, test), test
     rng = np.random.default_rng(options.seed)
-    training, test = split_presses(len(known), options.split, options.test_share, rng)
-    return known[training], known[test]
+    training, test = split_presses(len(positioned), options.split, options.test_share, rng)
+    return positioned[training], positioned[test]
 
 
 def split_presses(

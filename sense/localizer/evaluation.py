@@ -283,12 +283,12 @@ def error_row(
     }
     for name, (errors, r90) in _measure_errors(predictions, measures).items():
         kind, unit = name.rsplit("_", 1)
-        known = np.isfinite(errors[0])
-        if known.any():
+        measured = np.isfinite(errors[0])
+        if measured.any():
             row |= {
-                f"{kind}_mean_{unit}": float(errors[:, known].mean()),
-                f"{kind}_p95_{unit}": float(np.percentile(errors[:, known], 95)),
-                f"{kind}_within_r90": float((errors <= r90)[:, known].mean()),
+                f"{kind}_mean_{unit}": float(errors[:, measured].mean()),
+                f"{kind}_p95_{unit}": float(np.percentile(errors[:, measured], 95)),
+                f"{kind}_within_r90": float((errors <= r90)[:, measured].mean()),
             }
     return row
 

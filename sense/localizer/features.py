@@ -35,10 +35,10 @@ class PressFeatures:
     windows: Array  # (Q, C, F)
     history: Array  # (Q, C, J), relative to the rest before the press
     fibre_mask: Mask  # (Q, C), whether the fibre gave enough readings
-    seen: Mask  # (Q, K), which windows of `DOWN` and `UP` are complete; K = 0 if the features know no moment
+    complete: Mask  # (Q, K), which windows of `DOWN` and `UP` are complete; K = 0 if the features know no moment
 
     def __getitem__(self, rows: Indices | slice) -> "PressFeatures":
-        return PressFeatures(self.windows[rows], self.history[rows], self.fibre_mask[rows], self.seen[rows])
+        return PressFeatures(self.windows[rows], self.history[rows], self.fibre_mask[rows], self.complete[rows])
 
     def __add__(self, other: "PressFeatures") -> "PressFeatures":
         pairs = zip(vars(self).values(), vars(other).values(), strict=True)
@@ -72,9 +72,9 @@ def compute_features(
         empty = np.empty((*fibre_mask.shape, 0)), np.empty((len(medians), 0), bool)
         return PressFeatures(medians, empty[0], fibre_mask, empty[1])
     windows = window_means(filled, down_command, up_command, until)
-    seen = complete_windows(down_command, up_command, until)
+    complete = complete_windows(down_command, up_command, until)
     history = compute_history(filled, down_command) if history is None else history
-    return PressFeatures(windows, history, fibre_mask, seen)
+    return PressFeatures(windows, history, fibre_mask, complete)
 
 
 def valid_fibres(readings: Array, down_command: Indices, up_command: Indices, until: Indices) -> Mask:
@@ -100,8 +100,8 @@ def interpolate_gaps(readings: Array) -> Array:
 def window_means(readings: Array, down_command: Indices, up_command: Indices, until: Indices) -> Array:
     """Return (Q, C, F) means over the windows `DOWN`, `UP` and `NOW` of a press, V, less the mean at rest before it."""
     previous_end, _ = _neighbours(down_command, up_command, len(readings))
-    rest = mean_at_rest(readings, down_command, previous_end)
-    return windows_from_rest(readings, rest, down_command, up_command, until)
+    baseline = mean_at_rest(readings, down_command, previous_end)
+    return windows_from_rest(readings, baseline, down_command, up_command, until)
 
 
 def mean_at_rest(readings: Array, down_command: Indices, previous_end: Indices) -> Array:
@@ -110,14 +110,14 @@ def mean_at_rest(readings: Array, down_command: Indices, previous_end: Indices) 
 
 
 def windows_from_rest(
-    readings: Array, rest: Array, down_command: Indices, up_command: Indices, until: Indices
+    readings: Array, baseline: Array, down_command: Indices, up_command: Indices, until: Indices
 ) -> Array:
     """Return the windows of `window_means`, measured from the known rest (Q, C)."""
     held = np.minimum(up_command, until)
     places = [(down_command, window, held) for window in DOWN] + [(up_command, window, until) for window in UP]
     places += [(held, window, held) for window in NOW]
     means = [_gather(readings, origin, window, down_command, high).mean(axis=1) for origin, window, high in places]
-    return np.stack(means, axis=2) - rest[:, :, None]
+    return np.stack(means, axis=2) - baseline[:, :, None]
 
 
 def compute_history(readings: Array, down_command: Indices) -> Array:

@@ -121,9 +121,9 @@ class Localizer:
         if isinstance(X, Recording | PressSelection) and y is not None:
             raise InputError("y is given beside a recording, which holds the positions; expected None")
         if isinstance(X, PressSelection):
-            known = X.presses[X.recording.has_position[X.presses]]
+            positioned = X.presses[X.recording.has_position[X.presses]]
             rng = np.random.default_rng(settings.seed)
-            self.model_ = fit_recording(X.recording, known, settings, rng, on_progress, time_budget)
+            self.model_ = fit_recording(X.recording, positioned, settings, rng, on_progress, time_budget)
             return self
         if isinstance(X, Recording):
             self.model_, self.calibration_ = calibrate(X, settings, time_budget=time_budget, on_progress=on_progress)

@@ -291,7 +291,7 @@ class LocalizerModel(LocalizerDocument):
         unlike = find_unlike(self.single_press, presses)
         rows = np.flatnonzero(unlike)
         if self.sliding is not None and len(rows):  # the response to a finger that slides is that to many presses
-            inputs = presses.inputs[rows], presses.fibre_mask[rows], presses.seen[rows]
+            inputs = presses.inputs[rows], presses.fibre_mask[rows], presses.complete[rows]
             unlike[rows] = self.sliding.follow(self.networks[FOLLOWING], *inputs).moved <= MAY_SLIDE
         std_mm, r50_mm, r90_mm = np.array(UNIFORM) * self.scaler.scale_mm
         measures = {
@@ -322,16 +322,16 @@ class LocalizerModel(LocalizerDocument):
         parts = []
         for first in range(0, len(presses), chunk):
             rows = slice(first, first + chunk)
-            inputs = presses.inputs[rows], fibre_mask[rows], presses.seen[rows]
+            inputs = presses.inputs[rows], fibre_mask[rows], presses.complete[rows]
             parts.append(predict(self.networks, *inputs, *self.corrected, self.sliding))
         empty = np.empty((0, 2 + len(self.scaler.measures)), np.float32)
         empties = empty, empty, np.empty(0, bool)
         targets, std, slid = (np.concatenate(part) for part in zip(empties, *parts, strict=True))
-        n_complete, level = count_complete(presses.seen), np.minimum((~fibre_mask).sum(axis=1), self.max_failures)
+        n_complete, level = count_complete(presses.complete), np.minimum((~fibre_mask).sum(axis=1), self.max_failures)
         factors = self.interval_factors[np.where(slid, N_DOWN - 1, n_complete), level]
         to_std, to_r50, to_r90 = factors[:, :3].T * self.scaler.scale_mm
         radius = np.hypot(*std[:, :2].T)
-        is_complete = n_complete > 0 if presses.seen.shape[1] else np.ones(len(presses), bool)
+        is_complete = n_complete > 0 if presses.complete.shape[1] else np.ones(len(presses), bool)
         has_fibres = fibre_mask.all(axis=1) if self.method == "published" else fibre_mask.any(axis=1)
         blind = np.logical_not(is_complete & has_fibres)
         anywhere = np.array(UNIFORM) * self.scaler.scale_mm

@@ -118,9 +118,9 @@ def complete_at(n_complete: int, down_command: Indices, up_command: Indices) -> 
     return up_command + UP[n_complete - N_DOWN - 1][1]
 
 
-def count_complete(seen: Mask) -> Indices:
+def count_complete(complete: Mask) -> Indices:
     """Return the number (Q,) of complete windows of presses."""
-    return seen.sum(axis=1)
+    return complete.sum(axis=1)
 
 
 def stage_of(n_complete: int, n_timed: int) -> int | None:

@@ -60,13 +60,13 @@ def check_weights(weights: Weights, n_inputs: int, method: str, n_measures: int 
     check_arrays(weights, {name: (shape, np.float32) for name, shape in expected.items()}, MAX_WEIGHT)
 
 
-def network_inputs(features: Floats, fibre_mask: Mask, seen: Mask) -> Floats:
+def network_inputs(features: Floats, fibre_mask: Mask, complete: Mask) -> Floats:
     """Return (Q, C F + C + K) inputs of a network from (Q, C, F) features and the (Q, C) and (Q, K) masks."""
-    untimed = np.ones((len(seen), features.shape[2] - seen.shape[1]), bool)
-    mask = fibre_mask[:, :, None] & np.hstack([seen, untimed])[:, None]
+    untimed = np.ones((len(complete), features.shape[2] - complete.shape[1]), bool)
+    mask = fibre_mask[:, :, None] & np.hstack([complete, untimed])[:, None]
     # What is masked is replaced, not multiplied, by 0: not even NaN gets through.
     masked = np.where(mask, features, np.float32(0)).reshape(len(features), np.prod(features.shape[1:]))
-    return np.concatenate([masked, fibre_mask.astype(np.float32), seen.astype(np.float32)], axis=1)
+    return np.concatenate([masked, fibre_mask.astype(np.float32), complete.astype(np.float32)], axis=1)
 
 
 def forward(weights: Weights, x: Floats) -> Floats:
@@ -88,7 +88,7 @@ def predict_members(
     networks: Networks,
     features: Floats,
     fibre_mask: Mask,
-    seen: Mask,
+    complete: Mask,
     bayes: Sequence[BayesianLocalizer] = (),
     residual_network: Weights = MappingProxyType({}),
 ) -> Floats:
@@ -97,9 +97,9 @@ def predict_members(
     Features are (Q, C, F + G), scaled, with (Q, C) and (Q, K) masks. The last member is the Bayesian localizer of the
     phase, if any, corrected by its residual network.
     """
-    n_complete, n_timed = int(seen[:1].sum()), seen.shape[1]
+    n_complete, n_timed = int(complete[:1].sum()), complete.shape[1]
     is_published = "hidden.w" not in next(iter(networks.values()))
-    x = features.reshape(len(features), -1) if is_published else network_inputs(features, fibre_mask, seen)
+    x = features.reshape(len(features), -1) if is_published else network_inputs(features, fibre_mask, complete)
     names = answering(networks, n_complete, n_timed, bool(bayes))
     outputs = [forward(networks[name], x) for name in names if name != RESIDUAL]
     if RESIDUAL in names:
@@ -114,7 +114,7 @@ def predict(
     networks: Networks,
     features: Floats,
     fibre_mask: Mask,
-    seen: Mask,
+    complete: Mask,
     bayes: Sequence[BayesianLocalizer] = (),
     residual_network: Weights = MappingProxyType({}),
     sliding: "Sliding | None" = None,
@@ -126,19 +126,19 @@ def predict(
     Returns:
         (Q, N) scaled targets and their standard deviations, 0 before the first moment, and (Q,) whether it has slid.
     """
-    n_complete = count_complete(seen)
+    n_complete = count_complete(complete)
     first = next(iter(networks.values()))
     n_targets = first["last.w"].shape[2] // (2 if "hidden.w" in first else 1)
-    targets, std = np.zeros((2, len(seen), n_targets), np.float32)
+    targets, std = np.zeros((2, len(complete), n_targets), np.float32)
     for count in np.unique(n_complete).tolist():
-        if count or not seen.shape[1]:
+        if count or not complete.shape[1]:
             rows = n_complete == count
-            inputs = features[rows], fibre_mask[rows], seen[rows]
+            inputs = features[rows], fibre_mask[rows], complete[rows]
             targets[rows], std[rows] = combine_members(predict_members(networks, *inputs, bayes, residual_network))
-    slid = np.zeros(len(seen), bool)
+    slid = np.zeros(len(complete), bool)
     rows = np.flatnonzero(n_complete >= N_DOWN)
     if sliding is not None and len(rows):
-        following = sliding.follow(networks[FOLLOWING], features[rows], fibre_mask[rows], seen[rows])
+        following = sliding.follow(networks[FOLLOWING], features[rows], fibre_mask[rows], complete[rows])
         slid[rows] = following.moved > LEAST_SLIDE
         targets[slid], std[slid] = (part[slid[rows]] for part in following[:2])
     return targets, std, slid
@@ -160,12 +160,12 @@ class Sliding:
     now_factor: Floats
     now_offset: Floats
 
-    def follow(self, weights: Weights, features: Floats, fibre_mask: Mask, seen: Mask) -> Followed:
+    def follow(self, weights: Weights, features: Floats, fibre_mask: Mask, complete: Mask) -> Followed:
         """Follow the finger of presses (Q, C, F + G) that are read to their end."""
-        n_timed = seen.shape[1]
+        n_timed = complete.shape[1]
 
         def predict_from(features: Floats, n_complete: int) -> tuple[Floats, Floats]:
-            inputs = network_inputs(features, fibre_mask, seen & (np.arange(n_timed) < n_complete))
+            inputs = network_inputs(features, fibre_mask, complete & (np.arange(n_timed) < n_complete))
             return combine_members(forward(weights, inputs))
 
         targets, std = predict_from(features, N_DOWN)

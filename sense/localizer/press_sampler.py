@@ -37,7 +37,7 @@ class _Source(NamedTuple):
 
     table: Floats  # scaled response by position, over [-1, 1] in x and y; shape (S, S, C, F)
     residual: Floats  # what the table leaves unexplained of each press; shape (Q, C, F)
-    seen: Mask  # windows that are complete; shape (Q, K)
+    complete: Mask  # windows that are complete; shape (Q, K)
     now_factor: Floats  # see `TrainingPresses`
     now_offset: Floats
     depth_gain: float  # growth of the response with the scaled depth
@@ -74,8 +74,8 @@ class PressSampler:
             expected *= 1 + self.depth_gain * self.targets[:, 2:3]
         residual = (presses.inputs - expected.reshape(presses.inputs.shape)).astype(np.float32)
         now = presses.now_factor, presses.now_offset, float(self.depth_gain), NOW_NOISE
-        self._source = _Source(np.ascontiguousarray(table), residual, presses.seen, *now)
-        self._n_timed = presses.seen.shape[1]
+        self._source = _Source(np.ascontiguousarray(table), residual, presses.complete, *now)
+        self._n_timed = presses.complete.shape[1]
         self._bayes = tuple(stage.map_arrays(torch.from_numpy) for stage in bayes)
         self.n_inputs = fibres * (n_features + 1) + self._n_timed + (N_SUMMARY if bayes else 0)
         self._phase, self._cumulated = phase, np.cumsum(phase.shares)
@@ -135,15 +135,15 @@ def _compute_inputs(
 
     What is masked, and windows yet to come, stay 0.
     """
-    side, (fibres, size), n_timed = len(source.table), source.residual.shape[1:], source.seen.shape[1]
-    own, features, of_now = np.empty(size), np.empty(size), np.empty(N_NOW)
-    seen, windows = np.ones(size, np.bool_), np.empty(N_NOW, np.int64)
+    side, (fibres, size), n_timed = len(source.table), source.residual.shape[1:], source.complete.shape[1]
+    residual, features, of_now = np.empty(size), np.empty(size), np.empty(N_NOW)
+    complete, windows = np.ones(size, np.bool_), np.empty(N_NOW, np.int64)
     for b, row in enumerate(rows):
         gain = 1 + source.depth_gain * targets[b, 2] if targets.shape[1] > 2 else 1.0
         i, j, u, v = _locate(targets[b, 0], targets[b, 1], side)
         for k in range(n_timed):
-            seen[k] = source.seen[row, k] and k < moments.counts[b]
-            x[b, fibres * (size + 1) + k] = seen[k]
+            complete[k] = source.complete[row, k] and k < moments.counts[b]
+            x[b, fibres * (size + 1) + k] = complete[k]
         for k in range(N_NOW):
             windows[k] = _WINDOW_OF[min(max(moments.last[b] - k, 0), len(_WINDOW_OF) - 1)]
         is_sliding = b < len(moments.end)
@@ -156,11 +156,11 @@ def _compute_inputs(
                 continue
             x[b, fibres * size + c] = 1
             for f in range(size):
-                if f < N_DOWN or seen[f]:
-                    own[f] = source.residual[row, c, f] + noise * rng.standard_normal()
-                    features[f] = gain * _respond(source.table, i, j, u, v, c, f) + own[f]
+                if f < N_DOWN or complete[f]:
+                    residual[f] = source.residual[row, c, f] + noise * rng.standard_normal()
+                    features[f] = gain * _respond(source.table, i, j, u, v, c, f) + residual[f]
             if is_sliding:
-                _slide(source, path, c, gain, own, source.residual[other, c], noise, rng, features, of_now)
+                _slide(source, path, c, gain, residual, source.residual[other, c], noise, rng, features, of_now)
             elif is_now_mapped:
                 for k in range(N_NOW):
                     of_now[k] = features[windows[k]]
@@ -169,7 +169,7 @@ def _compute_inputs(
                     mapped = of_now[k] * source.now_factor[c, k, windows[k]] + source.now_offset[c, k, windows[k]]
                     features[n_timed + k] = mapped + source.now_noise * rng.standard_normal()
             for f in range(size):
-                if seen[f]:
+                if complete[f]:
                     x[b, c * size + f] = features[f]
 
 
@@ -217,7 +217,7 @@ def _trace(target: Any, velocity: Any, end: float, now: Any, reach: float, side:
 
 @kernel
 def _slide(
-    source: Any, path: Any, c: int, gain: float, own: Any, other: Any, noise: float, rng: Any, down: Any, now: Any
+    source: Any, path: Any, c: int, gain: float, residual: Any, other: Any, noise: float, rng: Any, down: Any, now: Any
 ) -> None:
     """Write the windows of a fibre under a finger that slides, over those of one at rest."""
     windows, correlation, cells, places = path
@@ -231,7 +231,7 @@ def _slide(
                 response += _respond(source.table, i, j, u, v, c, SUDDEN + n)
                 response -= _respond(source.table, i, j, u, v, c, SUDDEN + n - 1)
         far = math.sqrt(1 - correlation[k] ** 2) * (other[window] + noise * rng.standard_normal())
-        slid = gain * response + correlation[k] * own[window] + far
+        slid = gain * response + correlation[k] * residual[window] + far
         if k < N_DOWN:
             down[k] = slid
         else:

@@ -122,12 +122,12 @@ def recalibrate(
             number of fibres.
     """
     check_type("model", model, LocalizerModel)
-    known = np.flatnonzero(check_type("recording", recording, Recording).has_position)
+    positioned = np.flatnonzero(check_type("recording", recording, Recording).has_position)
     seed = check_int("seed", seed, 0, 2**32 - 1)
-    if len(known) < MIN_PRESSES:
-        raise InputError(f"recording has {len(known)} presses of known position, expected at least {MIN_PRESSES}")
+    if len(positioned) < MIN_PRESSES:
+        raise InputError(f"recording has {len(positioned)} presses of known position, expected at least {MIN_PRESSES}")
     pad = planned_pad(recording, pad)
-    rows = np.random.default_rng(seed).permutation(known)[:MAX_PRESSES]
+    rows = np.random.default_rng(seed).permutation(positioned)[:MAX_PRESSES]
     features, positions_mm = model.raw_features(recording)[rows], recording.presses_mm[rows]
     measures = {each.name: recording.measures[each.name][rows] for each in model.scaler.measures}
     subsets = [failure_subsets(model.fibres, n_failed, SUBSETS) for n_failed in range(model.max_failures + 1)]
@@ -239,7 +239,7 @@ class _Refit:
         fits = [self._fit_response(start, features, positions_mm, measures) for start in starts]
         number = int(np.argmax([fit.log_evidence for *_, fit in fits]))
         start, (presses, table, response) = starts[number], fits[number]
-        presses, n_timed = leave_one_out_residuals(presses, table, response.leverage), features.seen.shape[1]
+        presses, n_timed = leave_one_out_residuals(presses, table, response.leverage), features.complete.shape[1]
         fitted = presses.inputs, presses.fibre_mask, presses.targets[:, :2]
         bayes = fit_stages(table, *fitted, n_timed, earlier=start.bayes) if start.bayes else ()
         last = answering(start.networks, n_timed, n_timed, bool(bayes))
@@ -262,8 +262,10 @@ class _Refit:
         scaler, n_windows = old.scaler, features.windows.shape[2]
         predicted = old.predict_features(scaler.transform(features)).measures
         # Where the depth of a press is unknown, its prediction is kept.
-        known = {name: np.where(np.isnan(values), predicted[name].values, values) for name, values in measures.items()}
-        presses = scaler.training_presses(features, positions_mm, known, frame_rate_hz(old.rate_hz))
+        completed = {
+            name: np.where(np.isnan(values), predicted[name].values, values) for name, values in measures.items()
+        }
+        presses = scaler.training_presses(features, positions_mm, completed, frame_rate_hz(old.rate_hz))
         maps = scaler.uncentre(old.table)[..., :n_windows]
         prior = map_prior(maps) if self.prior is None else replace(self.prior, mean=maps)
         table, response = refit_response(scaler, presses, old.table, n_windows, prior)
@@ -408,8 +410,8 @@ def recalibration_lines(result: Recalibration) -> list[str]:
     lines = [f"{result.presses} new presses, each predicted by what was changed without it; error in mm"]
     for each in result.candidates:
         error = f" +- {each['standard_error_mm']:.2f}" if each["change"] else ""
-        kept = "  <- kept" if each["change"] == result.change else ""
-        lines.append(f"{each['mean_mm']:6.2f}{error:8}  {names[each['change']]}{kept}")
+        mark = "  <- kept" if each["change"] == result.change else ""
+        lines.append(f"{each['mean_mm']:6.2f}{error:8}  {names[each['change']]}{mark}")
     lines += [
         "failed  sets  before mm  after mm  in r90 before  in r90 after",
         *(

@@ -45,10 +45,10 @@ class ScaledFeatures:
 
     inputs: Floats  # (Q, C, F + G), about 1
     fibre_mask: Mask  # (Q, C), whether the fibre gave enough readings
-    seen: Mask  # (Q, K), which windows are complete, see `PressFeatures`
+    complete: Mask  # (Q, K), which windows are complete, see `PressFeatures`
 
     def __getitem__(self, rows: slice | Indices) -> "ScaledFeatures":
-        return ScaledFeatures(self.inputs[rows], self.fibre_mask[rows], self.seen[rows])
+        return ScaledFeatures(self.inputs[rows], self.fibre_mask[rows], self.complete[rows])
 
     def __len__(self) -> int:
         return len(self.inputs)
@@ -132,7 +132,7 @@ class FeatureScaler:
     def transform(self, features: PressFeatures) -> ScaledFeatures:
         """Remove the history from features in volts and scale them."""
         windows = remove_history(features.windows, features.history, self.history_coef, self.history_mean_v)
-        return ScaledFeatures(self.scale(windows), features.fibre_mask, features.seen)
+        return ScaledFeatures(self.scale(windows), features.fibre_mask, features.complete)
 
     def scale(self, windows: Array) -> Floats:
         """Scale (..., C, F + G) windows without history and modulations."""
@@ -165,11 +165,11 @@ class FeatureScaler:
     ) -> "TrainingPresses":
         """Scale features and targets of presses, which slide in training if the rate of the readings is given."""
         scaled, targets = self.transform(features), self.scale_targets(positions_mm, measures)
-        now_factor, now_offset = self.to_now(scaled.seen.shape[1])
+        now_factor, now_offset = self.to_now(scaled.complete.shape[1])
         return TrainingPresses(
             scaled.inputs,
             scaled.fibre_mask,
-            scaled.seen,
+            scaled.complete,
             targets,
             depth_gain=self.depth_gain,
             now_factor=now_factor,

@@ -84,7 +84,7 @@ class SinglePressTest:
             n_complete: number of complete windows; 0 if features know no moment.
             earlier: test of the pad before, whose discriminants are kept: few presses do not say how windows vary.
         """
-        n_timed, side = presses.seen.shape[1], len(table)
+        n_timed, side = presses.complete.shape[1], len(table)
         usable = np.ones(table.shape[3], bool)
         usable[n_complete : n_timed + len(NOW) if n_timed else 0] = False
         table = np.where(usable, table, 0.0)
@@ -175,12 +175,12 @@ class SinglePressTest:
         def over_fibres(part: Array) -> Array:  # (Q, P, C) or (P, C) to (Q, P, M)
             return part @ fibre_masks
 
-        own = over_fibres(np.einsum("qcm,pcm->qpc", z[:, :, first] * z[:, :, second], squares, optimize=True))
+        norm_z = over_fibres(np.einsum("qcm,pcm->qpc", z[:, :, first] * z[:, :, second], squares, optimize=True))
         cross = over_fibres(np.einsum("qcd,pcd->qpc", z, weighted, optimize=True))
         norm = over_fibres(np.einsum("pcd,pcd->pc", weighted, self.expected))
         strength = np.maximum(cross / np.maximum(norm, 1e-9), 0.0)
         growth = np.maximum(self.floor_share + (1 - self.floor_share) * strength**2, 1.0)
-        misfit = (own - strength * cross) / growth
+        misfit = (norm_z - strength * cross) / growth
         best = misfit.argmin(axis=1)
         misfit, growth = (np.take_along_axis(part, best[:, None], axis=1)[:, 0] for part in (misfit, growth))
         numbers = np.maximum(COMPONENTS * masks.sum(axis=2), 1)
@@ -234,8 +234,8 @@ def find_unlike(tests: Sequence[SinglePressTest], presses: ScaledFeatures) -> Ma
 
     Presses that have reached none are not judged.
     """
-    n_complete, unlike = count_complete(presses.seen), np.zeros(len(presses), bool)
-    numbers = stages(presses.seen.shape[1])
+    n_complete, unlike = count_complete(presses.complete), np.zeros(len(presses), bool)
+    numbers = stages(presses.complete.shape[1])
     for test, first, end in zip(tests, numbers, [*numbers[1:], np.inf], strict=False):
         rows = np.flatnonzero((n_complete >= first) & (n_complete < end))
         unlike[rows] = test.is_unlike(presses.inputs[rows], presses.fibre_mask[rows])
@@ -249,9 +249,11 @@ def stages(n_timed: int) -> tuple[int, ...]:
 
 def find_misfits(tests: Sequence[SinglePressTest], presses: ScaledFeatures) -> Array:
     """Return (Q, M) `SinglePressTest.misfits` of whole presses, MAX_PRESSES of them at most; none without tests."""
-    whole = np.flatnonzero(count_complete(presses.seen) == presses.seen.shape[1]) if tests else np.empty(0, np.int64)
-    rows = whole[np.linspace(0, len(whole) - 1, min(len(whole), MAX_PRESSES)).astype(np.int64)]
-    return tests[-1].misfits(presses.inputs[rows], presses.fibre_mask[rows]) if tests else np.empty((0, 1))
+    if not tests:
+        return np.empty((0, 1))
+    finished = np.flatnonzero(presses.complete.all(axis=1))
+    rows = finished[np.linspace(0, len(finished) - 1, min(len(finished), MAX_PRESSES)).astype(np.int64)]
+    return tests[-1].misfits(presses.inputs[rows], presses.fibre_mask[rows])
 
 
 def is_other_pad(tests: Sequence[SinglePressTest], misfits: Array) -> bool:

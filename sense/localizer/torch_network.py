@@ -91,8 +91,8 @@ def _activate(h: Tensor) -> Tensor:
     return functional.relu(functional.layer_norm(h, (width,), eps=EPSILON))
 
 
-def network_inputs(features: Tensor, fibre_mask: Tensor, seen: Tensor) -> Tensor:
+def network_inputs(features: Tensor, fibre_mask: Tensor, complete: Tensor) -> Tensor:
     """Return the (B, D) inputs of a network from features (B, C, F) and masks (B, C) and (B, K)."""
-    timed = functional.pad(seen, (0, features.shape[2] - seen.shape[1]), value=True)
+    timed = functional.pad(complete, (0, features.shape[2] - complete.shape[1]), value=True)
     masked = torch.where(fibre_mask[..., None] & timed[:, None], features, 0.0)
-    return torch.cat([masked.flatten(1), fibre_mask.to(features.dtype), seen.to(features.dtype)], dim=1)
+    return torch.cat([masked.flatten(1), fibre_mask.to(features.dtype), complete.to(features.dtype)], dim=1)

@@ -194,7 +194,7 @@ def train_members(
     each network has taken `MIN_STEPS`.
     """
     begin = time.monotonic()
-    n_timed, presses = presses.seen.shape[1], leave_one_out_residuals(presses, table, leverage)
+    n_timed, presses = presses.complete.shape[1], leave_one_out_residuals(presses, table, leverage)
     phases = PHASES[n_timed]
     steps = training_steps(len(presses.inputs), options) * (HARDER if presses.depth_gain else 1)
     length, has_bayes = sum(phase.length for phase in phases.values()), options.members > 1 and not presses.depth_gain
@@ -243,7 +243,7 @@ def train_members(
 
     with one_thread(), joint:
         weights = dict(run_tasks((number, partial(train, number)) for number in range(len(tasks))))
-    missing = [max(0, min(MIN_STEPS, usual) - taken) for taken, usual in zip(n_steps, all_steps, strict=True)]
+    missing = [max(0, min(MIN_STEPS, usual) - done) for done, usual in zip(n_steps, all_steps, strict=True)]
     if time_budget is not None and any(missing):
         needed_s = time.monotonic() - begin + pace_s * makespan(missing, cores)
         raise InputError(
@@ -254,7 +254,7 @@ def train_members(
         name: stack_members([weights[number] for number, task in enumerate(tasks) if task[0] == name])
         for name in phases
     }
-    trained_share = min(min(taken / usual, 1.0) for taken, usual in zip(n_steps, all_steps, strict=True))
+    trained_share = min(min(done / usual, 1.0) for done, usual in zip(n_steps, all_steps, strict=True))
     return TrainedNetworks(networks, bayes, weights[len(tasks) - 1] if has_bayes else {}, trained_share)
 
 
@@ -397,11 +397,11 @@ def retrain(
 
     Networks that are not to be retrained are left out, and a residual network without weights stays so.
     """
-    phases = PHASES[presses.seen.shape[1]]
+    phases = PHASES[presses.complete.shape[1]]
     options = LocalizerSettings(max_failures=max_failures)
     tasks = [(name, weights, phases[name], ()) for name, weights in networks.items()]
     if residual_network:
-        phase = CORRECTED if presses.seen.shape[1] else phases["press"]
+        phase = CORRECTED if presses.complete.shape[1] else phases["press"]
         tasks.append((RESIDUAL, residual_network, phase, bayes))
     seeds = rng.integers(2**63, size=len(tasks)).tolist()
 

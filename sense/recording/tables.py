@@ -146,12 +146,12 @@ class Table:
         """Note what was left out; raise InputError if it is too much."""
         limit = max(_MIN_BAD, _MAX_BAD_SHARE * len(self._lines))
         if len(torn) > limit:
-            line, found = torn[0]
-            raise InputError(f"{self.path}: line {line} has {found} values, expected {len(self.names)}")
+            line, n_values = torn[0]
+            raise InputError(f"{self.path}: line {line} has {n_values} values, expected {len(self.names)}")
         if torn and torn[-1][0] == last:
             self.notes.append(f"line {torn.pop()[0]}, the last, is cut off and left out")
         if torn:
-            counts = ", ".join(dict.fromkeys(str(found) for _, found in torn))
+            counts = ", ".join(dict.fromkeys(str(n_values) for _, n_values in torn))
             what = f"{counts} values, expected {len(self.names)}"
             self.notes.append(f"{name_lines([line for line, _ in torn])} left out: {what}")
         if n_headers:

@@ -358,7 +358,7 @@ class HandSession:
         target = self._sequence.touch(self._time_s(touched))
         self._touched = touched
         self._down_command = max(self._ring.command_index(touched, TOUCH_DELAY_S), self._released + 1)
-        self._baseline = self._ring.rest(self._down_command)
+        self._baseline = self._ring.baseline(self._down_command)
         self._rejected_mm = None
         self._recorder.begin(target or UNKNOWN, self._first + self._down_command, self._number)
         self._recorder.sync()
@@ -435,7 +435,7 @@ class HandSession:
         a fibre the difference from its baseline as a share of the largest response, None if missing.
         """
         sequence, end = self._sequence, self._ring.end
-        baseline = self._baseline if sequence.is_pressed else self._ring.rest(end)
+        baseline = self._baseline if sequence.is_pressed else self._ring.baseline(end)
         swings = (self._ring.rows(end - 1, end)[0, 1:] - baseline) / self._max_response_v
         done = self._n_done + len(sequence.accepted_mm)
         return {

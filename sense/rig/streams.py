@@ -48,7 +48,7 @@ class RingBuffer:
         dropped = self.end - self._filled
         return self._rows[max(first - dropped, 0) : max(min(end - dropped, self._filled), 0)]
 
-    def rest(self, index: int) -> Array:
+    def baseline(self, index: int) -> Array:
         """Return the mean (columns - 1,) of the readings just before an index; column 0 of the rows are times."""
         return interpolate_gaps(self.rows(index + REST[0], index)[:, 1:]).mean(axis=0)
 

@@ -64,8 +64,8 @@ class BuiltPad:
         paths = _deviate(plan, rig.path_mm, rng) if rig.path_mm else plan
         if not (rig.sensitivity or rig.own_sensitivity):
             return cls(paths)
-        held, *own = (_log_sensitivity(plan, rng) for _ in PressParts._fields)
-        logarithms = [held := rig.sensitivity * held, *(held + rig.own_sensitivity * each for each in own)]
+        held, *others = (_log_sensitivity(plan, rng) for _ in PressParts._fields)
+        logarithms = [held := rig.sensitivity * held, *(held + rig.own_sensitivity * each for each in others)]
         return cls(paths, PressParts(*map(_factors, logarithms)))
 
     def stretch(self, positions_mm: Array, contacts: PressParts[Contact]) -> PressParts[Array]:

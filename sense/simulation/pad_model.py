@@ -155,12 +155,12 @@ class Viscoelasticity:
     def __init__(self, rate_hz: float, rig: RigSettings) -> None:
         self._creep = _LowPass(rate_hz, CREEP_S)
         self._decay = np.exp(-1 / (rate_hz * rig.hysteresis_s))
-        self._left: Array | None = None
+        self._state: Array | None = None
 
     def __call__(self, strain: Strain) -> Array:
         """Compute the visible part (R, C) of further strain, which starts settled."""
-        left = np.zeros_like(strain.residue[:1]) if self._left is None else self._left
-        residue, self._left = lfilter([1.0], [1.0, -self._decay], strain.residue, axis=0, zi=left)
+        state = np.zeros_like(strain.residue[:1]) if self._state is None else self._state
+        residue, self._state = lfilter([1.0], [1.0, -self._decay], strain.residue, axis=0, zi=state)
         return strain.pressed - self._creep(strain.creeping) - residue
 
 
@@ -260,9 +260,9 @@ def simulate_readings(
 def _reading_noise_v(cycle: Cycle, rig: RigSettings) -> float:
     """Return the standard deviation of a held press minus the rest before it, by white noise and drift alone, V."""
     held = np.arange(cycle.held_index, cycle.readings)
-    rest = np.arange(cycle.down_index // 2, cycle.down_index)
-    times_s = np.append(held, rest) / cycle.rate_hz
-    weights = np.append(np.full(len(held), 1 / len(held)), np.full(len(rest), -1 / len(rest)))
+    before = np.arange(cycle.down_index // 2, cycle.down_index)
+    times_s = np.append(held, before) / cycle.rate_hz
+    weights = np.append(np.full(len(held), 1 / len(held)), np.full(len(before), -1 / len(before)))
     correlation = np.exp(-np.abs(times_s[:, None] - times_s) / DRIFT_S)
     drift, white = weights @ correlation @ weights, weights @ weights
     return float(1e-3 * np.sqrt(rig.drift_mv**2 * drift + rig.noise_mv**2 * white))

@@ -33,13 +33,13 @@ def replaced_residues(
         held: its held response; shape (Q, C).
         rig: `memory`, `memory_mm` and `hysteresis_s`.
     """
-    replaced, left = np.zeros_like(residues), np.ones(len(residues))
+    replaced, remaining = np.zeros_like(residues), np.ones(len(residues))
     for q in range(1, len(residues) if rig.memory else 0):
         recent = slice(max(q - MAX_LAG, 0), q)
         squares = ((positions_mm[recent] - positions_mm[q]) ** 2).sum(axis=1)
-        taken = rig.memory * np.exp(squares / (-2 * rig.memory_mm**2))
+        replaced_share = rig.memory * np.exp(squares / (-2 * rig.memory_mm**2))
         decayed = np.exp((release_s[recent] - touch_s[q]) / rig.hysteresis_s)
         both = np.sqrt(np.maximum(residues[recent] * held[q], 0))
-        replaced[q] = np.sign(held[q]) * ((left[recent] * taken * decayed) @ both)
-        left[recent] *= 1 - (1 - RETURNED) * taken
+        replaced[q] = np.sign(held[q]) * ((remaining[recent] * replaced_share * decayed) @ both)
+        remaining[recent] *= 1 - (1 - RETURNED) * replaced_share
     return replaced

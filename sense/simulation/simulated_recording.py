@@ -98,8 +98,8 @@ def model_twin(twin: Twin, rig: RigSettings, size: PadSettings | None = None) ->
             positions = (positions_mm - twin.residual.middle_mm) / twin.residual.half_mm
             maps = twin.residual.volts.transpose(2, 3, 0, 1)
             axis = np.linspace(-1, 1, len(maps))
-            left = RegularGridInterpolator((axis, axis), maps)(np.clip(positions, -1, 1))
-            parts += left.transpose(1, 0, 2)
+            residual = RegularGridInterpolator((axis, axis), maps)(np.clip(positions, -1, 1))
+            parts += residual.transpose(1, 0, 2)
         held, onset, creep, after = depths_mm[:, None] / FULL_DEPTH_MM * parts
         return PressParts(held, onset, creep, after)
 
@@ -127,9 +127,9 @@ def model_like_twin(pad: Morphology, twin: Twin, rig: RigSettings, size: PadSett
     columns = [twin.channels.index(channel) for channel in live]
     plan = model_plan(pad, twin.contact(), rig, size)
     noise_v = np.full(len(pad.knots), np.median([channel.noise_v for channel in live]))
-    whole, gain_v = twin.contact(), _median_gain(np.array([channel.gain_v for channel in live]))
+    plain, gain_v = twin.contact(), _median_gain(np.array([channel.gain_v for channel in live]))
     parts = [twin.parts.get(name) for name in PARTS]
-    contacts = PressParts(*(whole if part is None else part.contact() for part in parts))
+    contacts = PressParts(*(plain if part is None else part.contact() for part in parts))
     gains_v = [
         _share(name, rig) * gain_v if part is None else _median_gain(part.gains_v[columns])
         for name, part in zip(PARTS, parts, strict=True)
@@ -172,8 +172,8 @@ def measured_rig(twin: Twin, rig: RigSettings) -> RigSettings:
     measured |= {"scatter": twin.scatter.share, "scatter_common": twin.scatter.common}
     held = _log_sensitivities(twin.parts.get("held", twin))
     if held is not None:
-        own = [_log_sensitivities(twin.parts[name]) for name in PARTS[1:] if name in twin.parts]
-        differences = [part - held for part in own if part is not None]
+        sensitivities = [_log_sensitivities(twin.parts[name]) for name in PARTS[1:] if name in twin.parts]
+        differences = [part - held for part in sensitivities if part is not None]
         measured |= {"sensitivity": min(float(held.std()), 2.0)}
         measured |= {"own_sensitivity": min(float(np.std(differences)), 2.0)} if differences else {}
     return rig.model_copy(update=measured)
@@ -283,8 +283,8 @@ def measure_rig_settings(recording: Recording) -> dict[str, float]:
     if len(down_command) < MIN_PRESSES or not valid.any():
         return {}
     readings, rested = recording.readings[:, valid], ceil(REST_S * rate_hz)
-    rest = _interval_means(readings, np.maximum(down_command - rested, np.append(0, up_command[:-1])), down_command)
-    decay_s, drift_v = _fit_variogram(rest, float(np.median(np.diff(recording.times_s[down_command]))))
+    baseline = _interval_means(readings, np.maximum(down_command - rested, np.append(0, up_command[:-1])), down_command)
+    decay_s, drift_v = _fit_variogram(baseline, float(np.median(np.diff(recording.times_s[down_command]))))
     middle = (down_command + up_command) // 2
     second_differences = readings[middle - 1] - 2 * readings[middle] + readings[middle + 1]
     return {
@@ -300,10 +300,10 @@ def _interval_means(readings: Array, first: Indices, end: Indices) -> Array:
     return np.array([readings[a : max(b, a + 1)].mean(axis=0) for a, b in zip(first, end, strict=True)])
 
 
-def _fit_variogram(rest: Array, interval_s: float) -> tuple[float, float]:
+def _fit_variogram(baseline: Array, interval_s: float) -> tuple[float, float]:
     """Fit decaying hysteresis and drift to the variogram of rests (Q, C); return decay time, s, and drift, V."""
-    lags = np.unique(np.geomspace(1, len(rest) // 2, 24).astype(int))
-    variogram = np.array([((rest[lag:] - rest[:-lag]) ** 2).mean() / 2 for lag in lags])
+    lags = np.unique(np.geomspace(1, len(baseline) // 2, 24).astype(int))
+    variogram = np.array([((baseline[lag:] - baseline[:-lag]) ** 2).mean() / 2 for lag in lags])
     fits: list[tuple[float, float, float]] = []
     for decay_s in DECAY_S.tolist():
         models = 1 - np.exp(-lags[:, None] * interval_s / np.array([decay_s, DRIFT_S]))

@@ -43,22 +43,22 @@ def simulate_strokes(
     model = model_plan(pad, contact, rig, size)
     starts = sample_uniform(model.corners_mm, strokes, rng, model.free)
     ends = np.array([_end(start, speed_mm_s * _duration_s(rig), model.corners_mm, rng) for start in starts])
-    held, rest = rig.readings_per_press // 2, rig.readings_per_press - rig.readings_per_press // 2
-    share = np.arange(held) / held
+    n_held, n_rest = rig.readings_per_press // 2, rig.readings_per_press - rig.readings_per_press // 2
+    share = np.arange(n_held) / n_held
     paths = starts[:, None] + share[:, None] * (ends - starts)[:, None]
-    depth = np.minimum((np.arange(held) + 1) / (rig.rate_hz * TRAVEL_S), 1.0) * rig.press_depths_mm[0]
+    depth = np.minimum((np.arange(n_held) + 1) / (rig.rate_hz * TRAVEL_S), 1.0) * rig.press_depths_mm[0]
     built = np.random.default_rng(rig.seed)
     make_plan(pad, rig, built, size)  # the presses of a recording are drawn before the pad is
-    positions_mm = np.concatenate([np.repeat(starts[:, None], rest, axis=1), paths], axis=1).reshape(-1, 2)
-    depths_mm = np.tile(np.append(np.zeros(rest), depth), strokes)
+    positions_mm = np.concatenate([np.repeat(starts[:, None], n_rest, axis=1), paths], axis=1).reshape(-1, 2)
+    depths_mm = np.tile(np.append(np.zeros(n_rest), depth), strokes)
     readings = LivePad(pad, contact, rig, rig.rate_hz, built).volts(positions_mm, depths_mm)
-    first = rig.readings_per_press * np.arange(strokes) + rest
+    first = rig.readings_per_press * np.arange(strokes) + n_rest
     recording = Recording(
         readings,
         (np.arange(len(readings)) + 1) / rig.rate_hz,
         paths[:, -1],
         down_command=first,
-        up_command=first + held,
+        up_command=first + n_held,
         source={"kind": "simulated", "rig": rig.model_dump(mode="json"), **model.source},
     )
     return Strokes(recording, paths)

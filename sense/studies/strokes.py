@@ -68,7 +68,7 @@ def _follow_strokes(
     """Return the errors (speeds, N, T), mm, at each reading of strokes, whether they are within r90, and of the end."""
     recording = simulate(pad, rig, contact)
     model = fit_recording(recording, np.arange(rig.presses), options, np.random.default_rng(rig.seed))
-    errors, within, lifted = [], [], []
+    errors, within, final_errors = [], [], []
     for number, speed in enumerate(SPEEDS_MM_S):
         rng = np.random.default_rng([rig.seed, number])
         strokes = simulate_strokes(pad, rig, contact, speed, n_strokes, rng)
@@ -81,12 +81,12 @@ def _follow_strokes(
             error = distances(predicted.positions_mm, strokes.positions_mm[:, reading])
             errors.append(error)
             within.append(error <= predicted.r90_mm)
-        lifted.append(distances(predict(None).positions_mm, strokes.positions_mm[:, -1]))
+        final_errors.append(distances(predict(None).positions_mm, strokes.positions_mm[:, -1]))
     shape = len(SPEEDS_MM_S), -1, n_strokes
     return {
         "errors": np.array(errors).reshape(shape),
         "within": np.array(within).reshape(shape),
-        "lifted": np.array(lifted),
+        "lifted": np.array(final_errors),
     }
 
 

@@ -120,9 +120,9 @@ class Identification:
         for row, fibre in enumerate(built.fibres):
             planned, tangent = built.plan.paths[fibre], built.plan.tangents[fibre]
             offset = built.path(row)[0] - planned
-            left = offset[:, 1] * tangent[:, 0] - offset[:, 0] * tangent[:, 1]
+            lateral = offset[:, 1] * tangent[:, 0] - offset[:, 0] * tangent[:, 1]
             within = ((planned >= low) & (planned <= high)).all(axis=1)
-            out.append((unit_mm * left, unit_mm * self.fit.offset_std(row), within))
+            out.append((unit_mm * lateral, unit_mm * self.fit.offset_std(row), within))
         return out
 
     @property

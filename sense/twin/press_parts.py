@@ -59,8 +59,12 @@ class SplitPresses:
 
 def split_presses(recording: Recording, training: Mask, hysteresis_s: float) -> SplitPresses:
     """Split the presses of known position of a recording; maps of their parts are fitted to those in `training`."""
-    known = recording.has_position
-    down, up, positions_mm = recording.down_command[known], recording.up_command[known], recording.presses_mm[known]
+    positioned = recording.has_position
+    down, up, positions_mm = (
+        recording.down_command[positioned],
+        recording.up_command[positioned],
+        recording.presses_mm[positioned],
+    )
     inputs = compute_features(recording.readings, down, up)
     timed = inputs.windows[:, :, :N_TIMED]
     valid, positions = inputs.fibre_mask, normalize(positions_mm)[0]
@@ -123,8 +127,8 @@ def _fit_memory(presses: tuple[Array, ...], pressed: Array, training: Mask, rig:
         return rig.model_copy(update=dict(zip(BOUNDS, np.clip(values, low, high).tolist(), strict=True)))
 
     def misfit(values: Array) -> float:
-        left = pressed[last] - replaced_residues(positions_mm, touch_s, release_s, residues, held, at(values))
-        squares = np.square(left[first] - left[second]).mean(axis=0)
+        residual = pressed[last] - replaced_residues(positions_mm, touch_s, release_s, residues, held, at(values))
+        squares = np.square(residual[first] - residual[second]).mean(axis=0)
         return float(np.log(np.maximum(squares, MIN_SCALE_V**2)).sum())
 
     simplex = np.vstack([start, start - np.diag(scale * np.where(start - scale > low, 1, -1))])

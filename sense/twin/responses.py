@@ -78,11 +78,11 @@ def select_one_depth(recording: Recording) -> Recording:
 
 def compute_responses(recording: Recording, training: Mask) -> Responses:
     """Compute the responses to all Q presses of known position; history is fitted to those in the mask `training`."""
-    known = recording.has_position
-    down, up = recording.down_command[known], recording.up_command[known]
+    positioned = recording.has_position
+    down, up = recording.down_command[positioned], recording.up_command[positioned]
     inputs = compute_features(recording.readings, down, up, until=up)
     pressed = inputs.windows[:, :, : len(DOWN)]
-    positions_mm = recording.presses_mm[known]
+    positions_mm = recording.presses_mm[positioned]
     normalized, *_ = normalize(positions_mm)
     model = ResponseModel.fit(
         normalized[training],

@@ -140,11 +140,15 @@ def figure_text(figure: Figure) -> str:
             style = f"{to_hex(line.get_color())} {line.get_linestyle()} {line.get_marker()}"
             lines.append(f"  line {line.get_label()!r} {style}: {_summary(xy)}")
         for collection in axes.collections:
-            data = collection.get_offsets() if len(collection.get_offsets()) > 1 else _vertices(collection)
+            data = collection.get_offsets() if np.size(collection.get_offsets()) > 2 else _vertices(collection)
             values = collection.get_array()
             shown = "" if values is None else f", {collection.get_cmap().name} {_numbers(collection.get_clim())}: "
             shown += "" if values is None else _summary(np.asarray(values, dtype=float).reshape(-1, 1))
-            faces = sorted({to_hex(colour) for colour in collection.get_facecolor()}) if values is None else []
+            faces = (
+                sorted({to_hex(colour) for colour in np.reshape(collection.get_facecolor(), (-1, 4)).tolist()})
+                if values is None
+                else []
+            )
             kind = type(collection).__name__
             lines.append(f"  {kind} {collection.get_label()!r} {' '.join(faces)}: {_summary(data)}{shown}")
         for image in axes.images:

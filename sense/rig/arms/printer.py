@@ -178,7 +178,7 @@ class NozzleThread(threading.Thread):
                 self._add_state(now_s, position)
                 self._link.execute("M400")
                 self._check_at_rest(move.end)
-                self._rest(move.end)
+                self._stop_at(move.end)
                 return
             position = move.position(elapsed_s - _START_S)  # without a real-time position only the end is reported
         late = elapsed_s > move.duration_s + _MAX_LATE_S
@@ -192,9 +192,9 @@ class NozzleThread(threading.Thread):
     def _quick_stop(self) -> None:
         self._link.execute("M410")
         self._link.execute("M400")
-        self._rest(self._ask_position("M114", None))
+        self._stop_at(self._ask_position("M114", None))
 
-    def _rest(self, position: Position) -> None:
+    def _stop_at(self, position: Position) -> None:
         self._move, self._position, self._n_implausible = None, position, 0
         self._add_state(clock.now(), position)
 
@@ -206,7 +206,9 @@ class NozzleThread(threading.Thread):
         """Ask for the nozzle's position; ask again where the answer is damaged or not as expected."""
         position = None
         for _ in range(_MAX_IMPLAUSIBLE):
-            positions = [found for line in self._link.execute(command) if (found := parse_position(line)) is not None]
+            positions = [
+                reported for line in self._link.execute(command) if (reported := parse_position(line)) is not None
+            ]
             position = positions[-1] if positions else position
             if positions and (expected is None or math.dist(positions[-1], expected) <= _TOLERANCE_MM):
                 break

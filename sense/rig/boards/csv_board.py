@@ -108,10 +108,10 @@ class CsvBoard(SerialBoard):
         self._n_lines = self._last = 0
         self._reader = BlockReader(self._port, lambda: self._receive_blocks(stream), rate_hz)
         self._reader.start_settled()
-        rest = float(np.median(np.abs(table[:, self._columns]))) * self._count_v
+        level_v = float(np.median(np.abs(table[:, self._columns]))) * self._count_v
         counts = (
-            f"; they rest at {rest:.4g}: if that are counts, [rig] count_v is the volts of one"
-            if rest > _COUNTS_V
+            f"; they rest at {level_v:.4g}: if that are counts, [rig] count_v is the volts of one"
+            if level_v > _COUNTS_V
             else ""
         )
         return {

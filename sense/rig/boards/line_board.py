@@ -155,8 +155,8 @@ def describe_lines(received: bytes) -> tuple[str, str]:
     if text < _MIN_TEXT * len(received):
         return f"{len(received) - text} of {len(received)} bytes are no text", "is [rig] baud that of the board?"
     lines = [line.strip() for line in received.split(b"\n")[1:-1] if line.strip()] or [received.strip()]
-    shown = repr(lines[-1][:_MAX_SHOWN].decode("ascii", "replace"))
-    what = f"it sends lines such as {shown} without the header of docs/howto-boards.md"
+    excerpt = repr(lines[-1][:_MAX_SHOWN].decode("ascii", "replace"))
+    what = f"it sends lines such as {excerpt} without the header of docs/howto-boards.md"
     return what, 'add the header to its program, or set [rig] board = "csv", which is weaker'
 
 

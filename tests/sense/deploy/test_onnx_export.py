@@ -75,7 +75,7 @@ def test_graph_gives_the_predictions_at_every_reading(graph, localizer, recordin
     n_complete = []
     for end in range(down[-1] + 1, up[-1] + 24):
         expected = localizer.predict(so_far, until=np.full(6, end))
-        n_complete.append(localizer.raw_features(so_far, np.full(6, end)).seen[-1].sum())
+        n_complete.append(localizer.raw_features(so_far, np.full(6, end)).complete[-1].sum())
         inputs = {"down_command": down, "up_command": np.minimum(up, end), "fibre_mask": np.ones((6, 4), bool)}
         positions_mm, std_mm, r90_mm = graph.run(
             ["positions_mm", "std_mm", "r90_mm"], inputs | {"readings": readings[:end]}
@@ -140,7 +140,7 @@ def test_graph_follows_a_finger_that_slides(graph, localizer, recording) -> None
         readings[here] = recording.readings[there]
     sliding = replace(recording, readings=readings)
     scaled = localizer.scaled_features(sliding)
-    inputs = scaled.inputs, scaled.fibre_mask, scaled.seen
+    inputs = scaled.inputs, scaled.fibre_mask, scaled.complete
     *_, slid = predict(localizer.networks, *inputs, *localizer.corrected, sliding=localizer.sliding)
     assert 20 < slid.sum() < 280
     positions_mm, r90_mm = graph.run(["positions_mm", "r90_mm"], graph_inputs(sliding, scaled.fibre_mask))

@@ -239,7 +239,7 @@ def test_calibrate_uncertainty_corrects_overconfidence(recording: Recording, loc
     assert shift[0, 0, 2] == shift[0, 0, 3] == pytest.approx(np.log(50), abs=0.7)
     assert put_right.interval_factors.shape == (N_TIMED + 1, 2, 3)
 
-    presses = moments[-1].inputs, moments[-1].fibre_mask, moments[-1].seen
+    presses = moments[-1].inputs, moments[-1].fibre_mask, moments[-1].complete
     before, after = (
         predict_members(each.networks, *presses, *each.corrected)[-1, :, 2:] for each in (proud, put_right)
     )
@@ -265,21 +265,21 @@ def test_calibrate_gives_radii_for_every_moment(recording: Recording, localizer:
 
 @pytest.mark.slow
 def test_calibrate_keeps_a_time_budget(recording: Recording) -> None:
-    seen: list[tuple[int, int]] = []
+    complete: list[tuple[int, int]] = []
     begin = time.monotonic()
     options = SHORT.model_copy(update={"epochs": 10**5})
 
     def show(done: int, total: int, what: str) -> None:
         if not what:
-            seen.append((done, total))
+            complete.append((done, total))
 
     localizer, evaluation = calibrate(recording, options, time_budget=2, on_progress=show)
     assert time.monotonic() - begin < 60  # with what is done before and after, on a machine that does other things
     assert localizer.bayes
     networks = len(localizer.residual_network["first.w"])
     networks += sum(len(weights["first.w"]) for weights in localizer.networks.values())
-    assert seen == sorted(seen)
-    assert seen[-1][0] == seen[-1][1] <= 2 * networks
+    assert complete == sorted(complete)
+    assert complete[-1][0] == complete[-1][1] <= 2 * networks
     assert evaluation.errors[0]["mean_mm"] < 9
 
 

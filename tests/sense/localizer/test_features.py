@@ -44,10 +44,10 @@ def test_compute_features_takes_means_and_medians() -> None:
     found = compute_features(ramp, down_command, up_command)
     np.testing.assert_allclose(found.windows[0, 0], np.array(down + up + now) + 5.5)
     np.testing.assert_allclose(found.history[0, 0], np.array(past + slow) + 5.5)
-    assert found.seen.all()
+    assert found.complete.all()
     published = compute_features(ramp, down_command, up_command, is_published=True)
     np.testing.assert_allclose(published.windows[0, 0], [4990, 5010, 5030])
-    assert (published.history.shape, published.seen.shape) == ((1, 1, 0), (1, 0))
+    assert (published.history.shape, published.complete.shape) == ((1, 1, 0), (1, 0))
 
 
 @pytest.mark.parametrize(("until", "now"), [(1, [0, 0]), (2, [1, 0]), (9, [8, 7]), (20, [19, 18]), (29, [19, 18])])
@@ -56,7 +56,7 @@ def test_compute_features_says_where_the_finger_is_now(until: int, now: list[int
     ramp = np.arange(5100.0)[:, None]
     found = compute_features(ramp, np.array([5000]), np.array([5020]), np.array([5000 + until]))
     np.testing.assert_allclose(found.windows[0, 0, N_TIMED:], np.array(now) + 5.5)
-    assert found.seen.sum() == sum(end <= until for _, end in DOWN) + sum(20 + end <= until for _, end in UP)
+    assert found.complete.sum() == sum(end <= until for _, end in DOWN) + sum(20 + end <= until for _, end in UP)
 
 
 @pytest.mark.parametrize(("is_published", "until", "end"), [(False, None, 140), (True, None, 140), (False, 6, 106)])
@@ -101,7 +101,7 @@ def test_compute_features_takes_presses_of_any_length(
     presses = len(edges) // 2
     assert found.windows.shape == (presses, 2, 3 if is_published else N_WINDOWS)
     assert found.history.shape == (presses, 2, 0 if is_published else N_HISTORY)
-    assert found.seen.shape == (presses, 0 if is_published else N_TIMED)
+    assert found.complete.shape == (presses, 0 if is_published else N_TIMED)
     assert np.isfinite(found.windows).all()
     assert np.isfinite(found.history).all()
     assert found.fibre_mask.all()

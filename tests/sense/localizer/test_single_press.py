@@ -118,7 +118,7 @@ def test_presses_before_the_first_stage_and_without_fibres_are_not_judged(traine
     assert find_unlike(trained.tests, two).any()
     for n_complete in (0, N_DOWN - 1):
         early = np.tile(np.arange(N_TIMED) < n_complete, (100, 1))
-        assert not find_unlike(trained.tests, replace(two, seen=early)).any()
+        assert not find_unlike(trained.tests, replace(two, complete=early)).any()
     assert not find_unlike(trained.tests, replace(two, fibre_mask=np.zeros_like(two.fibre_mask))).any()
     assert not find_unlike((), two).any()
 
