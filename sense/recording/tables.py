@@ -40,6 +40,8 @@ _MONITOR = re.compile(r"^(\d{1,2}:\d\d:\d\d(?:[.,]\d+)?) -> ?")  # time stamps o
 _GARBAGE = re.compile("^[\x00-\x08\x0e-\x1f\x7f-\xff\ufffd]*[\x00-\x08\x0e-\x1f\xfe\xff\ufffd]")  # sent while booting
 _CLOCK = re.compile(r"(\d{1,2}):(\d\d)(?::(\d\d(?:[.,]\d+)?))?")
 _DATE = re.compile(r"\d{1,4}[-/.]\d{1,2}[-/.]\d{1,4}[T ,]+\d{1,2}:\d\d.*|\d{1,2} \w{3} \d{4} .*|" + _CLOCK.pattern)
+_MEASURED = re.compile(r"(?:([A-Za-z]\w*) ?[:=] ?)?([-+]?[\d.,]+(?:[eE][-+]?\d+)?) ?([a-zA-Zµμ°%Ω]{1,4})?")
+"""A number with its name before it, as for the Arduino IDE's plotter, or its unit behind it: `left:1.84`, `0.05 s`."""
 _THOUSANDS = re.compile(r"[-+]?\d{1,3}(,\d{3})+(\.\d*)?")
 
 
@@ -83,7 +85,7 @@ class Table:
     @property
     def has_header(self) -> bool:
         """Whether a line names the columns."""
-        return self.dialect.header > 0
+        return self.dialect.header > 0 or any(not name.isdecimal() for name in self.names)
 
     def line_number(self, row: int) -> int:
         """Return the number of the line, from 1, that a row was read from."""
@@ -273,12 +275,16 @@ def _find_dialect(sample: list[tuple[int, str]]) -> _Dialect:
     # 2. the lines of names and units before it
     header, names, units = _find_names(rows[:start], width, [item for item in comments if item[0] < number], separator)
     unnamed = list(zip(*table, strict=True))[len(names) :]
+    columns = list(zip(*[row for _, row in rows[start:] if len(row) == width], strict=True))
+    measured = [_MEASURED.fullmatch(next(filter(None, cells), "")) for cells in columns]
+    if not header and measured and all(match and match[1] for match in measured):
+        names, unnamed = [match[1] for match in measured if match], []
+    units = units or [(match and match[3]) or "" for match in measured]
     names += ["" if header and not any(cells) else str(len(names) + i) for i, cells in enumerate(unnamed, 1)]
     # 3. how numbers are written
-    values = [cell for _, row in rows[start:] for cell in row]
-    has_comma = any(re.fullmatch(r"[-+]?\d*,\d+", cell) for cell in values)
-    has_point = any(re.fullmatch(r"[-+]?\d*\.\d+", cell) for cell in values)
-    columns = zip(*[row for _, row in rows[start:] if len(row) == width], strict=True)
+    values = [match[2] for _, row in rows[start:] for cell in row if (match := _MEASURED.fullmatch(cell))]
+    has_comma = any(re.fullmatch(r"[-+]?\d*,\d+", value) for value in values)
+    has_point = any(re.fullmatch(r"[-+]?\d*\.\d+", value) for value in values)
     dates = frozenset(
         i for i, cells in enumerate(columns) if 2 * sum(bool(_DATE.fullmatch(c)) for c in cells) > len(cells)
     )
@@ -332,7 +338,7 @@ def _is_number(cell: str) -> bool:
     try:
         float(cell.strip().replace(",", "."))
     except ValueError:
-        return bool(_THOUSANDS.fullmatch(cell.strip()))
+        return bool(_THOUSANDS.fullmatch(cell.strip()) or _MEASURED.fullmatch(cell.strip()))
     return "_" not in cell
 
 
@@ -356,6 +362,8 @@ def _parse(cell: str, dialect: _Dialect, may_be_unknown: bool) -> float | None:
         return _TRUTH[word]
     if word == "?" and may_be_unknown:
         return UNKNOWN
+    if (measured := _MEASURED.fullmatch(cell)) and (measured[1] or measured[3]):
+        return _parse(measured[2], dialect, may_be_unknown=False)
     if dialect.decimal_comma:
         cell = cell.replace(".", "").replace(",", ".")
     elif _THOUSANDS.fullmatch(cell) and (dialect.separator == "," or "." in cell):

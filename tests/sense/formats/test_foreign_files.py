@@ -346,6 +346,20 @@ def test_import_bag_holds_late_poses_and_spreads_bursts(tmp_path: Path) -> None:
     np.testing.assert_allclose(recording.presses_mm[3], [-10, 10], atol=0.1)
 
 
+@pytest.mark.parametrize("separator", [",", "\t"])
+def test_import_csv_reads_numbers_with_names_before_and_units_behind_them(tmp_path: Path, separator: str) -> None:
+    named = [
+        separator.join(f"{n}:{v}" for n, v in zip(["t", "c0", "c1", "c2", "c3"], row.split(","), strict=True))
+        for row in rows()
+    ]
+    check(load(tmp_path, table("", named)))
+    measured = [
+        f"{1000 * t:.1f} ms,{','.join(f'{1000 * volt:.1f}mV' for volt in row)}"
+        for t, row in zip(TIMES, VOLTS, strict=True)
+    ]
+    check(load(tmp_path, table(lines=measured)))
+
+
 def test_import_bag_reads_fields_of_messages(tmp_path: Path) -> None:
     messages = []
     for i in range(N):
