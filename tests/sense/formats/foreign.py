@@ -4,6 +4,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
+from rosbags.rosbag1 import Writer as Ros1Writer
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
@@ -49,3 +50,15 @@ def write_bag(folder: Path, messages: Iterable[Message], plugin: str = "mcap", p
                 topics[topic] = writer.add_connection(topic, message.__msgtype__, typestore=STORE)
             writer.write(topics[topic], round(time_s * 1e9), STORE.serialize_cdr(message, message.__msgtype__))
     return next(file for file in folder.iterdir() if file.suffix in (".mcap", ".db3"))
+
+
+def write_ros1_bag(path: Path, topic: str, times_s: Any, values: Any) -> Path:
+    """Write a bag of ROS 1 with an array (N, C) of numbers, a message each."""
+    store = get_typestore(Stores.ROS1_NOETIC)
+    layout, kind = store.types["std_msgs/msg/MultiArrayLayout"](dim=[], data_offset=0), "std_msgs/msg/Float64MultiArray"
+    with Ros1Writer(path) as writer:
+        connection = writer.add_connection(topic, kind, typestore=store)
+        for time_s, row in zip(times_s, values, strict=True):
+            message = store.serialize_ros1(store.types[kind](layout=layout, data=row), kind)
+            writer.write(connection, round(time_s * 1e9), message)
+    return path

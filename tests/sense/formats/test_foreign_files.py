@@ -17,7 +17,7 @@ from padforge.sense.formats.csv_recording import read_presses
 from padforge.sense.formats.import_export import describe_file, import_file
 from padforge.sense.recording.doubts import find_doubts
 
-from .foreign import array, make, pose, write_bag
+from .foreign import array, make, pose, write_bag, write_ros1_bag
 
 N = 156
 TIMES = np.arange(N) / 20
@@ -374,6 +374,11 @@ def test_import_bag_reads_fields_of_messages(tmp_path: Path) -> None:
     np.testing.assert_allclose(recording.presses_mm[4], [0, 5], atol=1e-9)
     with pytest.raises(InputError, match=r"'position\.q' is no field"):
         import_bag(path, "fibres=/all.position.q")
+
+
+def test_import_bag_reads_bags_of_ros_1(tmp_path: Path) -> None:
+    bag = write_ros1_bag(tmp_path / "lab.bag", "/skin", TIMES + 1.7e9, VOLTS)
+    check(import_bag(bag, "fibres=/skin"))
 
 
 def test_describe_file_shows_what_a_mapping_may_name(tmp_path: Path) -> None:
