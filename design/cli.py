@@ -264,7 +264,7 @@ def edit(pad: Path | None, spec: Path | None, out: Path | None, force: bool, por
     show_default=True,
     help="Largest distance of fibres and their ends from the drawing.",
 )
-@common.out_option()
+@common.out_option(place="out/ and the name of the drawing")
 @common.force_option
 @common.json_option
 @click.pass_context

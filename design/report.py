@@ -113,7 +113,7 @@ def draw_plan(
     axes.set_title(
         f"{pad.layout}, {len(markers)} crossings"
         + (f", {n_same} within a family" if n_same else "")
-        + (f", {len(violations)} rules broken" if violations else ""),
+        + (f", {len(violations)} violation{'s' * (len(violations) > 1)} of rules" if violations else ""),
         fontsize=10,
         color=ALARM if violations else INK,
     )
@@ -156,7 +156,7 @@ def design_sections(folder: Path, document: Mapping[str, Any]) -> list[PageSecti
     )
     error_text = (
         "Expected error of a localizer in mm, averaged over all sets of failed fibres of a size. It is computed before"
-        " anything is built, by a formula that agrees with the errors of trained networks within about 5 %. Responses"
+        " anything is built, by a formula that agrees with the errors of trained networks within about 5%. Responses"
         f" to a press vary by {float(search['scatter']):.0%} of their value from press to press, plus"
         f" {float(search['noise']):.1%} of full scale."
     )

@@ -108,8 +108,8 @@ def _penalties(scored: ScoredPad) -> dict[object, float]:
 
 
 TERMS = (
-    Term("expected_error_mm", "expected error with {} fibres failed, mm", lambda s: _in_mm(s, s.expected_errors)),
-    Term("ambiguity_mm", "ambiguity with {} fibres failed, mm", lambda s: _in_mm(s, _ambiguities(s))),
+    Term("expected_error_mm", "expected error with {} failed, mm", lambda s: _in_mm(s, s.expected_errors)),
+    Term("ambiguity_mm", "ambiguity with {} failed, mm", lambda s: _in_mm(s, _ambiguities(s))),
     Term(
         "information",
         "mutual information of positions and signals, bits",

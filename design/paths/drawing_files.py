@@ -98,10 +98,10 @@ def _join(curves: list[DrawnCurve], tolerance: float) -> Iterator[DrawnCurve]:
         return
     # 1. end 2 k is the start of curve k, end 2 k + 1 its end: which other end is each one joined to?
     ends = np.array([curve.points[end] for curve in curves for end in (0, -1)])
-    names = [curve.name for curve in curves]
-    partners = _pair_ends(ends, np.arange(len(ends)), _COINCIDENT * max(float(np.ptp(ends, axis=0).max()), 1e-9), names)
+    coincident = _COINCIDENT * max(float(np.ptp(ends, axis=0).max()), 1e-9)
+    partners = _pair_ends(ends, np.arange(len(ends)), coincident, curves)
     free = np.setdiff1d(np.arange(len(ends)), list(partners))
-    gaps = _pair_ends(ends, free, tolerance, names)
+    gaps = _pair_ends(ends, free, tolerance, curves)
     partners |= gaps
     # 2. walk from every free end to the other end of its chain
     remaining = set(range(len(curves)))
@@ -127,7 +127,7 @@ def _join(curves: list[DrawnCurve], tolerance: float) -> Iterator[DrawnCurve]:
         raise InputError(f"{name}: part of a ring, or drawn twice, expected curves from border to border")
 
 
-def _pair_ends(ends: Array, candidates: Ints, tolerance: float, names: Sequence[str]) -> dict[int, int]:
+def _pair_ends(ends: Array, candidates: Ints, tolerance: float, curves: Sequence[DrawnCurve]) -> dict[int, int]:
     """Return the other end within the tolerance of each of the candidates that has one."""
     from scipy.spatial import KDTree
 
@@ -140,8 +140,9 @@ def _pair_ends(ends: Array, candidates: Ints, tolerance: float, names: Sequence[
         close = [int(candidates[at]) for distance, at in zip(*row, strict=True) if distance <= tolerance]
         close = [other for other in close if other != end]
         if len(close) > 1:
-            x, y = ends[end]
-            raise InputError(f"{names[end // 2]}: more than two curves end at ({x:g}, {y:g})")
+            curve = curves[end // 2]
+            x, y = curve.ends[end % 2]
+            raise InputError(f"{curve.name}: more than two curves end at ({x:g}, {y:g}) in the drawing")
         if close:
             partners[end] = close[0]
     return partners

@@ -45,13 +45,15 @@ force_option = click.option(
 )
 
 
-def out_option(default: str = "", what: str = "Folder for the results", file: bool = False) -> Callable[..., Any]:
-    """Make the option `--out` for a folder or a file; its default is "" where the command uses `pad_folder`."""
+def out_option(
+    default: str = "", what: str = "Folder for the results", file: bool = False, place: str = "in the folder of the pad"
+) -> Callable[..., Any]:
+    """Make the option `--out` for a folder or a file; without a default `place` says where `pad_folder` puts it."""
     return click.option(
         "--out",
         type=click.Path(file_okay=file, dir_okay=not file, path_type=Path),
         default=default or None,
-        help=f"{what} (default: {default or 'in the folder of the pad'}).",
+        help=f"{what} (default: {default or place}).",
     )
 
 

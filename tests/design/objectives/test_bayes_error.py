@@ -5,6 +5,7 @@ import pytest
 from scipy.stats import multivariate_normal
 
 from padforge.design import Contact, Morphology, PadSettings, SearchSettings
+from padforge.design.contact import relative_stretch
 from padforge.design.objectives import bayes_error as module
 from padforge.design.objectives.bayes_error import (
     Positions,
@@ -12,7 +13,7 @@ from padforge.design.objectives.bayes_error import (
     expected_errors,
     possible_positions,
 )
-from padforge.design.objectives.expected_error import evaluation_windows
+from padforge.design.objectives.expected_error import evaluation_windows, straight_full_scale
 from padforge.design.settings import PUBLISHED_CONTACT, Scatter
 
 PLACES = np.stack(np.meshgrid(*[np.linspace(0, 4, 41)] * 2), axis=-1).reshape(-1, 2)
@@ -65,20 +66,39 @@ def test_huge_pads_are_sampled():
     assert len(possible.places) < module.MAX_FAR + 5000
 
 
-@pytest.mark.parametrize("counts", [(2, 5), pytest.param((8, 8), marks=pytest.mark.slow)])
-def test_expected_errors_grow_with_failures_and_scatter(counts, monkeypatch):
+def test_expected_errors_grow_with_failures_and_scatter(monkeypatch):
     monkeypatch.setattr(module, "PRESSES", 1024)
-    size = PadSettings(horizontals=counts[0], verticals=counts[1], pitch_mm=6.0)
+    size = PadSettings(horizontals=2, verticals=5, pitch_mm=6.0)
     pad = Morphology.straight(size.layout)
     quiet, loud = (expected_errors(pad, Contact(), SearchSettings(scatter=share), size) for share in (0.18, 0.4))
     assert quiet == sorted(quiet)
     assert np.all(np.array(loud) > quiet)
+    assert quiet == expected_errors(pad, Contact(), SearchSettings(scatter=0.18), size)
 
 
-def test_expected_errors_hardly_depend_on_the_presses(monkeypatch):
-    size, pad, asked = PadSettings(grid=2), Morphology.random(2, 5, seed=1), SearchSettings(max_failures=1)
-    errors = expected_errors(pad, Contact(), asked, size)
-    assert errors == expected_errors(pad, Contact(), asked, size)
-    monkeypatch.setattr(module, "PRESSES", 4 * module.PRESSES)
-    monkeypatch.setattr(module, "STEP", 0.7 * module.STEP)
-    assert errors == pytest.approx(expected_errors(pad, Contact(), asked, size), rel=0.06)
+@pytest.mark.parametrize("scatter", [Scatter(0.2), Scatter(0.02, 0.3, 0.5)])
+def test_expected_errors_are_those_of_other_presses_located_by_explicit_covariances(scatter, monkeypatch):
+    """And a share more, for learning: of presses and readings that are drawn otherwise, on a grid of its own."""
+    monkeypatch.setattr(module, "PRESSES", 3000)
+    size, pad = PadSettings(grid=1), Morphology.random(1, 3, seed=1)
+    search = SearchSettings(
+        max_failures=(1.0,), noise=scatter.floor, scatter=scatter.share, scatter_common=scatter.common
+    )
+    contact = Contact(model="profile")  # whose full scale is that of the pad's straight fibres
+    scale = straight_full_scale(size.layout, contact, size.sensed_mm)
+    low, high = np.array(size.sensed)
+    rng, shares = np.random.default_rng(7), (np.arange(25) + 0.5) / 25
+    places = low + (high - low) * np.stack(np.meshgrid(shares, shares), axis=-1).reshape(-1, 2)
+    pressed = rng.uniform(low, high, (3000, 2))
+    responses, x = (relative_stretch(pad, at, contact) / scale for at in (pressed, places))
+    gains = rng.standard_normal((3000, 1)), rng.standard_normal((3000, 2))
+    gain = scatter.share * (np.sqrt(scatter.common) * gains[0] + np.sqrt(1 - scatter.common) * gains[1])
+    readings = responses * (1 + gain) + scatter.floor * rng.standard_normal((3000, 2))
+    own = scatter.floor**2 * np.eye(2) + scatter.share**2 * (1 - scatter.common) * np.eye(2) * (x**2)[:, None]
+    covariances = own + scatter.share**2 * scatter.common * x[:, :, None] * x[:, None]
+    away = readings[:, None] - x
+    exponent = np.einsum("qpi,pij,qpj->qp", away, np.linalg.inv(covariances), away)
+    likelihood = np.exp(-exponent / 2) / np.sqrt(np.linalg.det(covariances))
+    located = likelihood @ places / likelihood.sum(axis=1)[:, None]
+    expected = 1.05 * np.hypot(*(located - pressed).T).mean()
+    assert expected_errors(pad, contact, search, size) == pytest.approx([expected], rel=0.03)

@@ -5,13 +5,13 @@ import pytest
 from scipy.interpolate import PchipInterpolator
 from scipy.spatial import KDTree
 
-from padforge import InputError, Spec
+from padforge import Spec
 from padforge.design import Morphology, crossings
 from padforge.design.contact import fibre_axes
 from padforge.design.objectives.penalties import penalties
 from padforge.design.objectives.rules import check_rules
 from padforge.design.paths.curves import common_stretches, flatten, slopes
-from padforge.design.settings import PUBLISHED, PadSettings, RulesSettings
+from padforge.design.settings import PadSettings, RulesSettings
 from tests.design.objectives.pads import bent, climbing, only, swung
 
 
@@ -29,19 +29,10 @@ def test_check_rules_of_the_straight_grid_at_its_limits():
         assert len(check_rules(grid, only(**broken))) == count
 
 
-@pytest.mark.parametrize(("key", "refused"), [("max_crossings", "none"), ("max_common_track_mm", 0.8)])
-def test_rules_settings_write_no_limit_as_any(key, refused):
+@pytest.mark.parametrize("key", ["max_crossings", "max_common_track_mm"])
+def test_rules_settings_write_no_limit_as_any(key):
     assert getattr(Spec({"rules": {key: "any"}}).section(RulesSettings), key) is None
     assert RulesSettings.model_validate({key: None}).model_dump()[key] == "any"
-    assert PUBLISHED["rules"] == RulesSettings(max_common_track_mm=None)
-    with pytest.raises(InputError, match=rf"\[rules\] {key}: got {refused!r}"):
-        Spec({"rules": {key: refused}}).section(RulesSettings)
-
-
-def test_violation_reads_as_one_line():
-    (close,) = check_rules(bent(1.95), only(min_gap_mm=0.8))
-    assert str(close).startswith("min_gap_mm: fibre 1 and fibre 2 at (0.0, -5.9) mm: 0.56")
-    assert "\n" not in str(close)
 
 
 def test_min_crossing_angle_is_measured_exactly():
