@@ -1,9 +1,11 @@
-"""Bags of other programs."""
+"""Bags of other programs, and messages as JSON."""
 
+import math
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
@@ -49,3 +51,14 @@ def write_bag(folder: Path, messages: Iterable[Message], plugin: str = "mcap", p
                 topics[topic] = writer.add_connection(topic, message.__msgtype__, typestore=STORE)
             writer.write(topics[topic], round(time_s * 1e9), STORE.serialize_cdr(message, message.__msgtype__))
     return next(file for file in folder.iterdir() if file.suffix in (".mcap", ".db3"))
+
+
+def as_json(value: Any) -> Any:
+    """Return a message of rosbags as the protocol writes it."""
+    if hasattr(value, "__msgtype__"):
+        return {name: as_json(part) for name, part in vars(value).items() if name[0].islower()}
+    if isinstance(value, np.ndarray):
+        value = value.tolist()
+    if isinstance(value, list):
+        return [as_json(part) for part in value]
+    return None if isinstance(value, float) and math.isnan(value) else value
