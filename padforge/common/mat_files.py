@@ -56,8 +56,11 @@ class Hdf5Reader:
 
     def describe(self, name: str) -> str:
         """Return the shape and the type of a dataset, for people."""
+        import h5py
+
         dataset = self._datasets[name]
-        dtype = "table" if dataset.dtype.names else dataset.dtype
+        is_text = h5py.check_string_dtype(dataset.dtype) is not None
+        dtype = "table" if dataset.dtype.names else "text" if is_text else dataset.dtype
         return f"{getattr(dataset, 'shape', ('n',))} {dtype}"
 
     def matlab_class(self, name: str) -> str:

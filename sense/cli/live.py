@@ -204,7 +204,7 @@ class EventPrinter:
             is_estimate = isinstance(event, Estimate)
             # echo flushes, so that each line appears at once
             if self._as_json:
-                values = event.to_dict() if is_estimate else asdict(event)
+                values = event.to_dict() if is_estimate else asdict(event) | {"text": event.text}
                 click.echo(json.dumps({"event": type(event).__name__.lower()} | values))
             elif not is_estimate or self._is_news(event):
                 echo(event.text)

@@ -23,6 +23,7 @@ from padforge.sense.formats.columns import (
     UNITS,
     ColumnEntry,
     check_import,
+    join_names,
     match_columns,
     naming_file,
     order_notes,
@@ -127,15 +128,19 @@ def _read_matched(table: Table, matched: Sequence[tuple[ColumnEntry, int]]) -> A
     """Read the columns of entries; one without a unit has that of the line of units, or of its header in brackets."""
     indices = list(dict.fromkeys(i for _, i in matched if i >= 0))
     values = table.read_columns(indices, [i for entry, i in matched if entry.quantity in "xy"])
-    stated = []
+    stated, converted = [], dict[str, list[str]]()
     for entry, i in matched:
         bracketed = re.search(r"[\[(]([^\])]+)[\])]$", table.names[i])
         unit = table.units[i].strip("[]() ") or (bracketed[1] if bracketed else "")
         if entry.factor is None and (factor := UNITS[entry.quantity].get(unit)):
             entry = entry._replace(factor=factor)
             if factor != 1:
-                table.notes.append(f"{entry.quantity} is in {unit}, as the file says")
+                converted.setdefault(unit, []).append(table.names[i])
         stated.append((entry, i))
+    table.notes += [
+        f"{join_names(names)} {'is' if len(names) == 1 else 'are'} in {unit}, as the file says"
+        for unit, names in converted.items()
+    ]
     return read_entries(stated, lambda i: values[:, indices.index(i)])
 
 

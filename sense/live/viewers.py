@@ -14,6 +14,7 @@ from padforge.common.server import HOST
 from padforge.common.validation import InputError, short_repr
 from padforge.sense.formats.ros_messages import FRAME, HEALTH, PRESSED, READINGS, TOPICS, TOUCHES
 from padforge.sense.live.outputs import Message
+from padforge.sense.localizer.doubts import OTHER_PAD
 
 SCENE = "/pad/scene"
 THICKNESS_MM = 1.0  # of the disc
@@ -181,4 +182,6 @@ class RerunOutput(contextlib.AbstractContextManager["RerunOutput"]):
             self._stream.log("pad/touch", disc)
         elif message.topic == HEALTH:
             text = ", ".join(f"fibre {fibre}: {state}" for fibre, state in enumerate(pad["states"], 1))
-            self._stream.log("health", rerun.TextLog(text, level="WARN" if "fault" in pad else "INFO"))
+            text += f"; {OTHER_PAD}" if pad["other_pad"] else ""
+            is_warning = "fault" in pad or pad["other_pad"]
+            self._stream.log("health", rerun.TextLog(text, level="WARN" if is_warning else "INFO"))

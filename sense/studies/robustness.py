@@ -173,9 +173,10 @@ def _describe(settings: Mapping[str, Any], rows: list[dict[str, Any]], maps: lis
     is_sample = any(row["subsets"] < row["of"] for row in rows)
     sample = f" ({MAX_SETS} of them, drawn at random, where there are more)" if is_sample else ""
     most = max(row["n_failed"] for row in rows)
+    fibres = "fibre" if most == 1 else "fibres"
     text = [
         f"Networks of {settings['hidden']} neurons were trained on {settings['presses']} presses of a serpentine, "
-        f"another one for every set of up to {most} failed fibres{sample}, and tested on {settings['test']} fresh "
+        f"another one for every set of up to {most} failed {fibres}{sample}, and tested on {settings['test']} fresh "
         f"presses; errors are in grid units ({settings['signals']} signals). Where there are few sets, each was "
         f"trained several times, so that every mean is of at least {MIN_NETWORKS} networks. The last column is the "
         "paper's own measure, taken over the serpentine, most of which was trained on."

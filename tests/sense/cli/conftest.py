@@ -2,7 +2,7 @@
 
 import shutil
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -44,6 +44,11 @@ def padforge_sense(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixtur
     return run
 
 
+def files_in(folder: str) -> dict[str, bytes]:
+    """The content of the files of a folder, by name."""
+    return {path.name: path.read_bytes() for path in Path(folder).iterdir() if path.is_file()}
+
+
 def make_model(folder: Path, presses: int) -> Path:
     """Make a recording `rec`, and `model`, quickly calibrated on it."""
     (folder / "pad.toml").write_text(SPEC)
@@ -64,6 +69,13 @@ def make_deep_presses(folder: Path) -> Path:
         localizer, _ = calibrate(recording, LocalizerSettings(members=1, hidden=32, layers=1, epochs=12))
     localizer.save(folder / "model")
     return folder
+
+
+@pytest.fixture(autouse=True)
+def two_moments() -> Iterator[None]:
+    """Errors are evaluated at two moments of a press, which takes longest of a short calibration."""
+    with few_moments():
+        yield
 
 
 @pytest.fixture(scope="session")

@@ -14,7 +14,7 @@ from padforge import sense
 COMMANDS = {
     "record": "record --out out/rec",
     "import": "import whole.csv --out out/rec",
-    "calibrate": "calibrate rec --seed 3 --out model",
+    "calibrate": "calibrate rec --seed 3 --without moments --out model",
     "export": "export rec out/table.csv",
     "locate": "locate --model model rec --out out/places.csv",
 }
@@ -50,7 +50,7 @@ def test_command_on_a_full_disk_leaves_all_or_nothing(few, name: str) -> None:
             assert {path.name: path.read_bytes() for path in out.iterdir()} == before
     assert few(*words)[0] == 0
     if name == "calibrate":
-        assert {path.name for path in out.iterdir()} == set(before)
+        assert {path.name for path in out.iterdir()} == set(before) - {"error_by_moment.png"}
         assert (out / "localizer.json").read_bytes() != before["localizer.json"]
     if name in ("record", "import"):
         assert len(sense.Recording.open("out/rec").down_command) == 60

@@ -1,7 +1,6 @@
 """`live`: what is shown of readings as they come, and to whom."""
 
 import json
-import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -11,37 +10,40 @@ import pytest
 
 from padforge.design import Morphology
 from padforge.sense import Recording
-from padforge.sense.cli.live import EventPrinter, view_lines
+from padforge.sense.cli.live import EventPrinter
 from padforge.sense.live import outputs
 from padforge.sense.live.outputs import LivePage
 from padforge.sense.live.pipeline import Estimate
 from padforge.sense.localizer.doubts import OTHER_PAD
 from padforge.sense.localizer.model import LocalizerModel
-from padforge.sense.localizer.single_press import MIN_PRESSES
 from padforge.sense.rig import simulated_board
 from padforge.sense.rig.devices import RigFault
 from padforge.sense.settings import RigSettings
 from padforge.sense.simulation.simulated_recording import simulate
+from tests.helpers.golden import Golden
 from tests.helpers.page_names import names_in_view
 from tests.sense.conftest import first_presses
 
 
 @pytest.fixture
 def replay(few) -> Callable[..., tuple[int, str, str]]:
-    """Of six presses on a pad that lay with its tracks up."""
-    replace(first_presses(Recording.open("rec"), 6), source={"rig": {"mirrored": True}}).save("mirrored", {})
+    """Of four presses on a pad that lay with its tracks up."""
+    replace(first_presses(Recording.open("rec"), 4), source={"rig": {"mirrored": True}}).save("mirrored", {})
     command = ("live", "--port", "0", "--model", "model", "--replay", "mirrored", "--speed", "1e6")
     return lambda *words: few(*command, *words)
 
 
-def test_live_says_that_another_pad_is_pressed(enough, views: list[dict]) -> None:
-    simulate(Morphology.straight(2), RigSettings(presses=30, seed=14)).save("again", {})
+def test_live_says_that_another_pad_is_pressed(enough, views: list[dict], monkeypatch: pytest.MonkeyPatch) -> None:
+    """As early as after eight presses."""
+    for module in ("live.pipeline", "localizer.single_press"):
+        monkeypatch.setattr(f"padforge.sense.{module}.MIN_PRESSES", 8)
+    simulate(Morphology.straight(2), RigSettings(presses=12, seed=14)).save("again", {})
     command = ("live", "--port", "0", "--model", "model", "--replay", "again", "--speed", "1e6", "--json")
     code, out, _ = enough(*command)
     events = [json.loads(line) for line in out.splitlines()]
     (said,) = [event for event in events if event["event"] == "otherpad"]
     assert (code, said["text"]) == (1, OTHER_PAD)
-    assert said["press"] >= MIN_PRESSES - 1
+    assert said["press"] >= 7
     later = events[events.index(said) + 1 :]
     assert {(event["event"], *event["failed"]) for event in later} == {("estimate",)}
     assert {event["unlike"] for event in events if event["event"] == "estimate"} <= {True, False}
@@ -59,41 +61,23 @@ def views(monkeypatch: pytest.MonkeyPatch) -> list[dict]:
 def test_live_replays_a_recording(replay, views: list[dict]) -> None:
     code, out, err = replay("--json")
     assert code == 0, err
-    assert "http://127.0.0.1:" in err
-    assert "simulated" not in err
     told = [json.loads(line) for line in out.splitlines()]
     assert {each["event"] for each in told} == {"estimate"}
     assert not [key for key in told[0] if key.startswith(("depth", "force"))]
     final = [each["press"] for each in told if each["final"]]
     assert final == list(range(len(final)))
-    assert 5 <= len(final) <= 6
+    assert 3 <= len(final) <= 4
     assert len(told) > 20 * len(final)  # every reading
     assert {view["mirrored"] for view in views} == {True}
     assert [view["ended"] for view in views][-2:] == ["", "ended"]
     assert names_in_view("live.html") <= views[-1].keys()
-    code, plain, _ = replay()
-    assert code == 0, err
-    first = told[0]
-    lines = plain.splitlines()
-    assert lines[0].startswith(f"press 0: {first['x_mm']:.1f}, {first['y_mm']:.1f} mm, within ")
-    assert lines[0].endswith(f"({first['since_s']:.2f} s after the touch)")
-    assert 2 * len(final) <= len(lines) < 12 * len(final)
-    last = [line.split(":")[0] for line in lines if line.endswith("after the lift)")]
-    assert set(last) == {f"press {press}" for press in final}
 
 
-def test_live_sends_to_tcp(replay) -> None:
+def test_live_sends_to_viewers_and_programs(replay, golden: Golden) -> None:
     token = "a word of sixteen"
-    code, _, err = replay("--tcp", "0", "--host", "127.0.0.1", "--token", token)
+    code, _, err = replay("--tcp", "0", "--token", token, "--foxglove", "0", "--rerun", "pad.rrd")
     assert code == 0, err
-    assert re.search(r"^page: http://127\.0\.0\.1:\d+/\?token=a\+word\+of\+sixteen ", err, re.MULTILINE)
-    assert re.search(r"^lines: 127\.0\.0\.1:\d+$", err, re.MULTILINE)
-
-
-def test_live_sends_to_viewers(replay) -> None:
-    code, _, err = replay("--foxglove", "0", "--rerun", "pad.rrd")
-    assert code == 0, err
-    assert re.search(r"^foxglove: ws://127\.0\.0\.1:\d+$", err, re.MULTILINE)
+    golden("cli/live_addresses.txt", err, forget=[r"(?<=127\.0\.0\.1:)\d+"])
     assert Path("pad.rrd").stat().st_size > 10_000
 
 
@@ -134,23 +118,3 @@ def test_printed_estimates_say_more_than_those_before(capsys: pytest.CaptureFixt
         printer.print([Estimate(0, 0.0, now_s, *moment)])
     shown = [line.rpartition("(")[2][:4] for line in capsys.readouterr().out.splitlines()]
     assert shown == ["0.00", "0.20", "0.30", "0.40", "0.60", "0.70"]
-
-
-def test_live_lines_number_fibres_from_one() -> None:
-    fibres = [{"swing": swing, "state": state} for swing, state in ((0.5, "sound"), (None, "dead"))]
-    lines = view_lines({"pressed": False, "presses": [], "fibres": fibres, "faults": ["fibre 2 was dead"]})
-    assert lines[:2] == ["waiting for a press", "no press yet"]
-    assert [line.split()[:2] for line in lines[2:4]] == [["fibre", "1"], ["fibre", "2"]]
-    assert lines[4] == "fibre 2 was dead"
-
-
-def test_live_shows_depth_and_force_of_models_that_estimate_them(deep, views) -> None:
-    first_presses(Recording.open("rec"), 8).save("short", {})
-    words = ("live", "--replay", "short", "--speed", "1e6", "--port", "0", "--model", "model")
-    told = [json.loads(line) for line in deep(*words, "--json")[1].splitlines()]
-    depths_mm = [each["depth_mm"] for each in told if each["final"]]
-    assert 0 < min(depths_mm) < 3 < max(depths_mm) < 6
-    assert all(each["force_r90_n"] > 0 and each["depth_r90_mm"] > 0 for each in told)
-    assert {view["mirrored"] for view in views} == {False}
-    first = deep(*words)[1].splitlines()[0]
-    assert f"{told[0]['depth_mm']:.1f} ± {told[0]['depth_r90_mm']:.1f} mm deep, {told[0]['force_n']:.1f} ± " in first

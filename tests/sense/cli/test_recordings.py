@@ -82,18 +82,6 @@ def test_export_writes_a_bag_with_predictions_that_import_reads(few) -> None:
     assert few("locate", "--model", "model", "r.mcap", "--out", "places.csv")[0] == 0
 
 
-def test_export_writes_faults_of_models_with_health(enough) -> None:
-    assert enough("export", "rec", "r.mcap", "--model", "model")[0] == 0
-    assert topics("r.mcap")["/pad/health"] >= 1
-
-
-def test_export_writes_a_lerobot_dataset(few) -> None:
-    assert few("export", "rec", "set", "--format", "lerobot", "--model", "model")[:2] == (0, "rec -> set\n")
-    info = json.loads(Path("set/meta/info.json").read_text())
-    assert info["total_episodes"] == 60
-    assert "observation.touch" in info["features"]
-
-
 def test_recording_line_counts_what_is_unknown_and_missing() -> None:
     times_s = np.arange(40) / 8
     readings = np.full((40, 3), 1.5)

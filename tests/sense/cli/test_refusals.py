@@ -17,6 +17,7 @@ from padforge.sense import Recording
 from padforge.sense.live.outputs import LivePage
 from padforge.sense.settings import RigSettings
 from padforge.sense.simulation.simulated_recording import simulate
+from tests.sense.conftest import first_presses
 
 ROWS = """
 import noise.mat --out r                        | noise.mat
@@ -39,7 +40,7 @@ locate --model model rec --out pad.toml/p.csv   | pad.toml/p.csv: cannot be writ
 locate --model model rec --exclude-fibres 1,0 --out p.csv | padforge: fibre 0: no such fibre, allowed are 1 to 4
 health --model model rec                        | health
 calibrate rec --seed 5 --out studied            | localizer.json: fibre_loss.json was made from it; choose another
-recalibrate --model model rec --out studied     | localizer.json: fibre_loss.json was made from it; choose another
+recalibrate --model model less --out studied    | localizer.json: fibre_loss.json was made from it; choose another
 identify rec {straight} --out designed          | twin.json: design.json was made from it; choose another --out
 recalibrate --model model rec {five} --out n    | pad has 10 fibres, the recording 4; expected as many
 calibrate rec {five} --out n                    | pad has 10 fibres, the recording 4; expected as many
@@ -93,6 +94,7 @@ def workshop(few_presses: Path, tmp_path_factory: pytest.TempPathFactory) -> Pat
     (folder / "none.toml").write_text('[rig]\nport = "none"\n')
     (folder / "3.toml").write_text('[rig]\nport = "none"\nchannels = [4, 0, 7]\n')
     simulate(Morphology.straight(3), RigSettings(presses=30)).save(folder / "other", {})
+    first_presses(Recording.open(folder / "rec"), 20).save(folder / "less", {})
     shutil.copytree(folder / "model", folder / "studied")
     made_by = json.loads((folder / "model/localizer.json").read_text())["provenance"]
     (folder / "studied/fibre_loss.json").write_text(json.dumps({"provenance": {"inputs": {"localizer": made_by}}}))

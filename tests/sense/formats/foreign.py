@@ -1,9 +1,11 @@
-"""Bags of other programs."""
+"""Bags of other programs, and messages as JSON."""
 
+import math
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from rosbags.rosbag1 import Writer as Ros1Writer
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
@@ -62,3 +64,14 @@ def write_ros1_bag(path: Path, topic: str, times_s: Any, values: Any) -> Path:
             message = store.serialize_ros1(store.types[kind](layout=layout, data=row), kind)
             writer.write(connection, round(time_s * 1e9), message)
     return path
+
+
+def as_json(value: Any) -> Any:
+    """Return a message of rosbags as the protocol writes it."""
+    if hasattr(value, "__msgtype__"):
+        return {name: as_json(part) for name, part in vars(value).items() if name[0].islower()}
+    if isinstance(value, np.ndarray):
+        value = value.tolist()
+    if isinstance(value, list):
+        return [as_json(part) for part in value]
+    return None if isinstance(value, float) and math.isnan(value) else value

@@ -26,6 +26,7 @@ from padforge.sense.live.outputs import JsonLines, Message, MessageBuilder
 from padforge.sense.localizer.model import LocalizerModel
 from tests.docs.pages import BLOCK, ROOT
 from tests.sense.conftest import first_presses
+from tests.sense.formats.foreign import as_json
 
 TOKEN = "a word of sixteen"
 SECONDS = 1_800_000_000
@@ -192,17 +193,6 @@ def messages(deep_recording: Recording, deep_localizer: LocalizerModel) -> list[
         block = six.times_s[first : first + 10], six.readings[first : first + 10]
         messages += builder.build(*block, [*pipeline.feed(*block), *([fault] if first == 100 else [])])
     return messages
-
-
-def as_json(value: Any) -> Any:
-    """Return a message of rosbags as the protocol writes it."""
-    if hasattr(value, "__msgtype__"):
-        return {name: as_json(part) for name, part in vars(value).items() if name[0].islower()}
-    if isinstance(value, np.ndarray):
-        value = value.tolist()
-    if isinstance(value, list):
-        return [as_json(part) for part in value]
-    return None if isinstance(value, float) and math.isnan(value) else value
 
 
 @pytest.mark.parametrize("distribution", ["ROS2_HUMBLE", "ROS2_KILTED"])

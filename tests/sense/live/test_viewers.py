@@ -30,7 +30,7 @@ SENT = [
 ]
 
 
-class Client:
+class FoxgloveClient:
     """The little of a WebSocket client that a subscriber needs (RFC 6455)."""
 
     def __init__(self, port: int) -> None:
@@ -77,7 +77,7 @@ def test_foxglove_gets_messages_and_a_scene() -> None:
     with FoxgloveOutput(0, **AREA) as output:
         for message in SENT:
             output.send(message)
-        client = Client(int(output.url.rpartition(":")[2]))
+        client = FoxgloveClient(int(output.url.rpartition(":")[2]))
         messages = client.messages({READINGS, PRESSED, TOUCHES, HEALTH, SCENE})
         channel, content = next(messages)  # the health at first, though it was sent before
         assert (channel["topic"], json.loads(content)) == (HEALTH, SENT[0].msg)

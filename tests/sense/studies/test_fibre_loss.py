@@ -3,17 +3,15 @@
 import json
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
-from matplotlib.figure import Figure
 
 from padforge.common.validation import InputError
 from padforge.sense import Recording, evaluate
 from padforge.sense.localizer.model import LocalizerModel
 from padforge.sense.studies import fibre_loss
-from padforge.sense.studies.fibre_loss import ONE, RETRAINED, FibreLoss, MethodErrors, fibre_loss_study
+from padforge.sense.studies.fibre_loss import ONE, RETRAINED, MethodErrors, fibre_loss_study
 from tests.helpers.door import Ended, call
 
 
@@ -94,38 +92,3 @@ def test_fibre_loss_command_writes_document_and_figure() -> None:
     assert (ended.code, json.loads(ended.out)["methods"][ONE]["maps"][-1]["failed"]) == (0, [1, 3])
     assert json.loads(ended.out) == json.loads(Path("out", "fibre_loss.json").read_text())
     assert sorted(path.name for path in Path("out").iterdir()) == ["fibre_loss.json", "fibre_loss.png"]
-
-
-def test_draw_fibre_loss_has_y_upwards(monkeypatch: pytest.MonkeyPatch) -> None:
-    figures: list[Figure] = []
-    monkeypatch.setattr(fibre_loss, "save_figure", lambda figure, path: figures.append(figure))
-    errors, by_subset = [{"n_failed": 0, "subsets": 1, "mean_mm": 1.0}], [{"failed": [], "mean_mm": 1.0}]
-    cells = [{"x_mm": 0.0, "y_mm": y_mm, "mean_mm": mean_mm} for y_mm, mean_mm in ((-5.0, 1.0), (5.0, 9.0))]
-    methods = {"one network": MethodErrors(errors, by_subset, [{"failed": [], "by_position": cells}])}
-    fibre_loss.draw_fibre_loss(FibreLoss("random", 2, 2, methods, {}), Path("none.png"))
-    (image,) = (image for axes in figures[0].axes for image in axes.images)
-    assert image.origin == "lower"
-    assert np.asarray(image.get_array())[-1, 0] == 9.0
-    assert image.get_extent()[3] > 5
-
-
-def test_errors_by_loss_are_bars_side_by_side_with_a_dot_a_set() -> None:
-    errors = [{"n_failed": 0, "subsets": 1, "mean_mm": 1.0}, {"n_failed": 1, "subsets": 2, "mean_mm": 3.0}]
-    by_subset = [
-        {"failed": [], "mean_mm": 1.0},
-        {"failed": [1], "mean_mm": 4.0},
-        {"failed": [0], "mean_mm": 2.0},
-    ]
-    methods = {name: MethodErrors(errors, by_subset, []) for name in ("one network", "retrained")}
-    axes: Any = Figure().add_subplot()
-    fibre_loss.draw_errors_by_loss(axes, methods, "Fibre loss, 9")
-    middles = [patch.get_x() + patch.get_width() / 2 for patch in axes.patches]
-    assert middles == pytest.approx([-0.18, 0.82, 0.18, 1.18])
-    assert [patch.get_height() for patch in axes.patches] == [1, 3, 1, 3]
-    for dots, middle in zip(axes.collections, middles, strict=True):
-        x, y = dots.get_offsets().T
-        assert x.mean() == pytest.approx(middle)
-        assert y.tolist() in ([1], [2, 4])
-        assert len(set(x.tolist())) == len(x)
-    assert [text.get_text() for text in axes.texts[:4]] == ["1.00", "3.00", "1.00", "3.00"]
-    assert [label.get_text() for label in axes.get_xticklabels()] == ["all fibres\n1 set", "1 failed\n2 sets"]

@@ -4,23 +4,19 @@ import json
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from matplotlib.figure import Figure
 
 from padforge.common.validation import InputError
 from padforge.sense import Recording
 from padforge.sense.settings import LocalizerSettings as Options
 from padforge.sense.studies.learning_curve import (
     LearningCurve,
-    draw_learning_curve,
     fit_power_law,
     learning_curve,
-    learning_curve_lines,
     power_law,
 )
 from tests.helpers.door import called
@@ -103,30 +99,3 @@ def test_interrupt_ends_a_learning_curve_at_once(recording: Recording) -> None:
     with pytest.raises(KeyboardInterrupt):
         learning_curve(recording, long, on_progress=interrupt)
     assert max(shares) < 0.5
-
-
-def test_learning_curve_is_told_and_drawn_with_its_forecast(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Errors of 1 + 8 / sqrt(n) mm after 16 and 64 presses."""
-    points = [
-        {"presses": 16, "mean_mm": 3.0, "standard_error_mm": 0.25},
-        {"presses": 64, "mean_mm": 2.0, "standard_error_mm": 0.125},
-    ]
-    fit = {"floor_mm": 1.0, "factor_mm": 8.0, "exponent": 0.5}
-    forecast = {"presses": 256, "mean_mm": 1.5, "low_mm": 1.25, "high_mm": 2.25}
-    curve = LearningCurve(45, points, fit, forecast, "record more", {}, {})
-    lines = learning_curve_lines(curve)
-    assert lines[0] == "error in mm on 45 presses never trained on"
-    assert [line.split() for line in lines[2:4]] == [["16", "3.00", "0.25"], ["64", "2.00", "0.12"]]
-    assert lines[4:] == ["fit: 1.00 mm + 8 mm / presses^0.50", "record more"]
-    figures: list[Figure] = []
-    monkeypatch.setattr(
-        "padforge.sense.studies.learning_curve.save_figure", lambda figure, path: figures.append(figure)
-    )
-    draw_learning_curve(curve, Path("none.png"))
-    axes: Any = figures[0].axes[0]
-    fitted = axes.lines[0].get_xydata()
-    np.testing.assert_allclose(fitted[[0, -1]], [[16, 3.0], [256, 1.5]])
-    measured, expected = axes.containers
-    (bars,), (interval,) = measured[2], expected[2]
-    np.testing.assert_allclose(bars.get_segments(), [[[16, 2.5], [16, 3.5]], [[64, 1.75], [64, 2.25]]])
-    np.testing.assert_allclose(interval.get_segments(), [[[256, 1.25], [256, 2.25]]])

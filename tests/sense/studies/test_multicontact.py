@@ -64,32 +64,3 @@ def test_fit_pairs_does_not_depend_on_the_order_except_for_fixed_labels(method: 
             for order in (pairs, shuffled)
         )
     assert np.allclose(first, second, atol=1e-6) == (method != LABELLED)
-
-
-def test_multicontact_study_errs_by_half_the_distance_where_it_predicts_the_midpoint_for_both() -> None:
-    """Of pairs 1, 2, ... grid units apart; the free method predicts them exactly, but in the other order."""
-    study = multicontact_study({"random": PAD})
-    distance = np.arange(1.0, 33.0)
-    pressed = np.zeros((32, 2, 2))
-    pressed[:, 1, 0] = distance
-    midpoint = np.repeat(pressed.mean(axis=1, keepdims=True), 2, axis=1)
-    predicted = dict.fromkeys(METHODS, midpoint) | {"free": pressed[:, ::-1]}
-    states = [{"pressed": pressed, "predicted": predicted[method]} for method in METHODS]
-    counts = np.array([[5, 1, 0, 0], [0, 5, 0, 0], [0, 0, 9, 0], [0, 0, 5, 0]])
-    result = study.conclude([*states, {"confusions": counts}])
-    rows = {row["method"]: row for row in result.rows}
-    half_mm = PAD.unit_mm * distance.mean() / 2
-    for method in set(METHODS) - {"free"}:
-        row = rows[method]
-        assert (row["error_grid"], row["of_fixed_labels"]) == pytest.approx((distance.mean() / 2, 1.0))
-        assert (row["error_mm"], row["midpoint_error_mm"]) == pytest.approx((half_mm, half_mm))
-        assert row["resolution_mm"] is None
-    assert rows[LABELLED]["error_by_labels_mm"] == pytest.approx(half_mm)
-    free = rows["free"]
-    assert (free["error_mm"], free["of_fixed_labels"]) == (0, 0)
-    assert free["resolution_mm"] == pytest.approx(1.5 * PAD.unit_mm)  # the nearest two pairs of 32, in 16 groups
-    assert rows[COUNTING]["accuracy_percent"] == pytest.approx(100 * 19 / 25)
-    assert rows[COUNTING]["majority_percent"] == pytest.approx(100 * 9 / 25)
-    curve = result.extra["curves"][0]
-    assert curve["distance_mm"] == pytest.approx(PAD.unit_mm * (1.5 + 2 * np.arange(16)))
-    assert curve["error_mm"] == pytest.approx(np.array(curve["distance_mm"]) / 2)

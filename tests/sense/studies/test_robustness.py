@@ -3,7 +3,6 @@
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -90,32 +89,6 @@ def test_every_mean_is_over_sixteen_networks_or_more(tmp_path: Path, monkeypatch
     by_size = {size: {count for failed, count in trained.items() if len(failed) == size} for size in range(3)}
     assert by_size == {0: {16}, 1: {4}, 2: {3}}
     assert [row["of"] for row in document["rows"]] == [1, 4, 6]
-
-
-def test_figure_and_text_have_the_numbers_of_the_rows() -> None:
-    rows = []
-    for pad, means in (("plain", (0.1, 0.3)), ("bent", (0.05, 0.2))):
-        rows += [
-            {"pad": pad, "n_failed": n, "subsets": 1, "of": 1 + n, "mean": mean, "mean_mm": 10 * mean}
-            | {"std": 0.01 + n, "max": 2 * mean}
-            for n, mean in enumerate(means)
-        ]
-    settings = {"pads": {"plain": {}, "bent": {}}, "hidden": 7, "presses": 16, "test": 9, "signals": "exact"}
-    cells = np.arange(robustness.SIDE**2).reshape(robustness.SIDE, -1) / 1000
-    maps = [
-        {"pad": pad, "failed": failed, "extent": [0, 1, 0, 1], "errors": (cells * (1 + len(failed))).tolist()}
-        for pad in ("plain", "bent")
-        for failed in ([], [2])
-    ]
-    study = robustness_study(PADS, max_failures=1, presses=16)
-    figure: Any = study.draw({"settings": settings, "rows": rows, "maps": maps})
-    bars, *panels = figure.axes
-    assert [patch.get_height() for patch in bars.patches] == [0.1, 0.3, 0.05, 0.2]
-    images = [panel.images[0].get_array() for panel in panels if panel.images]
-    for errors, changed, change in (images[:3], images[3:]):  # of a pad: both maps, and the change of the second
-        np.testing.assert_allclose(errors, cells)
-        np.testing.assert_allclose(changed, 2 * cells)
-        np.testing.assert_allclose(change, cells)
 
 
 @pytest.mark.usefixtures("blank")

@@ -59,20 +59,3 @@ def test_scaling_study_maps_errors_by_x_along_rows_and_y_up_columns() -> None:
     (panel,) = study.conclude([state] * len(study.tasks)).extra["maps"]
     errors = np.array(panel["errors"])
     assert (errors[0, -1], errors[-1, 0], errors[-1, -1], errors.sum()) == (3.0, 1.0, 2.0, 6.0)
-
-
-def test_scaling_study_summarizes_errors_by_method_and_grid() -> None:
-    """The tasks come largest grid first, the rows method by method; an error of 1, 2 or 9 per grid and method."""
-    study = scaling_study({"square": Morphology.straight(2)}, grids=(4, 8))
-    names = [task.name for task in study.tasks]
-    assert names[0] == "square, 8 x 8, published"
-    base = np.array([1.0, 2.0, 9.0]) / 100
-    states = [
-        {"errors": base * (8 - number), "positions": np.ones((3, 2)), "seconds": np.array(2.126), "epochs": np.array(7)}
-        for number in range(len(names))
-    ]
-    result = study.conclude(states)
-    assert [(row["method"], row["grid"]) for row in result.rows[:2]] == [("published", 4), ("published", 8)]
-    row = result.rows[1]
-    assert [row[name] for name in ("mean", "median", "p95")] == pytest.approx([0.32, 0.16, 0.08 * 8.3])
-    assert (row["percent_of_side"], row["epochs"], row["seconds"]) == (pytest.approx(100 * 0.32 / 8), 7, 2.13)

@@ -1,9 +1,7 @@
 """The study of sensitivity to the object, in small."""
 
 from pathlib import Path
-from typing import Any
 
-import numpy as np
 import pytest
 
 from padforge import InputError
@@ -63,41 +61,3 @@ def test_study_finds_that_larger_objects_are_localized_better(tmp_path: Path, mo
     means = {tuple(row[key] for key in keys): row["mean"] for row in document["rows"]}
     assert means[1.0, 30, 1.0, 30] < 0.5 * means[0.6, 30, 0.6, 30]
     assert means[1.0, 30, 0.6, 30] > 1.5 * means[0.6, 30, 0.6, 30]
-
-
-def test_sensitivity_study_compares_radii_over_depths_and_depths_over_radii() -> None:
-    """Networks err by 1, 2 or 3 units for the radii, twice as much at the second depth, and by 60 for other objects."""
-    study = sensitivity_study(PADS)
-    sizes, others = study.settings["tool_radius_mm"], study.settings["depth_mm"]
-    trained = np.outer([1.0, 2.0], np.arange(1.0, len(sizes) + 1)).ravel()
-    assert (len(study.tasks), len(others)) == (len(trained), 2)
-    states = []
-    for number, error in enumerate(trained):
-        errors = np.full((2, len(trained)), 60.0)
-        errors[:, number] = error - 0.5, error + 0.5
-        states.append({"errors": errors})
-    result = study.conclude(states)
-    unit_mm = PADS["square"].unit_mm
-    row = result.rows[len(trained) + 1]
-    names = ("trained_tool_radius_mm", "trained_depth_mm", "tool_radius_mm", "depth_mm", "mean", "std", "mean_mm")
-    assert [row[name] for name in names] == pytest.approx([sizes[1], others[0]] * 2 + [2.0, 0.5, 2 * unit_mm])
-
-
-def test_figure_has_errors_by_size_and_a_matrix_of_trained_by_tested_objects() -> None:
-    """Of sizes 2 and 4 mm, 1 and 3 mm deep: in the curves every object is tested with itself."""
-    objects = [(size, depth) for depth in (1.0, 3.0) for size in (2.0, 4.0)]
-    matrix = np.arange(1.0, 17).reshape(4, 4)
-    rows = [
-        {"pad": "a", "trained_tool_radius_mm": trained[0], "trained_depth_mm": trained[1]}
-        | {"tool_radius_mm": tested[0], "depth_mm": tested[1], "mean_mm": float(matrix[i, j])}
-        for i, trained in enumerate(objects)
-        for j, tested in enumerate(objects)
-    ]
-    settings = {"pads": {"a": {}}, "contact": Contact().model_dump(mode="json")}
-    settings |= {"tool_radius_mm": [2.0, 4.0], "depth_mm": [1.0, 3.0]}
-    figure: Any = sensitivity_study(PADS).draw({"rows": rows, "settings": settings})
-    by_size, errors = figure.axes
-    assert [line.get_xydata().tolist() for line in by_size.lines] == [[[2, 1], [4, 6]], [[2, 11], [4, 16]]]
-    assert errors.images[0].get_array().tolist() == matrix.tolist()
-    numbers = {text.get_position(): text.get_text() for text in errors.texts}
-    assert (numbers[1, 0], numbers[0, 1]) == ("2.00", "5.00")  # the column is what is tested with

@@ -1,0 +1,145 @@
+"""What commands print and write of small recordings, kept as a whole.
+
+Numbers that come from trained networks may differ by some per cent.
+"""
+
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from padforge.design import Morphology
+from padforge.sense import Recording
+from padforge.sense.localizer import training
+from padforge.sense.localizer.model import LocalizerModel
+from padforge.sense.settings import RigSettings
+from padforge.sense.simulation.simulated_recording import simulate
+from tests.helpers.golden import Golden
+from tests.sense.cli.conftest import Run, files_in
+from tests.sense.conftest import first_presses
+
+RTOL = 0.05
+"""Of what a network was trained for."""
+
+
+class Session:
+    """A terminal session: the commands, what they printed, and their exit codes where these are not 0."""
+
+    def __init__(self, run: Run) -> None:
+        self.run, self.lines = run, list[str]()
+
+    def __call__(self, words: str) -> str:
+        code, out, err = self.run(*words.split())
+        ended = [f"(exit {code})"] if code else []
+        self.lines += [f"$ padforge sense {words}", *err.splitlines(), *out.splitlines(), *ended, ""]
+        return out
+
+    def head(self, file: str, lines: int) -> None:
+        """Show the first lines of a file."""
+        self.lines += [f"$ head -{lines} {file}", *Path(file).read_text().splitlines()[:lines], ""]
+
+    @property
+    def text(self) -> str:
+        return "\n".join(self.lines)
+
+
+def shortened(value: Any, at_most: int = 3) -> Any:
+    """JSON with the first of long lists alone, and their number."""
+    if isinstance(value, dict):
+        return {name: shortened(part) for name, part in value.items()}
+    if isinstance(value, list):
+        more = [f"and {len(value) - at_most} more"] if len(value) > at_most else []
+        return [shortened(part) for part in value[:at_most]] + more
+    return value
+
+
+@pytest.mark.usefixtures("blank", "calibrate_once")
+def test_session_of_few_presses(few: Run, golden: Golden, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A calibration is evaluated, exported and followed; presses in the wrong unit and a misplaced one are doubtful."""
+    monkeypatch.setattr(training, "RETRAINING_STEPS", 15)
+    monkeypatch.setattr("padforge.sense.deploy.onnx_export.N_TRIALS", 3)
+    good, session, before = Recording.open("rec"), Session(few), files_in("model")
+    shutil.copytree("rec", "torn")
+    Path("torn/readings.bin").write_bytes(Path("rec/readings.bin").read_bytes()[:-100])
+    first_presses(good, 4).save("short", {})
+    replace(good, presses_mm=good.presses_mm / 1000).save("metres", {})
+    presses_mm = good.presses_mm.copy()
+    presses_mm[7] = 250, 3
+    replace(good, presses_mm=presses_mm).save("typo", {})
+    Morphology.straight(2).save(Path("plan.json"))
+    session("calibrate rec --out new")
+    session("calibrate metres --out m --without moments --without figures")
+    session("evaluate --model model typo --max-failures 1")
+    session("evaluate --model model torn --max-failures 0")
+    session("locate --model model rec")
+    session.head("places.csv", 4)
+    session("export short short.csv")
+    session.head("short.csv", 2)
+    session("import short.csv")
+    session("import --show short.csv")
+    session("export short short.mcap --model model")
+    session("import short.mcap --out again")
+    session("export short set --format lerobot --model model")
+    session("deploy --model model short localizer.onnx")
+    session("record --presses 20 --seed 2 --out later/recording")
+    session("recalibrate --model model later/recording --morphology plan.json")
+    golden("cli/few.txt", session.text, rtol=RTOL, forget=[r"[\d.]+(?= µm)"])
+    assert files_in("model") == before
+    assert Path("later/localizer.json").read_bytes() != before["localizer.json"]
+    document = shortened(json.loads(few("evaluate", "--model", "model", "rec", "--max-failures", "1", "--json")[1]))
+    assert document.pop("provenance")
+    golden("cli/evaluate.json", document, rtol=RTOL)
+    document = shortened(json.loads(Path("later/recalibration.json").read_text()))
+    assert document.pop("provenance")
+    golden("cli/recalibration.json", document, rtol=RTOL)
+
+
+def test_session_of_depth_and_force(deep: Run, golden: Golden) -> None:
+    first_presses(Recording.open("rec"), 3).save("short", {})
+    session = Session(deep)
+    session("evaluate --model model rec --max-failures 1")
+    session("locate --model model rec")
+    session.head("places.csv", 4)
+    session("live --port 0 --model model --replay short --speed 1e6")
+    session("live --port 0 --model model --replay short --speed 1e6 --json")
+    del session.lines[next(i for i, line in enumerate(session.lines) if "--json" in line) + 6 :]
+    golden("cli/deep.txt", session.text, rtol=RTOL, forget=[r"127\.0\.0\.1:\d+"])
+
+
+def test_session_of_faulty_fibres_and_of_another_pad(enough: Run, golden: Golden) -> None:
+    """A fibre is stuck from the 60th of the last 120 presses on, another one has moved, and a pad was cast again."""
+    whole, session = Recording.open("rec"), Session(enough)
+    readings, first = np.array(whole.readings), whole.up_command[239]
+    readings[whole.down_command[300] - 15 :, 2] = readings[whole.down_command[300] - 15, 2]
+    edges = whole.down_command[240:] - first, whole.up_command[240:] - first
+    stuck = Recording(readings[first:], whole.times_s[first:], whole.presses_mm[240:], *edges)
+    stuck.save("stuck", {})
+    part = first_presses(whole, 120)
+    moved = np.array(part.readings)
+    moved[:, 1] += 0.33
+    replace(part, readings=moved).save("moved", {})
+    again = simulate(Morphology.straight(2), RigSettings(presses=30, seed=14))
+    again.save("again", {})
+    session("health --model model rec")
+    for name in ("stuck", "moved", "again"):
+        session(f"health --model model {name}")
+        session(f"locate --model model {name} --out {name}.csv")
+    session("locate --model model stuck --exclude-fibres 3 --out masked.csv")
+    session("locate --model model moved --exclude-fibres 2")
+    session("evaluate --model model again --max-failures 0")
+    golden("cli/health.txt", session.text, rtol=RTOL)
+    found = {name: json.loads(enough("health", "--model", "model", name, "--json")[1]) for name in ("stuck", "moved")}
+    golden("cli/health.json", found, rtol=RTOL)
+    # indices in JSON, numbers in text
+    assert found["stuck"]["findings"][0]["fibres"] == [2]
+    assert found["moved"]["shifts"][0]["fibres"] == [1]
+    expected_mm = LocalizerModel.load("model").predict(again).positions_mm  # no fibre is masked
+    np.testing.assert_allclose(np.loadtxt("again.csv", delimiter=",", skiprows=1)[:, 1:3], expected_mm, atol=1e-4)
+    places, masked = (Path(name).read_text().splitlines()[1:] for name in ("stuck.csv", "masked.csv"))
+    since = found["stuck"]["findings"][0]["since"]
+    assert places[since:] == masked[since:]
+    assert not set(places[:since]) & set(masked[:since])

@@ -1,0 +1,141 @@
+"""What every format holds of one small recording, and what `import --show` says of files, kept as a whole."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+import scipy.io
+from rosbags.rosbag2 import Reader
+
+from padforge.sense import Recording, export_bag, export_csv, export_hdf5, export_lerobot
+from padforge.sense.formats.annotations import FaultAnnotation, ModelAnnotations
+from padforge.sense.formats.import_export import describe_file, import_file
+from tests.helpers.golden import Golden, json_text
+
+from .foreign import STORE, array, as_json, make, pose, write_bag
+
+NAN = float("nan")
+
+
+@pytest.fixture
+def three() -> Recording:
+    """Three presses of two fibres in fifteen readings at 8 Hz; a position and a force are not known."""
+    readings = np.round(2 - np.outer(np.arange(15) % 5 > 2, [0.25, 0.125]) + np.arange(15)[:, None] / 100, 3)
+    readings[1, 1] = NAN
+    return Recording(
+        readings,
+        100 + np.arange(15) / 8,
+        np.array([[1.0, -2.0], [3.5, 4.0], [NAN, NAN]]),
+        np.array([3, 8, 13]),
+        np.array([5, 10, 15]),
+        {"kind": "test", "rig": {"mirrored": False}},
+        depths_mm=np.array([5.0, 2.5, 4.0]),
+        reached_mm=np.array([4.75, 2.25, NAN]),
+        forces_n=np.array([1.5, NAN, 0.75]),
+    )
+
+
+@pytest.fixture
+def annotations() -> ModelAnnotations:
+    """A model that predicts depth for two of the presses, and has named a fibre at the second."""
+    positions = np.array([[1.5, -2.5], [3.0, 4.5], [0.0, 1.0]]), np.array([[0.5, 0.25], [1.0, 2.0], [3.0, 4.0]])
+    depths = np.array([4.0, 2.0, NAN]), np.array([0.5, 0.25, NAN])
+    fault = FaultAnnotation(1, (1,), "stuck", "fibre 2 reads one value since press 1")
+    return ModelAnnotations(*positions, np.array([1.25, 2.25, 9.0]), *depths, [fault], (0,))
+
+
+def test_csv(three: Recording, golden: Golden, tmp_path: Path) -> None:
+    export_csv(three, tmp_path / "three.csv")
+    golden("formats/export.csv", (tmp_path / "three.csv").read_text())
+
+
+def test_hdf5(three: Recording, golden: Golden, tmp_path: Path) -> None:
+    export_hdf5(three, tmp_path / "three.h5")
+    with h5py.File(tmp_path / "three.h5") as file:
+        about = {
+            name: f"{data.dtype} {data.shape} {np.array(data).ravel()[:4].tolist()}" for name, data in file.items()
+        }
+        golden("formats/hdf5.json", {"attributes": dict(file.attrs), "datasets": about})
+
+
+@pytest.mark.parametrize("mirrored", [False, True])
+def test_bag(three: Recording, annotations: ModelAnnotations, golden: Golden, tmp_path: Path, mirrored: bool) -> None:
+    """All messages, but for readings beyond the first two; of a mirrored pad those with a z."""
+    states = np.array([[100.0, 100, 200, 300, 0, 0, np.pi / 2, 1, 0, 0], [101.0, 400, 500, 600, 0, 0, 0, 0, 0, 0]])
+    recording = replace(three, source={"kind": "test", "rig": {"mirrored": mirrored}})
+    export_bag(recording, tmp_path / "three.mcap", annotations, states)
+    left_out = ("/pad/recording", "/pad/readings", "/pad/health", "/pad/pressed", "/arm/pose") if mirrored else ()
+    lines = []
+    with Reader(tmp_path / "three.mcap") as reader:
+        for connection, stamp, data in reader.messages():
+            message = as_json(STORE.deserialize_cdr(data, connection.msgtype))
+            if connection.topic == "/pad/recording":
+                message = json.loads(message["data"])
+            if connection.topic not in left_out and (connection.topic != "/pad/readings" or stamp < 100.2e9):
+                lines.append(f"{stamp / 1e9:.3f} {connection.topic} {connection.msgtype} {compact(message)}")
+    golden(f"formats/bag{'_mirrored' * mirrored}.txt", "\n".join(lines))
+
+
+def compact(value: Any) -> str:
+    """JSON in one line, without what is 0 or empty, and arrays of 36 as the values that are not 0."""
+    if isinstance(value, dict):
+        parts = {name: compact(part) for name, part in value.items()}
+        return (
+            "{"
+            + ", ".join(f"{name}: {part}" for name, part in parts.items() if part not in ("0", "''", "[]", "{}"))
+            + "}"
+        )
+    if isinstance(value, list) and len(value) == 36:
+        return str({at: number for at, number in enumerate(value) if number})
+    if isinstance(value, list):
+        return f"[{', '.join(map(compact, value))}]"
+    return f"{value:.9g}" if isinstance(value, float) else repr(value)
+
+
+def test_lerobot(three: Recording, annotations: ModelAnnotations, golden: Golden, tmp_path: Path) -> None:
+    """All files, with the statistics of one feature."""
+    known = replace(three, forces_n=np.array([1.5, 2.0, 0.75]))
+    export_lerobot(known, tmp_path / "set", annotations)
+    tables = {path: pq.read_table(path) for path in sorted((tmp_path / "set").rglob("*.parquet"))}
+    for path, table in tables.items():
+        names = [name for name in table.column_names if not name.startswith("stats/") or "/observation.force" in name]
+        rows = [" | ".join(str(row[name]) for name in names) for row in table.to_pylist()]
+        kinds = " | ".join(f"{name} {table.schema.field(name).type}" for name in names)
+        golden(f"formats/lerobot/{path.parent.parent.name}_{path.stem}.txt", "\n".join([kinds, *rows]))
+    golden("formats/lerobot/info.json", json_text(json.loads((tmp_path / "set/meta/info.json").read_text())))
+    statistics = json.loads((tmp_path / "set/meta/stats.json").read_text())
+    golden("formats/lerobot/stats.txt", "\n".join(f"{name}: {values}" for name, values in statistics.items()))
+
+
+def test_descriptions_and_sources_of_files(golden: Golden, tmp_path: Path) -> None:
+    """What `import --show` prints of each format, and what an import then remembers of the file."""
+    rows = "\n".join(f"{50 * i},{1.5 + 0.1 * (i % 8 > 3)},{i},{i % 8 // 4}" for i in range(40))
+    (tmp_path / "units.csv").write_text(f"t,c2,c10 [mV],on\nms,V,,\n{rows}\n", encoding="utf-8")
+    (tmp_path / "bare.txt").write_text(rows.replace(",", " "), encoding="utf-8")
+    time_s, volts, on = np.arange(40) / 20, np.ones((40, 2)) + np.arange(40)[:, None] / 100, np.arange(40) % 8 // 4
+    scipy.io.savemat(tmp_path / "lab.mat", {"data": {"t": time_s, "v": volts}, "on": on * 1.0, "name": "pad"})
+    with h5py.File(tmp_path / "lab.h5", "w") as file:
+        file["log/t"], file["log/v"], file["on"], file["note"] = time_s, volts, on, "bench 2"
+    messages = [("/skin", t, array("Float64MultiArray", v)) for t, v in zip(time_s, volts, strict=True)]
+    messages += [("/on", t + 0.001, make("Bool", bool(down))) for t, down in zip(time_s, on, strict=True)]
+    bag = write_bag(
+        tmp_path / "bag", [*messages, ("/probe", 0.1, pose(0.01, 0.02)), ("/words", 0.1, make("String", ""))]
+    )
+    mappings = {
+        tmp_path / "units.csv": "time=t,fibres=c*,press=on",
+        tmp_path / "bare.txt": "time=1:ms,fibres=2-3:mV,press=4",
+        tmp_path / "lab.mat": "time=data.t,fibres=data.v[0:2],press=on",
+        tmp_path / "lab.h5": "time=/log/t,fibres=/log/v,press=/on",
+        bag: "fibres=/skin,press=/on,positions=/probe:cm",
+    }
+    lines = []
+    for path, mapping in mappings.items():
+        recording = import_file(path, mapping)
+        numbers = float(recording.times_s[1]), recording.readings[1].tolist(), recording.down_command.tolist()
+        lines += [f"-- {path.name}", *describe_file(path), f"{numbers}", f"{dict(recording.source)}"]
+    golden("formats/show.txt", "\n".join(lines))
