@@ -18,7 +18,7 @@ from padforge.design.published.networks import localisation_error
 from padforge.design.settings import PUBLISHED_CONTACT, PadSettings, RulesSettings, SearchSettings
 
 PAD, FREE = PadSettings(grid=2), RulesSettings(enforce=False)
-SMALL = SearchSettings(knots=3, starts=2, steps=10, population=10, generations=3, max_failures=1)
+SMALL = SearchSettings(knots=3, starts=2, steps=10, population=10, generations=3, max_failures=1, contacts="assumed")
 QUICK = SMALL.model_copy(update={"starts": 1, "steps": 1, "generations": 1})
 REPAIR = "padforge.design.optimize.gradient.REPAIR_STEPS"
 
@@ -207,7 +207,7 @@ def test_search_bench_evaluates_what_the_search_finds(monkeypatch):
 
 
 def test_half_way_the_better_half_of_the_starts_goes_on():
-    settings = SearchSettings(knots=2, starts=5, steps=45, max_failures=1)
+    settings = SearchSettings(knots=2, starts=5, steps=45, max_failures=1, contacts="assumed")
     found = search(PadSettings(grid=1), None, settings, RulesSettings(enforce=False))
     histories: dict[str, list[tuple[int, float]]] = {}
     for row in found.history:
