@@ -206,20 +206,6 @@ def test_search_bench_evaluates_what_the_search_finds(monkeypatch):
     assert judged["violations"] == len(check_rules(result.morphology, RulesSettings()))
 
 
-def test_half_way_the_better_half_of_the_starts_goes_on():
-    settings = SearchSettings(knots=2, starts=5, steps=45, max_failures=1, contacts="assumed")
-    found = search(PadSettings(grid=1), None, settings, RulesSettings(enforce=False))
-    histories: dict[str, list[tuple[int, float]]] = {}
-    for row in found.history:
-        histories.setdefault(row["run"], []).append((row["step"], row["objective"]))
-    means = {run: np.log([value for step, value in rows if step <= 20]).mean() for run, rows in histories.items()}
-    better = [
-        min(names, key=lambda run: means[run]) for names in (["start 1", "start 2", "start 3", "start 5"], ["start 4"])
-    ]
-    assert {run: rows[-1][0] for run, rows in histories.items()} == {run: 45 if run in better else 20 for run in means}
-    assert found.candidate in {*better, "straight fibres"}
-
-
 def test_better_half_compares_the_last_objectives_before_a_step():
     low, high = np.array([[10, 3.0], [20, 1.0], [30, 9.0]]), np.array([[10, 2.0], [20, 2.0], [30, 0.1]])
     histories = {0: low, 1: high, 2: high * [1.0, 2.0], 4: low * [1.0, np.nan]}
