@@ -6,8 +6,8 @@ from padforge.design import Contact, SearchSettings
 from padforge.design.contact import half_width_mm
 from padforge.design.contact_set import judged_contacts, served_contacts
 from padforge.design.settings import PUBLISHED_CONTACT
+from tests.helpers.golden import Golden
 
-ISOTROPIC = ["isotropic, 5.5 mm", "isotropic, 9.1 mm"]
 MEASURED = Contact(model="profile")
 
 
@@ -23,30 +23,23 @@ def test_plausible_contacts_of_a_layer_are_isotropic_ones_about_as_wide():
     assert half_width_mm(gentle) < 0.8 * half_width_mm(Contact())
 
 
-@pytest.mark.parametrize(
-    ("assumed", "contacts", "others"),
-    [
-        (Contact(), "plausible", ISOTROPIC),
-        (MEASURED, "plausible", ["10% narrower", "10% wider"]),
-        (PUBLISHED_CONTACT, "plausible", []),
-        (Contact(), "assumed", []),
-        (Contact(), (Contact(radius=0.9), Contact()), ["contact 1 of [search]"]),
-    ],
-)
-def test_served_contacts_begin_with_the_assumed_one(assumed, contacts, others):
-    served = served_contacts(assumed, SearchSettings(contacts=contacts))
-    assert (list(served), served["as assumed"]) == (["as assumed", *others], assumed)
+ASSUMED = {"layer": Contact(), "no stretch": Contact(stretch=0.0), "profile": MEASURED, "shape": PUBLISHED_CONTACT}
 
 
-def test_judged_contacts_are_the_served_ones_and_others():
-    """And none is there twice."""
-    profiles, disc = ["profile of 5 mm", "profile of 6.2 mm", "profile of 7.9 mm"], ["published disc, K = 0.6"]
-    presses, assumed = ["tool of 4.2 mm", "2.5 mm deep", "pressed flat alone"], SearchSettings(contacts="assumed")
-    for contact, search, others in (
-        (Contact(), SearchSettings(), ISOTROPIC + presses),
-        (Contact(stretch=0.0), assumed, presses[:2]),
-        (Contact(radius=0.9), SearchSettings(), profiles + disc),
-        (MEASURED, assumed, [profiles[0], profiles[2], *disc]),
-        (PUBLISHED_CONTACT, SearchSettings(), profiles),
-    ):
-        assert list(judged_contacts(contact, search)) == ["as assumed", *others]
+def test_contacts_served_and_judged_begin_with_the_assumed_one(golden: Golden) -> None:
+    """And none is there twice; their profiles are given by where they end."""
+    lines = []
+    for name, assumed in ASSUMED.items():
+        for contacts in ("plausible", "assumed", (Contact(radius=0.9), assumed)):
+            search = SearchSettings(contacts=contacts)
+            for what, found in (("served", served_contacts), ("judged", judged_contacts)):
+                named = found(assumed, search)
+                assert next(iter(named.values())) == assumed
+                assert len({str(contact) for contact in named.values()}) == len(named)
+                listed = [f"{other} ({contact.model}, {half_mm(contact)})" for other, contact in named.items()]
+                lines.append(f"{name}, {contacts if isinstance(contacts, str) else 'stated'}, {what}: {listed}")
+    golden("design/contact_names.txt", "\n".join(lines))
+
+
+def half_mm(contact: Contact) -> str:
+    return f"K = {contact.radius:g}" if contact.model == "shape" else f"{half_width_mm(contact):.3f} mm"

@@ -76,7 +76,7 @@ def test_quantized_signals_of_a_transposed_rectangle(pad):
 
 
 @given(pad=rectangles(knots=(0, 3)))
-@settings(max_examples=10)
+@settings(max_examples=6)
 def test_rules_and_lengths_of_a_transposed_rectangle(pad):
     rules, other = RulesSettings(max_crossings=2, min_crossing_angle_deg=30), turned(pad)
     np.testing.assert_allclose(lengths(other), lengths(pad)[order(pad)], rtol=1e-9)
@@ -105,7 +105,7 @@ def test_signals_of_coarse_families_and_single_fibres():
 
 
 @given(pad=rectangles(), data=st.data())
-@settings(max_examples=20)
+@settings(max_examples=8)
 def test_rectangle_file_round_trip(tmp_path_factory, pad, data):
     pitch = data.draw(st.tuples(*[st.floats(0.1, 1000)] * 2)) if data.draw(st.booleans()) else pad.pitch_mm
     pad = Morphology.random(Layout.create(pad.layout.counts, pitch), 3, data.draw(st.integers(0, 99)))

@@ -245,7 +245,7 @@ def test_settings_accept_numpy_numbers(model, arrays, plain):
     assert model(**arrays).model_dump_json() == model(**plain).model_dump_json()
 
 
-def test_default_contact_is_measured_or_published():
+def test_default_contact_is_measured_or_published(little_scored):
     pad, presses = Morphology.random(1, 3, seed=0), [[1.2, 0.7], [0.5, 0.8]]
     np.testing.assert_array_equal(signals(pad, presses), signals(pad, presses, Contact()))
     np.testing.assert_array_equal(design.signals_sparse(pad, presses).toarray(), signals(pad, presses))

@@ -12,6 +12,7 @@ from padforge.design import Morphology, Twin
 from padforge.design.contact import relative_stretch
 from padforge.design.paths.curves import flatten
 from padforge.design.twin import PARTS, PlanTransform, TwinChannel, TwinPart, TwinReadings, TwinResidual, TwinScatter
+from tests.helpers.golden import Golden
 
 PAD = Morphology.random(2, knots=3, seed=5)
 DISTANCE = np.linspace(0, 1.6, 9)
@@ -131,22 +132,13 @@ def test_twin_load_refuses_other_files_in_one_line(twin, tmp_path, change, messa
         Twin.load(path)
 
 
-def test_effects_that_another_pad_does_not_have(twin: Twin) -> None:
-    uneven = tuple(None if line is None else np.linspace(0.5, 1.5, len(line) - 1) for line in twin.as_built_mm)
-    assert twin.ignored_effects() is None
-    effects = replace(twin, sensitivity=uneven, angular_weight=0.1 * WEIGHT).ignored_effects()
-    assert effects is not None
-    assert effects.startswith(
-        "not carried over to another pad: the dependence on the angle between fibre and press and "
-    )
-    assert effects.endswith("where along its fibres the response is uneven (31%)")
-
-
-def test_one_uneven_fibre_is_an_effect_that_another_pad_does_not_have(twin: Twin) -> None:
+def test_effects_that_another_pad_does_not_have(twin: Twin, golden: Golden) -> None:
+    """None where the response is the same along each fibre; their standard deviation, averaged over the fibres."""
     sizes = [None if line is None else len(line) - 1 for line in twin.as_built_mm]
     even = tuple(None if size is None else np.full(size, 1.01) for size in sizes)
-    assert replace(twin, sensitivity=even).ignored_effects() is None
-    assert sizes[0] is not None
-    uneven = (np.linspace(0.5, 1.5, sizes[0]), *even[1:])
-    effects = replace(twin, sensitivity=uneven).ignored_effects()
-    assert effects == "not carried over to another pad: where along its fibres the response is uneven (10%)"
+    all_uneven = tuple(None if size is None else np.linspace(0.5, 1.5, size) for size in sizes)
+    changes = {}, {"sensitivity": even}, {"sensitivity": (all_uneven[0], *even[1:])}, {"angular_weight": 0.1 * WEIGHT}
+    both = {"sensitivity": all_uneven, "angular_weight": 0.1 * WEIGHT}
+    golden(
+        "design/twin_effects.txt", "\n".join(str(replace(twin, **each).ignored_effects()) for each in (*changes, both))
+    )

@@ -81,6 +81,8 @@ def test_editor_refuses_hostile_requests_and_saves_beside_pad(program: Program, 
     program.ask(do="add", fibre=1)
     assert program.post("/save", b"{}")[0] == 200
     program.ask(do="undo")
+    libraries = Path(f"/proc/{program.process.pid}/maps")
+    assert not libraries.exists() or "torch" not in libraries.read_text(), "a session needs no networks"
     code, said = program.end()
     assert code == 130
     assert "edits since the last save are discarded" in said.splitlines()  # a first use says that it compiles, too
@@ -98,12 +100,6 @@ def test_editor_refuses_mistakes_before_serving(tmp_path: Path, pad: Path) -> No
     ):
         with chdir(tmp_path):
             assert re.search(message, str(CliRunner().invoke(edit, arguments).exception))
-
-
-@pytest.mark.slow
-def test_editor_does_not_import_torch() -> None:
-    code = "import padforge.design.editor, sys; sys.exit('torch' in sys.modules)"
-    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 
 CENTRE = "(r => [r.x + r.width / 2, r.y + r.height / 2])(document.querySelectorAll('{}')[{}].getBoundingClientRect())"
@@ -167,7 +163,7 @@ def test_dragging_updates_page_at_once(program: Program, browser: Chromium, tmp_
 
 
 @pytest.mark.slow
-def test_editor_works_by_keyboard_and_touch(program: Program, browser: Chromium) -> None:
+def test_editor_works_by_keyboard_and_touch_and_pages_reconnect(program: Program, browser: Chromium) -> None:
     browser.ask("document.getElementById('fibre').focus()")
     for _ in range(12):  # once round the page, to the first knot
         browser.call("Input.dispatchKeyEvent", type="rawKeyDown", key="Tab", windowsVirtualKeyCode=9)
@@ -202,9 +198,8 @@ def test_editor_works_by_keyboard_and_touch(program: Program, browser: Chromium)
     lowered = browser.ask(CENTRE.format(".knot .dot", 5))[1] - y
     assert lowered == pytest.approx(20, abs=6)  # the first bit may count as a tap
 
-
-@pytest.mark.slow
-def test_second_page_follows_and_reconnects(program: Program, browser: Chromium) -> None:
+    # a second page follows, and one that comes back
+    browser.call("Emulation.setTouchEmulationEnabled", enabled=False)
     moved = program.ask(do="move", fibre=1, knot=1, x_mm=-12.0, y_mm=3.25)
     shown = "view.fibres[0].knots[1][1]"
     browser.wait_for(f"{shown} == 3.25")

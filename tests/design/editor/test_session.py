@@ -7,7 +7,7 @@ import pytest
 
 from padforge import InputError, Spec
 from padforge.common.files import sha256, write_json
-from padforge.design import Contact, Morphology, PadSettings, RulesSettings, check_rules
+from padforge.design import Contact, Morphology, PadSettings
 from padforge.design.editor import EditSession
 from padforge.design.objectives.ambiguity import AMBIGUITY_NOISE, ambiguities
 
@@ -31,31 +31,18 @@ def move(editor, fibre, knot, x_mm, y_mm, gesture=""):
     return ask(editor, do="move", fibre=fibre, knot=knot, x_mm=x_mm, y_mm=y_mm, gesture=gesture)
 
 
-def test_view_has_rules_and_ambiguity(tmp_path):
+def test_view_has_the_ambiguity_of_an_evaluation(tmp_path):
     pad = Morphology.random((1, 2), 4, 1, (9.0, 12.0))
     _, views = session(tmp_path, pad)
-    assert [view["ready"] for view in views] == [False, True]
-    view = views[-1]
-    size = PadSettings().for_layout(pad.layout)
-    assert [rule["text"] for rule in view["rules"]] == [str(rule) for rule in check_rules(pad, RulesSettings(), size)]
-    ambiguity = np.array(ambiguities(pad, Contact(), 1, AMBIGUITY_NOISE, size))
-    assert view["ambiguity_mm"] == pytest.approx(pad.unit_mm * ambiguity, rel=0.01)
-    straight = np.array(ambiguities(Morphology.straight(pad.layout), Contact(), 1, AMBIGUITY_NOISE, size))
-    assert view["straight_mm"] == pytest.approx(pad.unit_mm * straight, rel=0.01)
+    view, size = views[-1], PadSettings().for_layout(pad.layout)
+    for name, fibres in (("ambiguity_mm", pad), ("straight_mm", Morphology.straight(pad.layout))):
+        expected = pad.unit_mm * np.array(ambiguities(fibres, Contact(), 1, AMBIGUITY_NOISE, size))
+        assert view[name] == pytest.approx(expected, rel=0.01)
     assert np.mean(view["ambiguity_map_mm"], axis=1) == pytest.approx(view["ambiguity_mm"], abs=1e-4)
-    assert np.array(view["fibres"][2]["knots"]) == pytest.approx(pad.to_mm(pad.knots[2]), abs=1e-4)
-    assert json.loads(json.dumps(view, allow_nan=False))["unsaved"] is False
-    assert view["half_mm"] == pytest.approx([27.0 / 2, 24.0 / 2])
+    json.dumps(view, allow_nan=False)
 
 
-@pytest.mark.parametrize(("deep_family", "family"), [("horizontal", 0), ("vertical", 1)])
-def test_view_names_the_deep_family_as_its_fibres_do(tmp_path, deep_family, family):
-    _, views = session(tmp_path, grid=1, deep_family=deep_family)
-    assert views[-1]["deep_family"] == family
-    assert [fibre["family"] for fibre in views[-1]["fibres"]] == [0, 1]
-
-
-def test_move_clips_knot_and_gestures_are_undone_together(tmp_path):
+def test_gestures_are_undone_together(tmp_path):
     editor, views = session(tmp_path, grid=2)
     first = views[-1]["fibres"]
     for y_mm in (1.0, 2.0, 3.0):
@@ -69,20 +56,13 @@ def test_move_clips_knot_and_gestures_are_undone_together(tmp_path):
     ask(editor, do="redo")
     assert ask(editor, do="redo")["fibres"] == after["fibres"]
     assert [view["number"] for view in views[1:]] == list(range(1, len(views)))
-    editor, _ = session(tmp_path, grid=2, pitch_mm=10.0)
-    knots = np.array(move(editor, 1, 3, 0.7, 4.0)["fibres"][0]["knots"])
-    assert knots[3] == pytest.approx([0.7, 4.0])
+
+
+def test_move_clips_knots_to_the_pad_and_between_their_neighbours(tmp_path):
+    """27 mm wide and 24 mm high."""
+    editor, _ = session(tmp_path, Morphology.random((1, 2), 4, 1, (9.0, 12.0)))
     knots = np.array(move(editor, 1, 3, 900.0, -900.0)["fibres"][0]["knots"])
     assert knots[4, 0] - 0.1 < knots[3, 0] < knots[4, 0]
-    assert knots[3, 1] == -15
-    knots = np.array(move(editor, 3, 1, 900.0, -900.0)["fibres"][2]["knots"])
-    assert (knots[1, 0], knots[1, 1] > -15) == (15, True)
-
-
-def test_move_clips_knots_to_both_sides_of_a_rectangle(tmp_path):
-    """27 mm wide and 24 mm high."""
-    pad = Morphology.random((1, 2), 4, 1, (9.0, 12.0))
-    editor, _ = session(tmp_path, pad)
     for y_mm, edge_mm in ((900.0, 12.0), (-900.0, -12.0)):
         assert move(editor, 1, 2, 0.0, y_mm)["fibres"][0]["knots"][2][1] == pytest.approx(edge_mm)
     for x_mm, edge_mm in ((900.0, 13.5), (-900.0, -13.5)):
@@ -121,7 +101,6 @@ def test_save_writes_view_with_provenance(tmp_path):
     assert saved["fibres"][0]["knots"][1][1] == 2.0
     assert pad.provenance["command"] == "padforge design edit"
     assert pad.provenance["inputs"] == {"pad.json": read}
-    assert [rule["text"] for rule in saved["rules"]] == [str(rule) for rule in check_rules(pad, RulesSettings())]
     assert (editor.unsaved, ask(editor, do="undo")["unsaved"]) == (False, True)
 
 

@@ -14,7 +14,7 @@ from padforge.design.settings import PadSettings
 from padforge.design.signal_gradients import FibreCurves
 
 
-def test_score_evaluates_the_sensed_area():
+def test_score_evaluates_the_sensed_area(little_scored):
     """The published terms and the information are of presses between the fibres, wherever else it is pressed."""
     # a layer leaves no fibre idle anywhere
     pad, disc = Morphology.random(2, 4, seed=1), Contact(radius=0.9, sides=None)
@@ -27,7 +27,7 @@ def test_score_evaluates_the_sensed_area():
     assert layer["published_objective"] == published_terms(pad)[0].objective  # a layer has none of its own
 
 
-def test_score_joint_entropy_saturates_before_those_of_families():
+def test_score_joint_entropy_saturates_before_those_of_families(little_scored):
     """49 presses give no more than log2 49 bits, and straight fibres have them."""
     pad = Morphology.straight(4)
     assert score(pad, max_failures=0)["published_joint_entropy"] == pytest.approx(math.log2(49))

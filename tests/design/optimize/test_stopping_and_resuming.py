@@ -170,12 +170,13 @@ def test_command_ignores_a_hangup_under_nohup(monkeypatch):
 
 SETTINGS = """
 [pad]
-grid = 2
+grid = 1
 [search]
-knots = 3
+knots = 2
 starts = 2
-steps = 75
+steps = 60
 max_failures = 1
+contacts = "assumed"
 [rules]
 enforce = false
 """
