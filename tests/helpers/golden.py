@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
+from matplotlib.text import Annotation
 
 FOLDER = Path(__file__).parents[1] / "golden"
 
@@ -101,6 +102,18 @@ def _plain(value: Any) -> Any:
     return value.tolist()
 
 
+def json_text(value: Any, width: int = 150, indent: str = "") -> str:
+    """JSON with a line for each list or table that fits, in the order in which it is."""
+    line = json.dumps(value, ensure_ascii=False, default=_plain)
+    if len(indent) + len(line) <= width or not isinstance(value, dict | list):
+        return line
+    names = [f"{json.dumps(name)}: " for name in value] if isinstance(value, dict) else [""] * len(value)
+    items = value.values() if isinstance(value, dict) else value
+    parts = [f"{indent} {name}{json_text(item, width, indent + ' ')}" for name, item in zip(names, items, strict=True)]
+    begin, end = "{}" if isinstance(value, dict) else "[]"
+    return "\n".join([begin, ",\n".join(parts), indent + end])
+
+
 def page_text(page: str) -> str:
     """The words of a HTML page as a reader meets them: headings, paragraphs, tables by row, and what pictures hold."""
     root, lines = lxml.html.fromstring(page), []
@@ -128,16 +141,20 @@ def page_text(page: str) -> str:
 def figure_text(figure: Figure) -> str:
     """What a figure shows: titles, axes, limits, and the data and colours of lines, marks, images and texts."""
     lines = [f"figure {figure.get_figwidth():.3g} x {figure.get_figheight():.3g} in: {figure.get_suptitle()!r}"]
+    lines += [f"text {text.get_text()!r}" for text in figure.texts if text.get_text() != figure.get_suptitle()]
+    lines += [f"legend {_legend_text(legend)}" for legend in figure.legends]
     for axes in figure.axes:
+        title = axes.get_title() or axes.get_title(loc="left")
         limits = f"x {_numbers(axes.get_xlim())} {axes.get_xscale()}, y {_numbers(axes.get_ylim())} {axes.get_yscale()}"
-        lines.append(f"axes {axes.get_title()!r}: {axes.get_xlabel()!r}, {axes.get_ylabel()!r}; {limits}")
+        lines.append(f"axes {title!r}: {axes.get_xlabel()!r}, {axes.get_ylabel()!r}; {limits}")
         for name in ("x", "y"):
             ticks = [label.get_text() for label in getattr(axes, f"get_{name}ticklabels")()]
             if any(ticks) and axes.axison:
                 lines.append(f"  {name} ticks {' '.join(ticks)}")
         for line in axes.lines:
             xy = np.asarray(line.get_xydata(), dtype=float)
-            style = f"{to_hex(line.get_color())} {line.get_linestyle()} {line.get_marker()}"
+            colour = line.get_markeredgecolor() if line.get_linestyle() == "None" else line.get_color()
+            style = f"{to_hex(colour)} {line.get_linestyle()} {line.get_marker()}"
             lines.append(f"  line {line.get_label()!r} {style}: {_summary(xy)}")
         for collection in axes.collections:
             data = collection.get_offsets() if len(collection.get_offsets()) > 1 else _vertices(collection)
@@ -154,10 +171,20 @@ def figure_text(figure: Figure) -> str:
         for patch in axes.patches:
             lines.append(f"  {type(patch).__name__} {to_hex(patch.get_facecolor())}: {_summary(_path_of(patch))}")
         for text in axes.texts:
-            lines.append(f"  text {text.get_text()!r} at {_numbers(text.get_position())}")
+            place = text.xy if isinstance(text, Annotation) else text.get_position()
+            lines.append(f"  text {text.get_text()!r} at {_numbers(place)}")
         if legend := axes.get_legend():
             lines.append(f"  legend {[text.get_text() for text in legend.get_texts()]}")
     return "\n".join(lines)
+
+
+def _legend_text(legend: Any) -> list[str]:
+    """The entries of a figure's legend with the colours of their signs."""
+    entries = []
+    for text, sign in zip(legend.get_texts(), legend.legend_handles, strict=True):
+        colour = sign.get_facecolor() if hasattr(sign, "get_facecolor") else sign.get_markeredgecolor()
+        entries.append(f"{text.get_text()} {to_hex(colour)}")
+    return entries
 
 
 def _vertices(collection: Any) -> Any:
