@@ -235,7 +235,8 @@ def _check_self_intersection(mesh: TriangleMesh, slabs: Sequence[Slab]) -> Findi
     overlaps = np.vstack([find_overlaps(mesh, slab.middle_mm) for slab in slabs])
     positions = _deduplicate(overlaps)
     count = len(positions)
-    message = f"the solid overlaps itself at {count} positions" if count else "no cross section overlaps itself"
+    where = f"{count} position{'s' * (count > 1)}"
+    message = f"the solid overlaps itself at {where}" if count else "no cross section overlaps itself"
     return check_result("self_intersection", not count, count, 0, message, positions)
 
 
@@ -409,8 +410,8 @@ def _check_leaks(slabs: Sequence[Slab]) -> Finding:
     leaks = [plug for slab in slabs[1:] for plug in _find_wall_leaks(slab.cross_section)] + _find_floor_leaks(slabs)
     leaks = [leak.representative_point() for leak in leaks if leak.area > SPECK_MM2]
     positions = dict.fromkeys((round(leak.x, 3), round(leak.y, 3)) for leak in leaks)  # one for several slabs
-    count = len(leaks)
-    message = f"silicone leaks at {count} positions" if count else "no leaks"
+    count = len(positions)
+    message = f"silicone leaks at {count} position{'s' * (count > 1)}" if count else "no leaks"
     return check_result("tight", not count, count, 0, message, positions)
 
 

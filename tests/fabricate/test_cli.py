@@ -1,55 +1,161 @@
+"""All that `padforge fabricate` prints and writes for two small pads, kept whole, and what it refuses."""
+
+import io
 import json
 from pathlib import Path
+from typing import Any
 
+import ezdxf
 import pytest
 from click.testing import CliRunner
-from PIL import Image
 
 from padforge.common.validation import InputError
 from padforge.design.morphology import Morphology
+from padforge.fabricate import export
 from padforge.fabricate.cli import fabricate, mould_lines
+from padforge.fabricate.outputs.pictures import draw_crossing, draw_orientation
 from tests.fabricate.planted import level_pad
-from tests.helpers.less import blank_pictures
+from tests.helpers.golden import json_text
 
-FILES = {"mould.stl", "tracks.svg", "fabrication.json", "laying.md", "orientation.svg", "crossing.svg"}
+CROSSED = """
+[pad]
+keep_out_mm = [[-12.0, 11.0, 3.2, 6.0], [[8, 8], [9, 8], [9, 9], [8, 9]]]
+bent_radius_mm = 80.0
+[mould]
+border_mm = 1.0
+lid = true
+pins = true
+holder = true
+conductive = true
+[silicone]
+name = "Dragon Skin 20"
+parts = [2, 1]
+[fibre]
+ohm_per_mm = 14.2
+min_bend_radius_mm = 1.5
+[printer]
+bed_mm = [40, 220, 250]
+[dispenser]
+origin_mm = [60, 100]
+travel_height_mm = 7.5
+feed_mm_s = 6
+"""
+SIDE = """
+[pad]
+leads = "one side"
+deep_family = "vertical"
+[mould]
+lid = true
+spout = true
+number_mm = 0
+[printer]
+resin = true
+nozzle_mm = 0.05
+layer_mm = 0.05
+"""
+PADS = {
+    "crossed": (lambda: level_pad(1.8, 1.2), CROSSED, ()),
+    "side": (lambda: Morphology.straight((1, 2), (12.0, 10.0)), SIDE, ("build",)),
+}
+"""Each with its settings, and the words of the command, which may be left out."""
+PICTURES = ("mould", "tracks", "toolpath", "orientation", "crossing")
+VERSIONS = r'(?<="versions": \{)[^}]*'
+"""What differs between releases of libraries."""
 
 
 @pytest.fixture(autouse=True)
 def elsewhere(tmp_path_factory, monkeypatch):
     """Run in an empty folder, since a pad.toml in the current one is taken for the settings."""
     monkeypatch.chdir(tmp_path_factory.mktemp("elsewhere"))
-    blank_pictures(monkeypatch)
 
 
-@pytest.fixture
-def morphology(tmp_path):
-    path = tmp_path / "morphology.json"
-    Morphology.straight(2).save(path)
-    return path
+def invoke(*arguments: object) -> Any:
+    return CliRunner().invoke(fabricate, [str(argument) for argument in arguments], catch_exceptions=False)
 
 
-def invoke(*arguments):
-    return CliRunner().invoke(fabricate, [str(argument) for argument in arguments])
+def dxf_text(text: str) -> str:
+    """Layers, extents and entities of a DXF: kind, layer, and where they lie."""
+    document = ezdxf.read(io.StringIO(text))  # pyright: ignore[reportPrivateImportUsage]
+    header = {name: document.header[name] for name in ("$ACADVER", "$INSUNITS", "$EXTMIN", "$EXTMAX")}
+    lines = [f"{name} {value}" for name, value in header.items()]
+    for layer in document.layers:
+        lines.append(f"layer {layer.dxf.name}: colour {layer.color}, {layer.rgb}")
+    for entity in document.modelspace():
+        match entity.dxftype():
+            case "TEXT":
+                _, place, _ = entity.get_placement()
+                shown = f"{entity.dxf.text!r}, {entity.dxf.height:.3f} high at {place.x:.3f} {place.y:.3f}"
+            case "LINE":
+                shown = f"{entity.dxf.start.round(3)} to {entity.dxf.end.round(3)}"
+            case "SPLINE":
+                ends = [entity.control_points[at].round(4).tolist() for at in (0, -1)]
+                shown = f"{len(entity.control_points)} control points from {ends[0]} to {ends[1]}"
+            case _:
+                shown = " ".join(f"({x:.3f} {y:.3f})" for x, y, *_ in entity.get_points())
+        lines.append(f"{entity.dxftype()} {entity.dxf.layer}: {shown}")
+    return "\n".join(lines)
 
 
-@pytest.mark.parametrize("words", [[], ["build"]])
-def test_build_is_the_default_command(morphology, tmp_path, words):
-    result = invoke(*words, "--formats", "stl,svg", "--out", tmp_path / "out", morphology, "--json")
-    assert result.exit_code == 0, result.output
-    assert json.loads(result.stdout)["files"] == ["mould.stl", "tracks.svg"]
-    assert {path.name for path in (tmp_path / "out").iterdir()} == FILES
+@pytest.mark.parametrize("name", PADS)
+def test_files_and_lines_of_a_mould(name, tmp_path, golden, figures, monkeypatch):
+    monkeypatch.setattr(export, "draw_orientation", draw_orientation)
+    monkeypatch.setattr(export, "draw_crossing", draw_crossing)
+    make_pad, settings, words = PADS[name]
+    pad, spec = tmp_path / "morphology.json", tmp_path / "pad.toml"
+    make_pad().save(pad)
+    spec.write_text(settings)
+    result = invoke(*words, pad, "--formats", "stl,svg,dxf,png,gcode", "--spec", spec, "--out", tmp_path)
+    golden(f"fabricate/{name}/printed.txt", f"exit code {result.exit_code}\n{result.output}")
+    document = json.loads((tmp_path / "fabrication.json").read_text())
+    golden(f"fabricate/{name}/fabrication.json", json_text(document), forget=[VERSIONS])
+    for file in ("laying.md", "laying.gcode", "tracks.svg"):
+        golden(f"fabricate/{name}/{file}", (tmp_path / file).read_text(encoding="utf-8"))
+    golden(f"fabricate/{name}/tracks.dxf.txt", dxf_text((tmp_path / "tracks.dxf").read_text(encoding="utf-8")))
+    assert len(figures) == len(PICTURES)
+    for figure, picture in zip(figures, PICTURES, strict=True):
+        golden(f"fabricate/{name}/{picture}.txt", figure)
 
 
-def test_build_prints_a_summary_with_the_findings_to_look_at(tmp_path):
+def test_lines_and_documents_of_checks(tmp_path, golden, figures):
     level_pad(1.8, 1.2).save(tmp_path / "crossed.json")
-    result = invoke(tmp_path / "crossed.json", "--formats", "svg")
-    assert result.exit_code == 0
-    assert "ml of silicone" in result.output
-    assert "warn same_family_crossings: 2 crossings" in result.output
-    assert (tmp_path / "tracks.svg").exists()
-    Morphology.straight(2, 4.0).save(tmp_path / "narrow.json")
-    checked = invoke("check", tmp_path / "narrow.json")
-    assert (checked.exit_code, "warn" in checked.output) == (0, True)
+    (tmp_path / "two.toml").write_text('[mould]\nlevels = "two"\n[printer]\nnozzle_mm = 0.6\n')
+    (tmp_path / "small.toml").write_text("[printer]\nbed_mm = [30, 30, 100]\n")
+    invoke(tmp_path / "crossed.json", "--formats", "stl", "--out", tmp_path)
+    lines = []
+    for file, spec in (("crossed.json", "two.toml"), ("crossed.json", "small.toml"), ("mould.stl", "small.toml")):
+        words = ["check", tmp_path / file, "--spec", tmp_path / spec]
+        result = invoke(*words, "--picture", tmp_path / "findings.png")
+        lines += [f"{file} {spec}: exit code {result.exit_code}", result.output]
+    golden("fabricate/checked.txt", "\n".join(lines))
+    document = json.loads(invoke(*words, "--json").output)
+    golden("fabricate/checked.json", json_text(document))
+    for number, figure in enumerate(figures[-3:], 1):
+        golden(f"fabricate/checked_{number}.txt", figure)
+
+
+def test_lines_of_a_mould_name_three_places_and_count_the_others():
+    places = [(1.04, -2.06), (3.0, 4.0), (5.0, 6.0), (7.0, 8.0), (9.0, 0.0)]
+    findings = [
+        {"name": name, "status": status, "message": f"is {status}", "positions_mm": positions}
+        for name, status, positions in (("bed", "pass", []), ("thin", "warn", places), ("wall", "fail", []))
+    ]
+    document = {"size_mm": [60.123, 50.5, 8.0], "silicone_volume_ml": 20.06, "files": ["mould.3mf", "tracks.svg"]}
+    assert mould_lines(document | {"findings": findings}, Path("out")) == [
+        f"mould: 60.12 x 50.5 x 8 mm, 20.1 ml of silicone -> {Path('out/mould.3mf')}",
+        "  1 checks passed",
+        "  warn thin: is warn at (1.0, -2.1) (3.0, 4.0) (5.0, 6.0) and 2 more places",
+        "  FAIL wall: is fail",
+    ]
+    assert mould_lines(document | {"findings": [], "files": []}, Path("out")) == [
+        f"mould: 60.12 x 50.5 x 8 mm -> {Path('out/fabrication.json')}",
+        "  0 checks passed, no warnings",
+    ]
+
+
+def test_json_of_a_build_is_its_document(tmp_path):
+    Morphology.straight(1).save(tmp_path / "morphology.json")
+    result = invoke(tmp_path / "morphology.json", "--formats", "svg", "--json")
+    assert json.loads(result.stdout) == json.loads((tmp_path / "fabrication.json").read_text())
 
 
 @pytest.mark.parametrize(
@@ -63,63 +169,8 @@ def test_build_prints_a_summary_with_the_findings_to_look_at(tmp_path):
 def test_build_refuses_in_one_line_and_leaves_nothing(tmp_path, file, table, line):
     level_pad(1.8, 1.2).save(tmp_path / "pad.json")
     (tmp_path / "pad.toml").write_text(table, encoding="utf-8")
-    error = invoke(tmp_path / file, "--out", tmp_path / "out", "--spec", tmp_path / "pad.toml").exception
-    assert isinstance(error, InputError)
-    assert line in str(error)
-    assert "\n" not in str(error)
+    with pytest.raises(InputError) as refusal:
+        invoke(tmp_path / file, "--out", tmp_path / "out", "--spec", tmp_path / "pad.toml")
+    assert line in str(refusal.value)
+    assert "\n" not in str(refusal.value)
     assert not (tmp_path / "out").exists()
-
-
-def test_check_exits_1_when_a_check_fails(tmp_path):
-    level_pad(1.8, 1.2).save(tmp_path / "crossed.json")
-    (tmp_path / "pad.toml").write_text('[mould]\nlevels = "two"\n', encoding="utf-8")
-    result = invoke("check", tmp_path / "crossed.json", "--spec", tmp_path / "pad.toml", "--json")
-    assert result.exit_code == 1
-    document = json.loads(result.stdout)
-    assert not document["passed"]
-    assert "same_family_crossings" in [f["name"] for f in document["findings"] if f["status"] == "fail"]
-
-
-def test_check_of_a_mesh_with_the_printer_of_a_spec(morphology, tmp_path):
-    invoke(morphology, "--formats", "stl", "--out", tmp_path)
-    (tmp_path / "pad.toml").write_text("[printer]\nbed_mm = [30, 30, 100]\n", encoding="utf-8")
-    assert invoke("check", tmp_path / "mould.stl").exit_code == 0
-    result = invoke("check", tmp_path / "mould.stl", "--spec", tmp_path / "pad.toml")
-    assert result.exit_code == 1
-    assert "FAIL bed: 42.17 x 42.17 x 8 mm, the bed is 30 x 30 x 100 mm" in result.stdout
-
-
-def test_the_spec_shapes_the_mould(morphology, tmp_path):
-    (tmp_path / "pad.toml").write_text("[mould]\nborder_mm = 1.5\n", encoding="utf-8")
-    result = invoke(morphology, "--formats", "svg", "--out", tmp_path, "--spec", tmp_path / "pad.toml", "--json")
-    document = json.loads(result.stdout)
-    assert document["sizes"]["pad_mm"] == 3 * 11.25 + 2 * 1.5
-    assert set(document["provenance"]["inputs"]) == {"morphology.json", "pad.toml"}
-
-
-def test_check_draws_a_picture_of_the_findings(morphology, tmp_path):
-    (tmp_path / "pad.toml").write_text("[printer]\nnozzle_mm = 0.6\n", encoding="utf-8")
-    picture = tmp_path / "findings.png"
-    assert invoke("check", morphology, "--picture", picture, "--spec", tmp_path / "pad.toml").exit_code == 1
-    with Image.open(picture) as image:
-        assert image.format == "PNG"
-
-
-def finding_of(status, *positions, name="wall"):
-    return {"name": name, "status": status, "message": f"is {status}", "positions_mm": list(positions)}
-
-
-def test_mould_lines_count_checks_that_pass_and_name_the_others():
-    places = [(1.04, -2.06), (3.0, 4.0), (5.0, 6.0), (7.0, 8.0), (9.0, 0.0)]
-    findings = [finding_of("pass"), finding_of("warn", *places, name="thin"), finding_of("pass"), finding_of("fail")]
-    document = {"size_mm": [60.123, 50.5, 8.0], "silicone_volume_ml": 20.06, "files": ["mould.3mf", "tracks.svg"]}
-    assert mould_lines(document | {"findings": findings}, Path("out")) == [
-        f"mould: 60.12 x 50.5 x 8 mm, 20.1 ml of silicone -> {Path('out/mould.3mf')}",
-        "  2 checks passed",
-        "  warn thin: is warn at (1.0, -2.1) (3.0, 4.0) (5.0, 6.0) and 2 more places",
-        "  FAIL wall: is fail",
-    ]
-    assert mould_lines(document | {"findings": findings[::2], "files": []}, Path("out")) == [
-        f"mould: 60.12 x 50.5 x 8 mm -> {Path('out/fabrication.json')}",
-        "  2 checks passed, no warnings",
-    ]

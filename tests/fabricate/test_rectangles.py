@@ -1,7 +1,6 @@
 """Pads that are no squares: of two pitches, of one family, with holes, with leads to one side."""
 
 import math
-import re
 from dataclasses import replace
 
 import numpy as np
@@ -15,13 +14,12 @@ from padforge.design.morphology import Morphology
 from padforge.design.settings import PadSettings
 from padforge.fabricate.cad.model import body_solid
 from padforge.fabricate.checks.plan_checks import check_mould, check_plan
-from padforge.fabricate.export import build
 from padforge.fabricate.leads import lead_spacing
 from padforge.fabricate.mesh import build_mesh, mould_mesh
 from padforge.fabricate.mould import bed_frame, holder_body, lid_body, sizes, tray_body
-from padforge.fabricate.outputs.drawings import orientation_sentence, tracks_svg
+from padforge.fabricate.outputs.drawings import orientation_sentence
 from padforge.fabricate.plan import Plan
-from padforge.fabricate.settings import DEFAULTS, FabricationSettings, FibreSettings, MouldSettings
+from padforge.fabricate.settings import DEFAULTS, FabricationSettings, MouldSettings
 from tests.fabricate.planted import with_settings
 
 PAD = Morphology.straight((3, 6), (8.0, 15.0))
@@ -177,31 +175,6 @@ def test_holder_slots_are_at_the_mirrored_leads():
 )
 def test_orientation_sentence_states_the_order_of_fibres(fibres, leads, says):
     assert says in orientation_sentence(fibres, leads)
-
-
-def test_page_and_drawings_show_holes_bending_exits_and_lengths(tmp_path):
-    pad, hole = Morphology.straight((2, 3), (8.0, 15.0)), ((-7.0, -5.0), (-1.0, -5.0), (-1.0, 5.0), (-7.0, 5.0))
-    own = settings(pad, leads="one side", keep_out_mm=(hole,), bent_radius_mm=30.0)
-    own = replace(own, fibre=FibreSettings(ohm_per_mm=10.0))
-    result = build(pad, tmp_path, [], own)
-    page = (tmp_path / "laying.md").read_text(encoding="utf-8")
-    assert "Horizontal fibres are 1 to 2, vertical ones 3 to 5." in page
-    assert "around every pillar" in page
-    assert "bent to 30 mm, fibres are stretched by up to" in page
-    assert "from left to right as the pad lies for laying, these fibres end: 5, 2, 1, 5, 4, 3, 1, 2, 3, 4." in page
-    assert result.settings["pad"]["horizontals"] == 2
-    plan = Plan(pad, own)
-    for entry, line in zip(result.fibres, plan.lines, strict=True):
-        assert entry["in_pad_mm"] == pytest.approx(line.length - 1.0, abs=0.01)  # less what runs into the walls
-        assert entry["resistance_ohm"] == pytest.approx(10 * entry["cut_mm"], rel=1e-3)
-    whole = build(pad, tmp_path, [], settings(pad, leads="one side"))
-    less = whole.silicone_volume_ml - result.silicone_volume_ml
-    assert less == pytest.approx(6 * 10 * 6 / 1000, abs=1e-3)
-    drawing = tracks_svg(plan)
-    edge = re.search(r'<path id="edge" d="([^"]*)"', drawing)
-    assert edge is not None
-    assert edge[1].count("M") == 2
-    assert [len(re.findall(rf">{number}</text>", drawing)) for number in range(1, 6)] == [2] * 5
 
 
 def test_leads_to_one_side_leave_two_printed_lines_between_their_slots():

@@ -4,17 +4,15 @@
 # The CAD kernel's modules come without types.
 
 import math
-import re
 import subprocess
 import sys
 
 import numpy as np
 import pytest
-from build123d import Axis, Color, Compound, Solid, import_step
+from build123d import Axis, Compound, Solid
 from OCP.Standard import Standard_Failure
 from scipy.spatial import KDTree
 
-from padforge.common.plotting import HORIZONTAL, VERTICAL
 from padforge.common.validation import InputError
 from padforge.design.morphology import Morphology
 from padforge.design.paths.curves import lengths
@@ -72,6 +70,12 @@ def test_mould_of_a_straight_pad_has_closed_form_volumes(draft_deg, deep):
     shapes = judged(plan)
     assert {name: shape.volume for name, shape in shapes.items()} == pytest.approx({"tray": tray} | ridges, rel=1e-9)
     assert all(face.geom_type.name == "PLANE" for shape in shapes.values() for face in shape.faces())
+
+
+@pytest.mark.slow
+def test_fused_mould_is_one_solid_of_the_volume_of_the_mesh():
+    """The kernel works in a process of its own."""
+    plan = Plan(Morphology.straight(1), with_settings(PLAIN))
     fused = build_mould(plan.pad, plan.settings, fused=True)
     assert isinstance(fused, Solid)
     assert fused.volume == pytest.approx(build_mesh(mould_body(plan)).volume(), rel=1e-6)
@@ -107,6 +111,7 @@ def test_ridge_edges_are_half_a_width_from_exact_fibres(pad, mould):
     assert np.abs(distance - plan.settings.mould.ridge_width_mm / 2).max() < 3e-3
 
 
+@pytest.mark.slow
 def test_ridge_can_be_filleted_and_shelled():
     """As whoever opens the mould in CAD does first: its upper edges rounded, its inside taken out."""
     ridge = judged(Plan(SOFT, with_settings({"ridge_width_mm": 1.0})))["horizontal 1"]
@@ -179,26 +184,6 @@ def test_mould_for_conductive_material_has_wells():
     assert sum(face.area for face in round_) == pytest.approx(2 * (2 * math.pi * 1.5 - 2 * 0.4) * 0.6, rel=0.01)
 
 
-def test_mould_is_an_assembly_of_named_and_coloured_solids(tmp_path):
-    """In build123d, and as its STEP file reads back: one solid for the tray, every ridge and number."""
-    mould = build_mould(Morphology.random(4, 3, seed=1), with_settings({"pins": True, "number_mm": 1.5}))
-    ridges = [f"{family} {number}" for family in ("horizontal", "vertical") for number in range(1, 5)]
-    assert mould.label == "mould"
-    assert [child.label for child in mould.children] == ["tray", *ridges, "numbers"]
-    assert [child.label for child in mould.children[-1].children] == [f"number {k}" for k in range(1, 9)]
-    write_step(path := tmp_path / "mould.step", mould)
-    read = import_step(path)
-    assert read.is_valid
-    assert (read.label, len(read.children), len(read.solids())) == ("mould", 1 + 8 + 1, 1 + 8 + 8)
-    tray, *tracks, _ = read.children
-    assert [child.label for child in tracks] == [name.replace(" ", "_") for name in ridges]  # as build123d reads blanks
-    assert [[*child.color] for child in tracks] == [
-        pytest.approx([*Color(colour)], abs=2e-3) for colour in (HORIZONTAL, VERTICAL) for _ in range(4)
-    ]
-    for child, original in zip((tray, *tracks), mould.children, strict=False):
-        assert child.volume == pytest.approx(original.volume, rel=1e-4)
-
-
 WRITE_AGAIN = """
 import sys
 from pathlib import Path
@@ -209,7 +194,8 @@ write_step(Path(sys.argv[1]), build_mould(Morphology.random(1, 3, seed=1)))
 """
 
 
-def test_step_file_has_the_same_bytes_every_time_and_every_point_once(tmp_path):
+@pytest.mark.slow
+def test_step_file_has_the_same_bytes_every_time(tmp_path):
     """Also in another process, where shapes have other addresses."""
     mould = build_mould(Morphology.random(1, 3, seed=1))
     for name in ("first", "second"):
@@ -217,8 +203,6 @@ def test_step_file_has_the_same_bytes_every_time_and_every_point_once(tmp_path):
     subprocess.run([sys.executable, "-c", WRITE_AGAIN, tmp_path / "third"], check=True)
     first, *others = [(tmp_path / name).read_text() for name in ("first", "second", "third")]
     assert others == [first, first]
-    points = re.findall(r"CARTESIAN_POINT\(([^;]*)\)", first)
-    assert len(set(points)) <= len(points) < 1.02 * len(set(points))
 
 
 @pytest.mark.slow

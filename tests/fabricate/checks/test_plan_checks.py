@@ -61,13 +61,6 @@ def test_findings_of_a_straight_pad_by_settings(name, settings, status, measured
         assert len(finding.positions_mm) == (0 if status == "pass" else {"ridge_width": 2, "slenderness": 1}[name])
 
 
-@pytest.mark.parametrize(("grid", "named"), [(2, "numbers 1, 2, 3, 4"), (5, "10 numbers")])
-def test_numbers_lists_those_without_room(grid, named):
-    finding = find(Morphology.straight(grid, 4.0), "numbers", with_settings({"number_mm": 9.0, "exit_mm": 0.0}))
-    assert (finding.status, finding.measured, len(finding.positions_mm)) == ("warn", 0, 2 * grid)
-    assert finding.message == f"no room beside the fibre's start for {named}"
-
-
 class TestFibres:
     @pytest.mark.parametrize(("levels", "status"), [("as_needed", "warn"), ("two", "fail")])
     def test_same_family_crossings_by_levels(self, levels, status):
@@ -246,15 +239,6 @@ def test_mould_is_compared_with_the_layer_that_the_design_believes(contact, sett
     assert (findings["silicone_thickness"].status, findings["fibre_depths"].status) == (thickness, depths)
 
 
-def test_finding_names_what_mould_and_design_differ_in():
-    findings = designed_for(Contact(), mould={"silicone_mm": 8.0}, pad={"deep_family": "vertical"})
-    assert findings["silicone_thickness"].message == "silicone is 8 mm thick, the design believes 6"
-    assert findings["fibre_depths"].message == (
-        "horizontal fibres lie 0.25 mm deep, the design believes 1.05; "
-        "vertical fibres lie 1.05 mm deep, the design believes 0.25"
-    )
-
-
 def test_contact_of_settings_counts_if_the_pad_has_none():
     tables: dict[str, dict[str, object]] = {"mould": {"silicone_mm": 8.0}}
     pad, settings = Morphology.straight(2), FabricationSettings.from_spec(Spec(tables))
@@ -262,32 +246,6 @@ def test_contact_of_settings_counts_if_the_pad_has_none():
     for contact in ({"radius": 0.6}, {}):
         settings = FabricationSettings.from_spec(Spec(tables | {"contact": contact}))
         assert "silicone_thickness" not in {finding.name for finding in check_plan(Plan(pad, settings))}
-
-
-def test_messages_of_findings_have_their_lengths_in_mm():
-    mould: dict[str, object] = {"ridge_width_mm": 0.45, "deep_ridge_height_mm": 1.3, "silicone_mm": 5.5}
-    plan = Plan(Morphology.straight(2), with_settings(mould, fibre={"diameter_mm": 0.35}))
-    messages = {finding.name: finding.message for finding in check_plan(plan)}
-    expected = {
-        "ridge_width": "ridges are 0.45 mm wide, the nozzle 0.4 mm",
-        "track_size": "the tightest track is 0.4 mm, the fibre 0.35 mm",
-        "layers": "every step is a whole number of 0.1 mm layers",
-        "slenderness": "the tallest ridges, 1.3 mm, are 2.9 times as tall as wide",
-        "crossing_gap": "0.550 mm lie between fibres of neighbouring depths where they cross",  # 1.3 - 0.4 - 0.35
-        "same_family_crossings": "0 crossings of fibres of one family",
-        "cover": "4.2 mm of silicone lie beyond the deepest tracks",
-        "fibre_bend": "no fibre bends below 1 mm, in the mean over 0.5 mm",
-        "numbers": "every number has room",
-    }
-    assert {name: messages[name] for name in expected} == expected
-    resin = find(plan.pad, "ridge_width", with_settings(printer=RESIN))
-    assert resin.message == "ridges are 0.4 mm wide, two pixels 0.4 mm"
-    crossed = find(level_pad(1.8, 1.2), "same_family_crossings")
-    assert crossed.message == "2 crossings of fibres of one family, kept apart by 3 depths instead of 2"
-    thicker = find(level_pad(1.8, 1.2), "cover", with_settings({"silicone_mm": 2.5}))
-    assert thicker.message == (
-        "1 mm of silicone lie beyond the deepest tracks; for 3 depths the pad is 3 mm thick, not 2.5"
-    )
 
 
 def test_fibre_bend_is_that_of_the_tightest_fibre():

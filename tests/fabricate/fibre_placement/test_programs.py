@@ -5,12 +5,10 @@ import re
 import numpy as np
 import pytest
 
-from padforge.common.plotting import ALARM
 from padforge.design.morphology import Morphology
 from padforge.fabricate.export import Fabrication
 from padforge.fabricate.fibre_placement import gcode, plan_toolpath
 from padforge.fabricate.outputs.laying_page import laying_document
-from padforge.fabricate.outputs.pictures import draw_toolpath
 from padforge.fabricate.plan import Plan
 from tests.fabricate.fibre_placement.machines import Run, exact_path, max_distance, run_gcode
 from tests.fabricate.planted import level_pad, with_settings
@@ -59,15 +57,6 @@ def test_gcode_places_every_fibre_along_its_path(request, name):
     require_travels_above(plan, run)
 
 
-def test_pauses_are_in_the_order_of_the_work():
-    plan = Plan(level_pad(1.8, 1.2))  # three layers
-    asked = run_gcode(program(plan)).asked
-    words = [re.sub(r".*?(fasten|cut|seal|zero).*", r"\1", message) for message in asked]
-    layers = [len(step) for step in laying_document(plan, 1.0)["laying_order"]]
-    assert words == ["zero", *(word for count in layers for word in (*(["fasten", "cut"] * count), "seal"))]
-    assert asked[-1].startswith(f"layer {len(layers)} of {len(layers)}, 0.4 mm deep: seal")
-
-
 def test_gcode_has_nothing_that_a_firmware_misreads():
     text = program(Plan(Morphology.straight(2)))
     lines = text.splitlines()
@@ -90,54 +79,6 @@ def test_fibre_settings_set_depth_and_speed():
 
     assert seconds(max_strain=0.05) > 1.2 * seconds(max_strain=2.0)
     assert seconds(diameter_mm=0.2) < seconds(diameter_mm=0.39)
-
-
-def test_gcode_has_positions_speeds_and_height_of_the_settings():
-    dispenser = {"origin_mm": [50.0, -20.0], "travel_height_mm": 7.5, "feed_mm_s": 6.0}
-    text = program(Plan(Morphology.straight(1), with_settings(dispenser=dispenser)))
-    code = [line for line in text.splitlines() if not line.startswith(";")]
-    assert code[:2] == ["G21", "G90"]
-    assert [line[:4] for line in code[2:5]] == ["M0 (", "G1 Z", "G1 X"]  # a lift before anything goes sideways
-    assert code[3] == "G1 Z7.5 F1800"
-    assert "; the pad's middle is at X50 Y-20;" in text
-    run = run_gcode(text)
-    (_, horizontal), (_, vertical) = run.placed_fibres()
-    # turned over, a horizontal fibre starts on the right
-    assert horizontal.corners.tolist() == [[50 + 43.25, -20.0, -0.9], [50 - 43.25, -20.0, -0.9]]
-    assert vertical.corners.tolist() == [[50.0, -20 - 43.25, -0.1], [50.0, -20 + 43.25, -0.1]]
-    assert horizontal.speeds.tolist() == vertical.speeds.tolist() == [6.0]
-    assert {z for way in run.ways for z in way.corners[:, 2].tolist()} == {7.5, -0.9, -0.1}
-
-
-def test_toolpath_picture_shows_every_fibre_with_its_number_turn_and_depth(tmp_path, figures):
-    plan = Plan(level_pad(1.8, 1.2), with_settings(dispenser={"origin_mm": [60.0, 100.0]}))
-    steps = plan_toolpath(plan, 0.3)
-    draw_toolpath(plan, steps, tmp_path / "toolpath.svg")
-    [axes] = figures[0].axes
-    strokes = [stroke for step in steps for stroke in step.strokes]
-    labels = [text.get_text() for text in figures[0].legends[0].get_texts()]
-    assert labels == [
-        "1. horizontal, 2 mm deep, z = -1.7 mm",
-        "2. horizontal, 1.2 mm deep, z = -0.9 mm",
-        "3. vertical, 0.4 mm deep, z = -0.1 mm",
-    ]
-    paths = [np.array(line.get_xydata()) for line in axes.lines if line.get_label() in labels]
-    for stroke, path in zip(strokes, paths, strict=True):
-        assert path == pytest.approx(stroke.positions_mm)
-        (x_min, x_max), (y_min, y_max) = axes.get_xlim(), axes.get_ylim()
-        assert (path > (x_min, y_min)).all()
-        assert (path < (x_max, y_max)).all()
-    turns = [word for turn, each in enumerate(strokes, 1) for word in (f"{each.fibre + 1}", f"{turn}.")]
-    assert [text.get_text() for text in axes.texts] == turns
-    ends = [end for stroke in strokes for end in stroke.positions_mm[[0, -1]]]
-    for text, end in zip(axes.texts, ends, strict=True):  # 2.5 mm beyond its end of the fibre
-        assert np.hypot(*(text.get_position() - end)) == pytest.approx(2.5)
-        assert np.hypot(*text.get_position()) > np.hypot(*end)
-    travels = [np.array(line.get_xydata()) for line in axes.lines if line.get_label() == "travel"]
-    for travel, before, after in zip(travels, strokes[:-1], strokes[1:], strict=True):
-        assert travel == pytest.approx(np.array([before.positions_mm[-1], after.positions_mm[0]]))
-    (box,) = (line for line in axes.lines if line.get_color() == ALARM)  # of 0 to 220 mm
-    assert np.array(box.get_xydata())[:4].tolist() == [[-60, -100], [160, -100], [160, 120], [-60, 120]]
 
 
 @pytest.mark.parametrize(

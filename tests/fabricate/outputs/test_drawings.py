@@ -75,16 +75,6 @@ def test_tracks_svg_has_exact_curves(mould):
         assert_on_curve(plan, fibre, bezier_points(np.stack([points[1 + 3 * i : 5 + 3 * i] for i in range(4)])))
 
 
-def test_tracks_svg_has_layer_for_every_depth_in_laying_order():
-    groups = svg_groups(Plan(Morphology.straight(4)))
-    assert list(groups) == ["silicone", "horizontal-1.2", "vertical-0.4", "numbers", "scale"]
-    assert {group.get(f"{INKSCAPE}groupmode") for group in groups.values()} == {"layer"}
-    assert groups["horizontal-1.2"].get(f"{INKSCAPE}label") == "horizontal, 1.2 mm deep"
-    assert [path.get("id") for path in groups["vertical-0.4"]] == [f"vertical-{n}" for n in (1, 2, 3, 4)]
-    deep = svg_groups(Plan(Morphology.straight(4), with_settings(pad={"deep_family": "vertical"})))
-    assert list(deep)[1:3] == ["vertical-1.2", "horizontal-0.4"]
-
-
 def test_tracks_svg_has_true_size_and_contains_everything():
     plan = Plan(PAD)
     root = ElementTree.fromstring(tracks_svg(plan))
@@ -100,19 +90,6 @@ def test_tracks_svg_has_true_size_and_contains_everything():
     assert not bar.intersects(edge)
     assert bar.bounds[2] - bar.bounds[0] == pytest.approx(10)
     assert groups["scale"][1].text == "10 mm"
-
-
-def test_tracks_svg_numbers_are_beside_starts_outside_silicone():
-    plan = Plan(PAD)
-    texts = svg_groups(plan)["numbers"]
-    assert [text.text for text in texts] == list("123456")
-    for text, line in zip(texts, plan.lines, strict=True):
-        position = shapely.Point(float(text.get("x", "")), -float(text.get("y", "")))
-        assert not position.intersects(plan.silicone)
-        assert position.distance(shapely.Point(line.coords[0])) < 3
-    root = ElementTree.fromstring(tracks_svg(plan))
-    assert "as it lies in the tray" in (root.findtext(f"{SVG}title") or "")
-    assert orientation_sentence((4, 4), "edges") in (root.findtext(f"{SVG}desc") or "")
 
 
 def read_dxf(text: str, folder: Path) -> Drawing:

@@ -13,7 +13,6 @@ from padforge.design.morphology import Morphology
 from padforge.fabricate.export import build
 from padforge.fabricate.mesh import mould_mesh
 from padforge.fabricate.mould import sizes
-from padforge.fabricate.outputs.drawings import CROSSING_LINK, ORIENTATION_FILE, orientation_sentence
 from padforge.fabricate.outputs.laying_page import (
     PRINT_SETTINGS_HEAD,
     laying_document,
@@ -164,28 +163,6 @@ def rows(page: str, head: str) -> list[list[str]]:
     return [[cell.strip() for cell in line.strip("|").split("|")] for line in body[:end]]
 
 
-def test_page_lists_failed_checks_and_follows_settings():
-    findings = (
-        {"name": "bed", "status": "pass", "message": "fits", "positions_mm": []},
-        {"name": "thin", "status": "warn", "message": "thin walls", "positions_mm": [[1.0, 2.0]]},
-        {"name": "wall", "status": "fail", "message": "no wall", "positions_mm": []},
-    )
-    lid = with_settings(
-        {"lid": True, "spout": True, "number_mm": 0.0}, printer={"resin": True, "nozzle_mm": 0.05, "layer_mm": 0.05}
-    )
-    page = laying_page(fabrication_document(Plan(Morphology.straight(2), lid), findings))
-    assert "1 of 3 checks passed" in page
-    assert page.index("**fail** wall: no wall") < page.index("**warn** thin: thin walls (1 position,")
-    assert "pour through its spout" in page
-    for text in ("of resin", "in layers of 0.05 mm", "A ridge is 8 pixels wide", "the floor is 2 mm, 40 layers"):
-        assert text in page
-    assert "PrusaSlicer" not in page
-    assert page.index("- Slice it") < page.index("- Turn anti-aliasing") < page.index("- Wash and cure")
-    assert "read the right way" not in page
-    plain = laying_page(fabrication_document(Plan(Morphology.straight(2)), findings[:1]))
-    assert "1 of 1 checks passed.\n" in plain
-
-
 def print_setting(name: str, mould: MouldSettings, printer: PrinterSettings) -> tuple[str, str]:
     """Return the value of a setting of PrusaSlicer, and its reason."""
     row = next(row for row in print_settings_rows(mould, printer) if row[0].startswith(f"{name}: "))
@@ -238,108 +215,6 @@ def test_solid_layers_hide_the_infill_below_them(layer, layers):
     assert value.startswith(f"{layers}; ")  # 0.8 mm or more
 
 
-def bench_document(**changes: object) -> dict:
-    """A document whose every number is another one, so that none can stand in the place of another."""
-    fibre = {
-        "name": "soft thread",
-        "diameter_mm": 0.35,
-        "ohm_per_mm": 20.0,
-        "max_strain": 0.45,
-        "min_bend_radius_mm": 1.5,
-    }
-    entry = {"in_pad_mm": 50.04, "cut_mm": 90.06, "resistance_ohm": 1801.2, "divider_ohm": 1800.0}
-    fibres = [
-        entry | {"number": 1, "fibre": "horizontal 1", "depth_mm": 1.75},
-        {"number": 2, "fibre": "vertical 1", "depth_mm": 0.25, "in_pad_mm": 60.0, "cut_mm": 100.0}
-        | {"resistance_ohm": 2.5e6, "divider_ohm": 2.4e6},
-    ]
-    settings = {
-        "mould": MouldSettings(lead_mm=20.0, holder=True).model_dump(),
-        "printer": PrinterSettings().model_dump(),
-        "pad": {"leads": "edges", "horizontals": 1, "verticals": 1, "keep_out_mm": []},
-    }
-    return {
-        "files": ["mould.stl", "laying.gcode"],
-        "size_mm": [40.5, 30.126, 8.0],
-        "sizes": {"pad_mm": 33.75},
-        "mould_volume_ml": 10.0,
-        "findings": [],
-        "settings": settings,
-        "silicone": {
-            "name": "Goo",
-            "part_a_g": 3.04,
-            "part_b_g": 1.96,
-            "volume_ml": 4.56,
-            "thickness_mm": 6.125,
-            "mass_g": 5.0,
-        }
-        | {"mass_g": 5.0, "surplus_percent": 12, "shrinkage": 0.013, "pot_life_min": 91, "cure_h": 1.5},
-        "adhesive": {"name": "glue", "volume_ml": 0.6, "steps_ml": [0.4, 0.2]},
-        "order": {"fibre_m": 0.234, "waste_percent": 17, "plastic_g": 13.4, "print_h": 1.34, "laying_h": 2.26},
-        "fibre": fibre,
-        "fibres": fibres,
-        "laying_order": [[1], [2]],
-        "crossings": {"total": 1, "same_family": 0, "gap_mm": 1.2, "columns": []}
-        | {"table": [["horizontal 1", "vertical 1", -3.04, 7.06, 1.75, 0.25, 1.2]]},
-        "common_tracks": [{"shallow": 2, "deep": 1, "length_mm": 2.34, "position_mm": [-1.5, 4.5]}],
-    } | changes
-
-
-def section(document: dict, title: str) -> list[str]:
-    """Return the lines of a section that are not empty."""
-    text = laying_page(document).partition(f"\n## {title}\n")[2].partition("\n## ")[0]
-    return [line for line in text.splitlines() if line]
-
-
-def test_page_has_the_amounts_of_the_document():
-    document = bench_document()
-    titles = [line for line in laying_page(document).splitlines() if line.startswith("#")]
-    names = ["Pad", "Order", "Print", "Mix", "Cast", "Orientation", "Lay", "Wire", "Crossings", "Checks"]
-    assert titles == ["# How to make the pad", *(f"## {name}" for name in names)]
-    assert section(document, "Pad") == ["The pad is 33.75 x 33.75 mm, 6.12 mm thick, with 2 fibres."]
-    lines = section(document, "Print")
-    assert lines[:2] == [
-        "- The mould is 40.5 x 30.13 x 8 mm and takes 10.0 ml, 12 g of PLA if solid.",  # of 1.24 g/ml
-        "- Print it as it lies, open side up, without supports.",
-    ]
-    assert lines[2].endswith("its tracks up; fibres 1 and 2 start at the cut corner.")
-    assert lines[3:5] == ["Slicer settings, by the names they have there:", f"| {' | '.join(PRINT_SETTINGS_HEAD)} |"]
-    assert section(document, "Mix") == [
-        "| Goo | part A | part B | together |",
-        "| --- | --- | --- | --- |",
-        "| mass | 3.0 g | 2.0 g | 5.0 g |",
-        "The mould holds 4.6 ml, the pad is 6.12 mm thick. The masses include 12 % for what stays in the cup.",
-        "The silicone shrinks by 1.3 % as it cures, and the mould is larger by that. Lengths and positions below are"
-        " those of the pad.",
-    ]
-    cast = section(document, "Cast")
-    assert "The pot life is 1.52 hours: finish" in cast[0]
-    assert cast[2:] == [
-        "3. Pour it slowly into one corner of the level mould, up to the top of the walls.",
-        "4. Leave it for 90 minutes at room temperature.",
-        "5. Free the casting all along the walls, then pull it out from a corner.",
-    ]
-    assert section(document, "Checks") == ["0 of 0 checks passed."]
-
-
-def test_page_orders_materials_by_kind_and_estimates_the_work():
-    order = section(bench_document(), "Order")
-    assert [row.split(" | ")[:2] for row in order[2:10]] == [
-        ["| fibre", "0.23 m of soft thread, 0.35 mm"],
-        ["| silicone", "5 g of Goo"],
-        ["| adhesive", "0.60 ml"],
-        ["| filament", "13 g of PLA"],
-        ["| connectors", "4"],
-        ["| wire", "4 pieces, from the pad to the board"],
-        ["| resistors", "2, of values by the resistance of the fibre"],
-        ["| board", "for 2 fibres"],
-    ]
-    assert order[10].startswith("The fibre includes 17 % for waste. The mould prints in about 1.3 h, by rules of thumb")
-    assert (
-        "Laying and sealing by hand takes about 2.3 h, an estimate of 60 minutes a metre and 2 minutes a" in order[10]
-    )
-
-
 @pytest.mark.parametrize(("resin", "hours"), [(False, 4.0 * 1000 / (0.4 * 0.1 * 50) / 3600), (True, 80 * 12 / 3600)])
 def test_order_follows_lengths_crossings_and_the_printer(resin, hours):
     plan = Plan(Morphology.straight(2, 10.0), with_settings({"lead_mm": 25.0}, {"resin": resin}))
@@ -351,117 +226,56 @@ def test_order_follows_lengths_crossings_and_the_printer(resin, hours):
     assert order["plastic_g"] == pytest.approx(4.0 * (1.1 if resin else 1.24), abs=0.1)
 
 
-def test_page_lays_and_wires_every_fibre_by_its_own_numbers():
-    document = bench_document()
-    lay = section(document, "Lay")
-    assert "the tracks lie on top. The numbers on it read the right way now." in lay[0]
-    assert lay[1].endswith(
-        "with 20 mm out at both ends. Lay them unstretched: soft thread bears 45 % of stretch at most and bends of no"
-        " less than 1.5 mm radius."
-    )
-    assert "fill the tracks over the fibres with glue." in lay[2]
-    assert lay[3:7] == [
-        "| step | number | fibre | depth | in the pad | cut to | then seal with |",
-        "| --- | --- | --- | --- | --- | --- | --- |",
-        "| 1 | 1 | horizontal 1 | 1.75 mm | 50.0 mm | 90.1 mm | 0.40 ml |",
-        "| 2 | 2 | vertical 1 | 0.25 mm | 60.0 mm | 100.0 mm | 0.20 ml |",
-    ]
-    assert "toolpath is in `laying.gcode` and drawn in `toolpath.svg`." in lay[7]
-    together = document | {"laying_order": [[1, 2]], "adhesive": {"name": "glue", "steps_ml": [0.6]}}
-    assert [row[-1] for row in rows(laying_page(together), "step")] == ["", "0.60 ml"]  # once all of a step are laid
-    wire = section(document, "Wire")
-    assert wire[0].startswith("At 20 Ohm per mm the fibres")
-    assert wire[1:] == [
-        "| number | fibre | resistance | fixed resistor |",
-        "| --- | --- | --- | --- |",
-        "| 1 | horizontal 1 | 1.8 kOhm | 1.8 kOhm |",
-        "| 2 | vertical 1 | 2.5 MOhm | 2.4 MOhm |",
-    ]
-    small = [entry | {"resistance_ohm": 999.4, "divider_ohm": 0.5} for entry in document["fibres"]]
-    assert rows(laying_page(document | {"fibres": small}), "number")[0][2:] == ["999 Ohm", "0.5 Ohm"]
-    exits = section(document | {"exits": [2, 1, 1, 2]}, "Wire")
-    assert exits[0].endswith("from left to right as the pad lies for laying, these fibres end: 2, 1, 1, 2.")
+def make_document(**changes: object) -> dict:
+    """A document whose every number is another one, so that none can stand in the place of another."""
+    names, entries = ("horizontal 1", "vertical 1"), []
+    for number, (name, depth, length) in enumerate(zip(names, (1.75, 0.25), (50.04, 60.0), strict=True), 1):
+        lengths = {"in_pad_mm": length, "cut_mm": length + 40.02, "depth_mm": depth}
+        entries.append({"number": number, "fibre": name, "resistance_ohm": 999.4, "divider_ohm": 0.5} | lengths)
+    entries[1] |= {"resistance_ohm": 2.5e6, "divider_ohm": 2.4e6}
+    return {
+        "files": ["mould.stl"],
+        "size_mm": [40.5, 30.126, 8.0],
+        "sizes": {"pad_mm": [33.75, 30.5]},
+        "mould_volume_ml": 10.0,
+        "findings": [{"name": "thin", "status": "warn", "message": "thin walls", "positions_mm": [[1.0, 2.0]]}],
+        "settings": {
+            "mould": MouldSettings(lead_mm=20.0, holder=True).model_dump(),
+            "printer": PrinterSettings(resin=True, nozzle_mm=0.4).model_dump(),
+            "pad": {"leads": "edges", "horizontals": 1, "verticals": 1, "keep_out_mm": [[9.0, 5.0, 4.0]]},
+        },
+        "silicone": {"name": "Goo", "part_a_g": 3.04, "part_b_g": 1.96, "volume_ml": 4.56, "thickness_mm": 6.125}
+        | {"mass_g": 5.0, "surplus_percent": 12, "shrinkage": 0.013, "pot_life_min": 91, "cure_h": 1.5},
+        "adhesive": {"name": "glue", "volume_ml": 0.6, "steps_ml": [0.4, 0.2]},
+        "order": {"fibre_m": 0.234, "waste_percent": 17, "plastic_g": 13.4, "print_h": 1.34, "laying_h": 2.26},
+        "fibre": {"name": "soft thread", "diameter_mm": 0.35, "ohm_per_mm": 20.0}
+        | {"max_strain": 0.45, "min_bend_radius_mm": None},
+        "fibres": entries,
+        "laying_order": [[1], [2]],
+        "crossings": {"total": 1, "same_family": 0, "gap_mm": 1.2, "columns": []}
+        | {"table": [["horizontal 1", "vertical 1", -3.04, 7.06, 1.75, 0.25, 1.2]]},
+        "common_tracks": [{"shallow": 2, "deep": 1, "length_mm": 2.34, "position_mm": [-1.5, 4.5]}],
+    } | changes
 
 
-def test_page_lists_crossings_as_they_are_and_counts_many():
-    lines = section(bench_document(), "Crossings")
-    assert lines[0] == "1 crossings, 0 of them within a family. At least 1.2 mm lie between two fibres."
-    assert lines.pop(1) == CROSSING_LINK
-    assert lines[1] == "Positions are from the centre of the pad. As it lies, x runs to the left and y away from you."
-    assert lines[3:6] == [
-        "| tracks | x | y | in common |",
-        "| --- | --- | --- | --- |",
-        "| 2 over 1 | -1.5 mm | 4.5 mm | 2.3 mm |",
-    ]
-    assert lines[6:] == [
-        "| fibres | x | y | depths | between them |",
-        "| --- | --- | --- | --- | --- |",
-        "| 1 and 2 | -3.0 mm | 7.1 mm | 1.75 and 0.25 mm | 1.2 mm |",
-    ]
-    row = bench_document()["crossings"]["table"][0]
-    shallow = [*row[:4], 0.25, 2.5, -0.1]  # the first is the upper one
-    many = {"total": 25, "same_family": 7, "gap_mm": -0.1, "table": [row] * 20 + [shallow] * 5}
+def make_crowded_document() -> dict:
+    """A document with more crossings and common tracks than have room, whose fibres touch."""
+    row, upper = ["horizontal 1", "vertical 1", 0, 0, 1.75, 0.25, 1.2], ["vertical 1", "horizontal 1", 0, 0, 0.25, 2.5]
+    crossings = {"total": 25, "same_family": 7, "gap_mm": -0.1, "table": [row] * 20 + [[*upper, -0.1]] * 5}
     tracks = [{"shallow": 2, "deep": 1, "length_mm": float(mm), "position_mm": [0.0, 0.0]} for mm in range(26, 0, -1)]
-    lines = section(bench_document(crossings=many, common_tracks=tracks), "Crossings")
-    assert lines[0] == "25 crossings, 7 of them within a family. Some touch."
-    assert [line for line in lines if " over 1 |" in line][-1].endswith("| 3.0 mm |")  # 24 of them
-    assert "These are the 24 longest of 26; `fabrication.json` has them all." in lines
-    assert lines[-5:] == [
-        "| depths | between the fibres | crossings |",
-        "| --- | --- | --- |",
-        "| 2.5 and 0.25 mm | -0.1 mm | 5 |",
-        "| 1.75 and 0.25 mm | 1.2 mm | 20 |",
-        "`fabrication.json` has the position of each.",
-    ]
-    none = bench_document(crossings={"total": 0}, common_tracks=[])
-    assert section(none, "Crossings") == ["No two fibres cross."]
+    plain = {"name": "thread", "diameter_mm": 0.35, "ohm_per_mm": 20.0, "max_strain": None, "min_bend_radius_mm": None}
+    return make_document(crossings=crossings, common_tracks=tracks, fibre=plain)
 
 
-def test_page_says_what_the_settings_ask_for():
-    document = bench_document()
-
-    def page(mould: dict | None = None, pad: dict | None = None, **changes: object) -> dict:
-        settings = dict(document["settings"])
-        settings["mould"] = settings["mould"] | (mould or {})
-        settings["pad"] = settings["pad"] | (pad or {})
-        return document | {"settings": settings} | changes
-
-    lid = page({"lid": True, "conductive": True, "number_mm": 0.0, "holder": False})
-    assert section(lid, "Print")[2:4] == [
-        "- Print the lid as well.",
-        "- The mould called `conductive` is for casting a conductive material in place of fibres.",
-    ]
-    assert section(lid, "Cast")[2].endswith(
-        "to the top of the walls. Lay the lid on: air and surplus leave by its vents."
-    )
-    assert section(lid, "Lay")[0] == "1. Turn the casting over, as drawn above: the tracks lie on top."
-    pillars = page(pad={"keep_out_mm": [[0.0, 0.0, 5.0, 5.0]], "leads": "one side"})
-    assert "along the walls and around every pillar, then" in section(pillars, "Cast")[-1]
-    assert "tracks up; its leads are at the side of the cut corner." in section(pillars, "Print")[2]
-    alone = page(pad={"horizontals": 0, "verticals": 3})
-    assert "tracks up; fibre 1 starts at the cut corner." in section(alone, "Print")[2]
-    assert section(alone, "Orientation")[0] == orientation_sentence((0, 3), "edges")
-    bent = {"name": "fibre_strain", "status": "pass", "message": "fibres stretch by 3 %", "positions_mm": []}
-    assert section(page(findings=[bent]), "Orientation")[1] == (
-        "The pad is worn on a cylinder whose axis runs along y, the face with the tracks outwards: fibres stretch"
-        " by 3 %."
-    )
-    unknown = document["fibre"] | {"ohm_per_mm": None}
-    [line] = section(page(fibre=unknown), "Wire")
-    assert "unknown: measure 100 mm of it and set `[fibre] ohm_per_mm`" in line
-    assert f"]({ORIENTATION_FILE})" in section(document, "Orientation")[-1]
-    plain = document["fibre"] | {"max_strain": None, "min_bend_radius_mm": None}
-    assert section(page(fibre=plain), "Lay")[1].endswith("with 20 mm out at both ends.")
+def make_document_of_one_family() -> dict:
+    document = make_document(crossings={"total": 0}, common_tracks=[])
+    document["settings"]["pad"] |= {"horizontals": 0, "verticals": 3, "keep_out_mm": []}
+    return document
 
 
-def test_page_lists_holes_with_room_for_their_screws():
-    pad = {"leads": "edges", "horizontals": 1, "verticals": 1}
-    document = bench_document(sizes={"pad_mm": [120.0, 30.5]})
-    document["settings"]["pad"] = pad | {
-        "keep_out_mm": [[-50.5, 0.0, 3.2, 6.0], [[0, 0], [1, 0], [0, 1]], [9.0, 5.0, 4.0]]
-    }
-    size, lead, _, _, *rows, note = section(document, "Pad")
-    assert size.startswith("The pad is 120 x 30.5 mm, ")
-    assert lead == "It has these holes:"
-    assert rows == ["| -50.5 mm | 0 mm | 3.2 mm | 6 mm, 3.06 mm deep |", "| 9 mm | 5 mm | 4 mm | - |"]
-    assert "The heads of screws sink into the face with the tracks." in note
+@pytest.mark.parametrize(
+    ("name", "make"),
+    [("few", make_document), ("crowded", make_crowded_document), ("one_family", make_document_of_one_family)],
+)
+def test_page_of_a_document(name, make, golden):
+    golden(f"fabricate/laying_{name}.md", laying_page(make()))

@@ -1,21 +1,16 @@
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
-import trimesh
 from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
-from matplotlib.patches import Patch
 from PIL import Image
 
 from padforge.common.plotting import ALARM, FAINT, HORIZONTAL, PAPER, VERTICAL
 from padforge.design.morphology import Morphology
 from padforge.fabricate.checks import Finding
 from padforge.fabricate.mesh import mould_mesh
-from padforge.fabricate.outputs.drawings import orientation_sentence
 from padforge.fabricate.outputs.pictures import (
-    CARE,
     TURN_DEG,
     draw_findings,
     draw_mould,
@@ -109,14 +104,6 @@ def test_pictures_are_small_and_show_layers_and_marks(tmp_path, monkeypatch):
     assert not count_colour(pixels_of(tmp_path / "mesh.png"), ALARM)
 
 
-def test_only_failures_and_warnings_are_marked(tmp_path, figures):
-    findings = [make_finding("pass", (1, 2)), make_finding("fail"), make_finding("warn", (6, -4), name="bend")]
-    draw_mould(PLAN, *mesh_of(PLAN), findings, tmp_path / "mould.png")
-    marks = [line for line in figures[0].axes[0].lines if not str(line.get_label()).startswith("_")]
-    assert [(line.get_label(), line.get_markeredgecolor()) for line in marks] == [("warn: bend (1)", CARE)]
-    assert np.array(marks[0].get_xydata()).tolist() == [[6, -4]]
-
-
 @pytest.mark.slow
 def test_pictures_of_a_dense_pad_are_small(tmp_path, published):
     plan = Plan(Morphology.load(published / "20para.mat"))
@@ -176,24 +163,6 @@ def test_side_views_number_fibres_as_panels(tmp_path, figures):
     assert ["".join(sorted(view, key=lambda text: view[text][0])) for view in views] == ["5678", "8765", "8765"]
 
 
-def test_orientation_picture_has_sentence_titles_and_numbers(tmp_path, figures):
-    for settings in (with_settings(), with_settings({"number_mm": 0.0})):
-        draw_orientation(Plan(Morphology.straight(2), settings), tmp_path / "orientation.svg")
-    note = " ".join(text.get_text() for text in figures[0].texts)
-    assert note == orientation_sentence((2, 2), "edges")
-    assert {text.get_text() for text in figures[0].axes[0].texts} >= {"1  In the mould", "pad_angle_deg", "arm"}
-    cast = [sum(patch.get_gid() == "cast" for patch in figure.axes[0].patches) for figure in figures]
-    assert cast == [3 * 4, 0]
-
-
-def test_mould_picture_has_the_size_of_the_mould_as_title(tmp_path, figures):
-    plan = Plan(Morphology.straight((1, 2), (12.0, 10.0)))
-    draw_mould(plan, *mesh_of(plan), [], tmp_path / "mould.png")
-    walls = 2 * (2 + 2 + 6 * np.tan(np.radians(2)))
-    size = f"{3 * 12 + walls:.4g} x {2 * 10 + walls:.4g} x 8 mm"  # with a floor of 2 mm below 6 mm of silicone
-    assert figures[0].axes[0].get_title(loc="left") == f"Mould from above, {size}"
-
-
 def test_fibres_are_drawn_as_wide_as_they_are(tmp_path, figures):
     draw_tracks(Plan(level_pad(1.0, 2.0), with_settings(fibre={"diameter_mm": 2.0})), tmp_path / "tracks.png")
     [axes] = figures[0].axes
@@ -201,77 +170,3 @@ def test_fibres_are_drawn_as_wide_as_they_are(tmp_path, figures):
     points_per_mm = 72 * figures[0].get_figwidth() * axes.get_position().width / (x_max - x_min)
     widths = [line.get_linewidth() for line in axes.lines if line.get_color() in (HORIZONTAL, VERTICAL)]
     assert widths == pytest.approx([2.0 * points_per_mm] * 4, rel=1e-3)
-
-
-def test_colours_of_a_mesh_are_named_by_height_above_its_lowest_point(tmp_path, figures):
-    low, high = (trimesh.creation.box(bounds=[(x, 0, 1), (x + 10, 10, z)]) for x, z in ((0, 3), (10, 6)))
-    vertices, faces = np.vstack([low.vertices, high.vertices]), np.vstack([low.faces, high.faces + len(low.vertices)])
-    draw_findings(vertices, faces, [], tmp_path / "mesh.png")
-    assert [text.get_text() for text in figures[0].axes[1].texts] == ["2 mm", "5 mm above the lowest point"]
-
-
-def legend_of(figure: Figure) -> dict[str, Any]:
-    """Return the entries of a legend with their handles."""
-    [legend] = figure.legends
-    return dict(zip([text.get_text() for text in legend.get_texts()], legend.legend_handles, strict=True))
-
-
-def test_legend_of_the_mould_names_every_colour_with_its_height(tmp_path, figures):
-    plan = Plan(level_pad(1.8, 1.2), with_settings({"silicone_mm": 5.5}))
-    findings = [
-        make_finding("warn", (1, 2), (3, 4), name="bend"),
-        make_finding("fail", (5, 6)),
-        make_finding("pass", (7, 8)),
-    ]
-    draw_mould(plan, *mesh_of(plan), findings, tmp_path / "mould.png")
-    entries = legend_of(figures[0])
-    colours = {layer.depth_mm: layer.colour for layer in fibre_layers(plan)}
-    patches = {label: to_hex(entry.get_facecolor()) for label, entry in entries.items() if isinstance(entry, Patch)}
-    assert patches == {
-        "floor": PAPER,
-        "wall, 5.5 mm": FAINT,
-        "mirrored numbers, 0.4 mm": "#8a867d",
-        "horizontal ridges, 2 mm": colours[2.0],
-        "horizontal ridges, 1.2 mm": colours[1.2],
-        "vertical ridges, 0.4 mm": colours[0.4],
-    }
-    assert list(entries)[len(patches) :] == ["fail: wall (1)", "warn: bend (2)"]
-    [axes] = figures[0].axes
-    marks = {line.get_label(): line for line in axes.lines if not str(line.get_label()).startswith("_")}
-    assert {label: (line.get_marker(), line.get_markeredgecolor()) for label, line in marks.items()} == {
-        "fail: wall (1)": ("o", ALARM),
-        "warn: bend (2)": ("D", CARE),
-    }
-    assert np.array(marks["warn: bend (2)"].get_xydata()).tolist() == [[1, 2], [3, 4]]
-    assert (axes.get_xlabel(), axes.get_ylabel()) == ("x (mm)", "y (mm)")
-    x_min, y_min, x_max, y_max = plan.tray.bounds
-    assert (*axes.get_xlim(), *axes.get_ylim()) == pytest.approx((x_min, x_max, y_min, y_max))
-    plain = Plan(plan.pad, with_settings({"number_mm": 0.0}))
-    draw_mould(plain, *mesh_of(plain), [], tmp_path / "mould.png")
-    assert not any("numbers" in label for label in legend_of(figures[1]))
-
-
-def test_tracks_are_labelled_by_depth_with_a_number_at_every_end(tmp_path, figures):
-    plan = Plan(level_pad(1.8, 1.2), with_settings(pad={"leads": "one side"}))
-    draw_tracks(plan, tmp_path / "tracks.png")
-    [axes] = figures[0].axes
-    crossings = len(plan.crossings)
-    assert axes.get_title(loc="left") == f"Fibres as they lie in the tray, from above: 4 fibres, {crossings} crossings"
-    entries = legend_of(figures[0])
-    layers = fibre_layers(plan)
-    labels = [f"{('horizontal', 'vertical')[layer.family]}, {layer.depth_mm:g} mm deep" for layer in layers]
-    assert list(entries) == [*labels, "2 crossings of one family"]
-    assert [entries[label].get_color() for label in labels] == [layer.colour for layer in layers]
-    numbers = [text for text in axes.texts if text.get_text().isdigit()]
-    assert sorted(text.get_text() for text in numbers) == sorted(list("1234") * 2)
-    for text in numbers:
-        fibre = int(text.get_text()) - 1
-        line = np.array(plan.lines[fibre].coords)
-        assert np.hypot(*(line[[0, -1]] - text.xy).T).min() < 3.5  # within the wall
-        assert text.get_color() == (HORIZONTAL, VERTICAL)[plan.family(fibre)]
-        assert (text.get_horizontalalignment(), text.get_verticalalignment()) == ("center", "top")
-    bar = axes.lines[-1].get_xdata()
-    assert bar[1] - bar[0] == pytest.approx(10)
-    assert [text.get_text() for text in axes.texts if "mm" in text.get_text()] == ["10 mm"]
-    note = " ".join(text.get_text() for text in figures[0].texts)
-    assert note == orientation_sentence((2, 2), "one side")

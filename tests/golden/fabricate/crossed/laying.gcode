@@ -1,0 +1,140 @@
+; padforge: the fibres of a pad, laid by a needle
+; 4 fibres in 3 layers, 0.40 m; 1.4 minutes of laying
+; the pad lies turned over, left to right, with its tracks up, on a flat plate
+; seen from above: x to the right, against the pad's, y away from you; fibre 1 starts on the right, nearest
+; z is 0 where the needle touches the upper face; it goes down to -1.698 mm
+; needle of at most 0.37 mm, pad 5.99 mm thick
+; the pad's middle is at X60 Y100; set zero of z by G92 Z0 (Marlin), G10 L20 P1 Z0 (GRBL)
+G21
+G90
+M0 (needle over the pad, zero of z is set)
+G1 Z7.5 F1800
+G1 X108 Y105 Z7.5 F1800
+G1 Z-1.698 F360
+M0 (fibre 2, horizontal 2: fasten its end under the needle)
+G1 X107.7
+G1 X75 F144
+G1 X74.807 Y104.77
+G1 X73.909 Y103.696 F324
+G1 X73.182 Y102.842
+G1 X72.455 Y102.011
+G1 X71.727 Y101.213
+G1 X71 Y100.456
+G1 X70.455 Y99.921
+G1 X70.091 Y99.582
+G1 X69.727 Y99.259
+G1 X69.182 Y98.806
+G1 X68.636 Y98.394
+G1 X68.273 Y98.145
+G1 X68.091 Y98.028
+G1 X67.727 Y97.811
+G1 X67.545 Y97.712
+G1 X67.182 Y97.53
+G1 X67 Y97.448
+G1 X66.636 Y97.304
+G1 X66.455 Y97.242
+G1 X66.091 Y97.138
+G1 X65.909 Y97.096
+G1 X65.545 Y97.035
+G1 X65.364 Y97.016
+G1 X65 Y97
+G1 X54.818 Y97.004
+G1 X54.455 Y97.035
+G1 X54.091 Y97.096
+G1 X53.727 Y97.186
+G1 X53.545 Y97.242
+G1 X53.182 Y97.373
+G1 X52.818 Y97.53
+G1 X52.455 Y97.712
+G1 X52.091 Y97.917
+G1 X51.909 Y98.028
+G1 X51.545 Y98.267
+G1 X51.182 Y98.527
+G1 X50.636 Y98.953
+G1 X50.273 Y99.259
+G1 X49.727 Y99.75
+G1 X49.364 Y100.096
+G1 X48.818 Y100.641
+G1 X48.273 Y101.213
+G1 X47.727 Y101.808
+G1 X47.182 Y102.423
+G1 X46.636 Y103.054
+G1 X45.909 Y103.912
+G1 X45.192 Y104.77
+G1 X45 Y105 F144
+G1 X44.7
+G1 X12 F360
+M0 (fibre 2, horizontal 2: cut it at the needle)
+G1 Z7.5 F1800
+M0 (layer 1 of 3, 2 mm deep: seal it and let it cure)
+G1 X108 Y95
+G1 Z-0.899 F360
+M0 (fibre 1, horizontal 1: fasten its end under the needle)
+G1 X107.7
+G1 X75 F144
+G1 X74.807 Y95.23
+G1 X73.909 Y96.304 F324
+G1 X73.182 Y97.158
+G1 X72.455 Y97.989
+G1 X71.727 Y98.787
+G1 X71 Y99.544
+G1 X70.455 Y100.079
+G1 X70.091 Y100.418
+G1 X69.727 Y100.741
+G1 X69.182 Y101.194
+G1 X68.636 Y101.606
+G1 X68.273 Y101.855
+G1 X68.091 Y101.972
+G1 X67.727 Y102.189
+G1 X67.545 Y102.288
+G1 X67.182 Y102.47
+G1 X67 Y102.552
+G1 X66.636 Y102.696
+G1 X66.455 Y102.758
+G1 X66.091 Y102.862
+G1 X65.909 Y102.904
+G1 X65.545 Y102.965
+G1 X65.364 Y102.984
+G1 X65 Y103
+G1 X54.818 Y102.996
+G1 X54.455 Y102.965
+G1 X54.091 Y102.904
+G1 X53.727 Y102.814
+G1 X53.545 Y102.758
+G1 X53.182 Y102.627
+G1 X52.818 Y102.47
+G1 X52.455 Y102.288
+G1 X52.091 Y102.083
+G1 X51.909 Y101.972
+G1 X51.545 Y101.733
+G1 X51.182 Y101.473
+G1 X50.636 Y101.047
+G1 X50.273 Y100.741
+G1 X49.727 Y100.25
+G1 X49.364 Y99.904
+G1 X48.818 Y99.359
+G1 X48.273 Y98.787
+G1 X47.727 Y98.192
+G1 X47.182 Y97.577
+G1 X46.636 Y96.946
+G1 X45.909 Y96.088
+G1 X45.192 Y95.23
+G1 X45 Y95 F144
+G1 X44.7
+G1 X12 F360
+M0 (fibre 1, horizontal 1: cut it at the needle)
+G1 Z7.5 F1800
+M0 (layer 2 of 3, 1.2 mm deep: seal it and let it cure)
+G1 X65 Y52
+G1 Z-0.1 F360
+M0 (fibre 3, vertical 1: fasten its end under the needle)
+G1 Y148
+M0 (fibre 3, vertical 1: cut it at the needle)
+G1 Z7.5 F1800
+G1 X55 Y52
+G1 Z-0.1 F360
+M0 (fibre 4, vertical 2: fasten its end under the needle)
+G1 Y148
+M0 (fibre 4, vertical 2: cut it at the needle)
+G1 Z7.5 F1800
+M0 (layer 3 of 3, 0.4 mm deep: seal it and let it cure)
