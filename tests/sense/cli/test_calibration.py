@@ -3,8 +3,10 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from padforge.sense import Recording
 from padforge.sense.health.fault_detector import HEALTH_FILES
 from tests.sense.cli.conftest import SPEC, files_in
 
@@ -17,7 +19,13 @@ def test_calibrate_writes_a_document_that_evaluate_agrees_with(few) -> None:
     document = json.loads(out)
     assert document == json.loads(Path("new/calibration.json").read_text())
     assert document["split"] == "chronological"
-    assert document["test"]["press"] == list(range(51, 60))
+    test, row = document["test"], document["errors"][0]
+    assert test["press"] == list(range(51, 60))
+    pressed_mm = Recording.open("rec").presses_mm[51:]
+    np.testing.assert_allclose(test["pressed_mm"], pressed_mm)
+    errors_mm = np.linalg.norm(pressed_mm - test["predicted_mm"], axis=1)
+    expected = [errors_mm.mean(), np.median(errors_mm), np.quantile(errors_mm, 0.95)]
+    assert [row[name] for name in ("mean_mm", "median_mm", "p95_mm")] == pytest.approx(expected)
     for max_failures, levels in (("0", 1), ("8", 4)):  # of 4 fibres one is left
         code, out, _ = few("evaluate", "--model", "new", "rec", "--max-failures", max_failures, "--json")
         assert code == 0

@@ -14,7 +14,7 @@ import scipy.io
 from padforge.common.validation import InputError
 from padforge.sense import Recording, import_bag, import_csv, import_hdf5, import_mat
 from padforge.sense.formats.csv_recording import read_presses
-from padforge.sense.formats.import_export import describe_file, import_file
+from padforge.sense.formats.import_export import import_file
 from padforge.sense.recording.doubts import find_doubts
 
 from .foreign import array, make, pose, write_bag, write_ros1_bag
@@ -379,17 +379,3 @@ def test_import_bag_reads_fields_of_messages(tmp_path: Path) -> None:
 def test_import_bag_reads_bags_of_ros_1(tmp_path: Path) -> None:
     bag = write_ros1_bag(tmp_path / "lab.bag", "/skin", TIMES + 1.7e9, VOLTS)
     check(import_bag(bag, "fibres=/skin"))
-
-
-def test_describe_file_shows_what_a_mapping_may_name(tmp_path: Path) -> None:
-    (tmp_path / "lab.csv").write_text(table("t,c0,c1,c2,c3\nms,V,V,V,V"))
-    assert describe_file(tmp_path / "lab.csv")[1] == "t [ms]: 0.000, 0.050, 0.100, ..."
-    scipy.io.savemat(tmp_path / "lab.mat", {"data": {"t": TIMES}, "name": "pad"})
-    assert describe_file(tmp_path / "lab.mat") == ["data.t: (1, 156) float64, begins 0, 0.05, 0.1", "name: text"]
-    with h5py.File(tmp_path / "lab.h5", "w") as file:
-        file["x"] = MATRIX
-    assert describe_file(tmp_path / "lab.h5")[0].startswith("/x: (156, 6) float64, begins 0, 1.")
-    bag = write_bag(tmp_path / "bag", [("/skin", 0.0, array("Float64MultiArray", VOLTS[0]))])
-    assert describe_file(bag)[0].startswith(
-        "/skin: std_msgs/msg/Float64MultiArray, fields layout.dim (0), layout.data_offset, data (4)"
-    )

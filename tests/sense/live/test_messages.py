@@ -1,23 +1,20 @@
 """What a live pad tells people and programs of events that were made by hand, kept as a whole."""
 
-import contextlib
 import json
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from scipy.stats import norm
 
 from padforge.sense.cli.live import EventPrinter, view_lines
+from padforge.sense.formats.ros_messages import TOUCHES
 from padforge.sense.health.fault_detector import FibreFault
 from padforge.sense.live.outputs import Message, MessageBuilder
 from padforge.sense.live.pipeline import Estimate, Event, OtherPad
-from padforge.sense.live.viewers import SCENE, FoxgloveOutput, RerunOutput
 from tests.helpers.golden import Golden
-from tests.sense.live.test_viewers import FoxgloveClient, decode
 
-AREA = {"centre_mm": [1.0, 2.0], "half_mm": [20.0, 10.0]}
 PLAIN = Estimate(0, 0.25, 0.375, "touch", 2, 0.125, False, 3.26, -4.04, 1.5, 0.5, 2.25, 4.5, (0,))
 DEEP = {"depth_mm": 2.51, "depth_r90_mm": 0.26, "force_n": 1.24, "force_r90_n": 0.15}
 EVENTS: tuple[Event, ...] = (
@@ -64,6 +61,21 @@ def test_lines_over_tcp(golden: Golden, mirrored: bool) -> None:
     golden(f"live/lines{'_mirrored' * mirrored}.txt", "\n".join(map(json.dumps, chosen)))
 
 
+def test_touches_lie_below_the_surface_in_a_right_handed_frame() -> None:
+    """In m, with variances in m^2. From above, y of the plan runs up and x to the right, or to the left if mirrored."""
+    for mirrored in (False, True):
+        for message in (each for each in messages(mirrored) if each.topic == TOUCHES):
+            pad, pose = message.pad, message.msg["pose"]
+            position, covariance = pose["pose"]["position"], np.reshape(pose["covariance"], (6, 6))
+            z_axis = np.cross([-1 if mirrored else 1, 0, 0], [0, 1, 0])
+            above = np.array([pad["x_mm"], pad["y_mm"], np.dot([0, 0, -pad.get("depth_mm", 0)], z_axis)])
+            assert list(position.values()) == pytest.approx(above / 1000)
+            std_z_mm = pad.get("depth_r90_mm", np.nan) / norm.ppf(0.95)
+            variances = (np.array([pad["std_x_mm"], pad["std_y_mm"], std_z_mm]) / 1000) ** 2
+            assert np.diag(covariance)[:3] == pytest.approx(np.nan_to_num(variances, nan=-1), rel=1e-4)
+            assert not (covariance - np.diag(np.diag(covariance))).any()
+
+
 def test_lines_on_a_terminal(golden: Golden, capsys: pytest.CaptureFixture[str]) -> None:
     """Of events, as text and as JSON, and of a view."""
     for as_json in (False, True):
@@ -76,47 +88,3 @@ def test_lines_on_a_terminal(golden: Golden, capsys: pytest.CaptureFixture[str])
     for shown in (view, view | {"pressed": False, "presses": [], "faults": []}):
         print("\n".join(["--", *view_lines(shown)]))
     golden("live/terminal.txt", capsys.readouterr().out)
-
-
-def test_foxglove(golden: Golden) -> None:
-    """All topics with their schemas, and the messages that a client gets that subscribes to all."""
-    sent = messages()
-    with FoxgloveOutput(0, **AREA) as output:
-        for message in sent:
-            output.send(message)
-        client = FoxgloveClient(int(output.url.rpartition(":")[2]))
-        received = client.messages({SCENE, *(message.topic for message in sent)})
-        lines = [str(next(received)[0]["topic"])]  # the health at first, though it was sent before
-        for message in sent:
-            output.send(message)
-        for _ in range(len(sent) + 3):  # a scene with each touch
-            channel, content = next(received)
-            is_scene = channel["topic"] == SCENE
-            text = " ".join(str(decode(channel, content)).split()) if is_scene else content.decode()
-            lines += [] if is_scene else [f"schema {channel['topic']} {channel['schema']}"]
-            lines.append(f"{channel['topic']} {channel['encoding']} {channel['schemaName']} {text}")
-        client.socket.close()
-    golden("live/foxglove.txt", "\n".join(dict.fromkeys(lines)))
-
-
-def test_rerun(golden: Golden, tmp_path: Path) -> None:
-    """All that the file holds but the layout of the viewer."""
-    from rerun.chunk import RrdReader
-
-    path = tmp_path / "pad.rrd"
-    with contextlib.suppress(KeyboardInterrupt), RerunOutput(str(path), 2, **AREA) as output:
-        for message in messages():
-            output.send(message)
-        assert not path.exists()
-        raise KeyboardInterrupt  # the usual end of a live pad
-    assert [file.name for file in tmp_path.iterdir()] == ["pad.rrd"]
-    lines = []
-    for chunk in RrdReader(str(path)).stream():
-        batch = chunk.to_record_batch()
-        columns = {
-            name: batch.column(name).to_pylist() for name in batch.schema.names if ":" in name or name == "pad_time"
-        }
-        lines += [
-            f"{chunk.entity_path} {name}: {values}" for name, values in columns.items() if "Blueprint" not in name
-        ]
-    golden("live/rerun.txt", "\n".join(sorted(lines)))

@@ -50,7 +50,7 @@ def test_program_reads_a_board(
 ) -> None:
     """A board that prints 106 lines a second, until it is unplugged."""
     stream = repeated(recording, 8)
-    times_s, rows = iter(stream.times_s[:3000].tolist()), iter(stream.readings[:3000])
+    times_s, rows = iter(stream.times_s[:1500].tolist()), iter(stream.readings[:1500])
 
     class Board:
         def __init__(self, port: str, baud: int) -> None:
@@ -71,4 +71,4 @@ def test_program_reads_a_board(
         patched.setattr(time, "monotonic", lambda: next(times_s))
         with pytest.raises(StopIteration):
             exec(PROGRAMS[1], {})
-    assert check_places(capsys.readouterr().out, recording) > 100
+    assert check_places(capsys.readouterr().out, recording) > 40

@@ -7,27 +7,18 @@ import os
 import socket
 import struct
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 
 from padforge.common.validation import InputError
-from padforge.sense.formats.ros_messages import HEALTH, PRESSED, READINGS, TOUCHES
 from padforge.sense.live.viewers import SCENE, FoxgloveOutput, RerunOutput
-from tests.sense.live.test_outputs import DOWN, READING, STATES, TOUCH
+from tests.helpers.golden import Golden
+from tests.sense.live.test_messages import messages
 
-AREA = {"centre_mm": [1.0, 2.0], "half_mm": [10.0, 5.0]}
-POSE = {"pose": {"pose": {"position": {"x": 0.0015, "y": -0.00225, "z": -0.001}}}}
-SENT = [
-    replace(STATES, msg={"status": [{"level": 0, "name": "pad: fibre 1", "message": "sound"}]}),
-    replace(READING, msg={"data": [None, 1.0]}),
-    replace(DOWN, msg={"data": True}, pad={"time_s": 0.5, **DOWN.pad}),
-    replace(TOUCH, msg=POSE, pad={"now_s": 0.75, **TOUCH.pad}),
-]
+AREA = {"centre_mm": [1.0, 2.0], "half_mm": [20.0, 10.0]}
 
 
 class FoxgloveClient:
@@ -71,31 +62,6 @@ class FoxgloveClient:
             elif code == 2 and content[0] == 1:
                 (subscription,) = struct.unpack("<I", content[1:5])
                 yield channels[subscription], content[13:]
-
-
-def test_foxglove_gets_messages_and_a_scene() -> None:
-    with FoxgloveOutput(0, **AREA) as output:
-        for message in SENT:
-            output.send(message)
-        client = FoxgloveClient(int(output.url.rpartition(":")[2]))
-        messages = client.messages({READINGS, PRESSED, TOUCHES, HEALTH, SCENE})
-        channel, content = next(messages)  # the health at first, though it was sent before
-        assert (channel["topic"], json.loads(content)) == (HEALTH, SENT[0].msg)
-        assert (channel["schemaName"], channel["encoding"]) == ("diagnostic_msgs/msg/DiagnosticArray", "json")
-        for message in SENT[1:]:
-            output.send(message)
-        received = [next(messages) for _ in range(4)]
-        client.socket.close()
-    assert [channel["topic"] for channel, _ in received] == [READINGS, PRESSED, TOUCHES, SCENE]
-    for message, (channel, content) in zip(SENT[1:], received[:3], strict=True):
-        assert json.loads(content) == message.msg
-        assert json.loads(channel["schema"])["properties"].keys() == message.msg.keys()
-    assert json.loads(received[0][0]["schema"])["properties"]["data"]["items"] == {"type": "number"}
-    (entity,) = decode(*received[3]).entities
-    (disc,), (area,) = entity.cylinders, entity.cubes
-    assert (disc.pose.position.x, disc.pose.position.y, disc.pose.position.z) == (0.0015, -0.00225, -0.001)
-    assert (disc.size.x, disc.size.y, disc.top_scale) == (0.002, 0.002, 1)
-    assert (area.pose.position.x, area.pose.position.y, area.size.x, area.size.y) == (0.001, 0.002, 0.02, 0.01)
 
 
 @pytest.mark.parametrize(
@@ -147,31 +113,6 @@ def test_foxglove_names_a_port_in_use() -> None:
             FoxgloveOutput(port, **AREA)
 
 
-def test_rerun_writes_a_file(tmp_path: Path) -> None:
-    from rerun.chunk import RrdReader
-
-    path = tmp_path / "pad.rrd"
-    with contextlib.suppress(KeyboardInterrupt), RerunOutput(str(path), 2, **AREA) as output:
-        for message in SENT:
-            output.send(message)
-        assert not path.exists()
-        raise KeyboardInterrupt  # the usual end of a live pad
-    assert [file.name for file in tmp_path.iterdir()] == ["pad.rrd"]
-    chunks = {(chunk.entity_path, chunk.is_static): chunk.to_record_batch() for chunk in RrdReader(str(path)).stream()}
-
-    def value(entity: str, column: str, is_static: bool = False) -> Any:
-        return chunks[entity, is_static].column(column)[0].as_py()
-
-    np.testing.assert_array_equal(value("/readings", "Scalars:scalars"), [1.0, np.nan])
-    assert value("/readings", "SeriesLines:names", is_static=True) == ["fibre 1", "fibre 2"]
-    assert chunks["/pressed", False].column("Scalars:scalars").to_pylist() == [[0.0], [1.0]]
-    assert value("/health", "TextLog:text") == ["fibre 1: sound, fibre 2: stuck"]
-    assert value("/pad/touch", "Ellipsoids3D:centers") == [[1.5, -2.25, -1.0]]
-    assert value("/pad/touch", "Ellipsoids3D:half_sizes") == [[1.0, 1.0, 0.5]]
-    assert value("/pad/area", "Boxes3D:half_sizes", is_static=True) == [[10.0, 5.0, 0.0]]
-    assert chunks["/pad/touch", False].column("pad_time")[0].value == 750_000_000  # ns
-
-
 @pytest.mark.parametrize(
     ("target", "error"),
     [
@@ -187,3 +128,44 @@ def test_rerun_refuses_other_targets(tmp_path: Path, monkeypatch: pytest.MonkeyP
     Path("file").write_text("")
     with pytest.raises(InputError, match=error):
         RerunOutput(target, 2, **AREA)
+
+
+def test_foxglove(golden: Golden) -> None:
+    """All topics with their schemas, and the messages that a client gets that subscribes to all."""
+    sent = messages()
+    with FoxgloveOutput(0, **AREA) as output:
+        for message in sent:
+            output.send(message)
+        client = FoxgloveClient(int(output.url.rpartition(":")[2]))
+        received = client.messages({SCENE, *(message.topic for message in sent)})
+        lines = [str(next(received)[0]["topic"])]  # the health at first, though it was sent before
+        for message in sent:
+            output.send(message)
+        for _ in range(len(sent) + 3):  # a scene with each touch
+            channel, content = next(received)
+            is_scene = channel["topic"] == SCENE
+            text = " ".join(str(decode(channel, content)).split()) if is_scene else content.decode()
+            lines += [] if is_scene else [f"schema {channel['topic']} {channel['schema']}"]
+            lines.append(f"{channel['topic']} {channel['encoding']} {channel['schemaName']} {text}")
+        client.socket.close()
+    golden("live/foxglove.txt", "\n".join(dict.fromkeys(lines)))
+
+
+def test_rerun(golden: Golden, tmp_path: Path) -> None:
+    """All that the file holds but the layout of the viewer."""
+    from rerun.chunk import RrdReader
+
+    path = tmp_path / "pad.rrd"
+    with contextlib.suppress(KeyboardInterrupt), RerunOutput(str(path), 2, **AREA) as output:
+        for message in messages():
+            output.send(message)
+        assert not path.exists()
+        raise KeyboardInterrupt  # the usual end of a live pad
+    assert [file.name for file in tmp_path.iterdir()] == ["pad.rrd"]
+    lines = []
+    for chunk in RrdReader(str(path)).stream():
+        batch = chunk.to_record_batch()
+        names = [name for name in batch.schema.names if ":" in name or name == "pad_time"]
+        if "RecordingInfo" not in names[0]:
+            lines += [f"{chunk.entity_path} {name}: {batch.column(name).to_pylist()}" for name in names]
+    golden("live/rerun.txt", "\n".join(sorted(lines)))

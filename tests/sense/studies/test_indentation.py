@@ -12,7 +12,7 @@ from padforge.sense.studies import indentation
 from padforge.sense.studies.indentation import FOOTPRINTS, SETS, circumradius, force_study, shape_study, tool_contacts
 from padforge.sense.studies.study import Sizes, Study, run
 
-PADS = {"square": Morphology.straight(2), "random": Morphology.random(2, 2, 0)}
+PAD = {"random": Morphology.random(2, 2, 0)}
 UNIT_MM = 11.25
 MIDDLE_ERROR_MM = UNIT_MM * 0.38
 """Mean distance of presses from the middle of the pad."""
@@ -23,9 +23,9 @@ def test_force_study_estimates_depth_and_force_better_than_guessing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(indentation, "FORCE_NOISES", (1.0, 100.0))
-    monkeypatch.setattr(contact, "DEPTH_STEPS", 6)
-    force = run(force_study(PADS, sizes=Sizes(300, 120, hidden=12, epochs=25)), tmp_path)
-    expected = [(label, noise) for label in PADS for noise in (1.0, 100.0)]
+    monkeypatch.setattr(contact, "DEPTH_STEPS", 4)
+    force = run(force_study(PAD, sizes=Sizes(300, 120, hidden=12, epochs=25)), tmp_path)
+    expected = [(label, noise) for label in PAD for noise in (1.0, 100.0)]
     assert [(row["pad"], row["noise_counts"]) for row in force["rows"]] == expected
     for row in force["rows"]:
         assert 0 < row["depth_mm"] < 0.7 * row["depth_guessed_mm"]
@@ -47,7 +47,7 @@ def test_tools_have_one_size_and_the_layer_of_the_contact() -> None:
 @pytest.mark.parametrize("study", [force_study, shape_study])
 def test_contact_without_depth_is_refused(study: Callable[..., Study]) -> None:
     with pytest.raises(InputError, match=r"\[contact\] model is shape, allowed is layer"):
-        study(PADS, contact=Contact(radius=0.6))
+        study(PAD, contact=Contact(radius=0.6))
 
 
 @pytest.mark.parametrize("sides", FOOTPRINTS.values())
@@ -59,9 +59,9 @@ def test_circumradius_gives_polygons_of_one_area(sides: int | None) -> None:
 
 @pytest.mark.slow
 def test_shape_study_classifies_better_than_chance(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(contact, "DEPTH_STEPS", 6)
-    shapes = run(shape_study(PADS, sizes=Sizes(500, 200, hidden=12, epochs=25)), tmp_path)
-    assert [(row["pad"], row["shapes"]) for row in shapes["rows"]] == [(label, kind) for label in PADS for kind in SETS]
+    monkeypatch.setattr(contact, "DEPTH_STEPS", 4)
+    shapes = run(shape_study(PAD, sizes=Sizes(300, 120, hidden=12, epochs=25)), tmp_path)
+    assert [(row["pad"], row["shapes"]) for row in shapes["rows"]] == [(label, kind) for label in PAD for kind in SETS]
     for row in shapes["rows"]:
         assert row["accuracy_percent"] > row["majority_percent"] + 5
         assert 0 < row["position_mm"] < MIDDLE_ERROR_MM
