@@ -129,8 +129,9 @@ def figure_text(figure: Figure) -> str:
     """What a figure shows: titles, axes, limits, and the data and colours of lines, marks, images and texts."""
     lines = [f"figure {figure.get_figwidth():.3g} x {figure.get_figheight():.3g} in: {figure.get_suptitle()!r}"]
     for axes in figure.axes:
+        title = axes.get_title() or axes.get_title(loc="left")
         limits = f"x {_numbers(axes.get_xlim())} {axes.get_xscale()}, y {_numbers(axes.get_ylim())} {axes.get_yscale()}"
-        lines.append(f"axes {axes.get_title()!r}: {axes.get_xlabel()!r}, {axes.get_ylabel()!r}; {limits}")
+        lines.append(f"axes {title!r}: {axes.get_xlabel()!r}, {axes.get_ylabel()!r}; {limits}")
         for name in ("x", "y"):
             ticks = [label.get_text() for label in getattr(axes, f"get_{name}ticklabels")()]
             if any(ticks) and axes.axison:
