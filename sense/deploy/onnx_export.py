@@ -282,6 +282,8 @@ def _build_graph(model: LocalizerModel, digest: str) -> onnx.ModelProto:
     graph = onnx.load_model_from_string(content.getvalue())
     for each in (*graph.graph.input, *graph.graph.output):
         each.doc_string = (INPUTS | OUTPUTS)[each.name]
+    for each in graph.graph.output[:2]:  # positions and deviations, whose size is traced as unknown
+        each.type.tensor_type.shape.dim[1].dim_value = 2
     graph.producer_name = "padforge"
     metadata = {
         "format": FORMAT,

@@ -411,14 +411,13 @@ def calibration_lines(document: Mapping[str, Any]) -> list[str]:
         if names[0] in rows[0]:
             header = "failed  sets   mean    p95  in r90"
             lines += table(f"error of {kind} in {unit}", header, names, [f"{kind}_within_r90"])
+    return [*lines, *([BUILT_PAD] if is_simulated else []), *reserve_lines(document)]
+
+
+def reserve_lines(document: Mapping[str, Any]) -> list[str]:
+    """Say in lines with what reserve a calibration document is to be read: training, radii, and what is doubtful."""
     doubts = [f"doubtful: {doubt}" for doubt in document.get("doubts", ())]
-    return [
-        *lines,
-        *([BUILT_PAD] if is_simulated else []),
-        *untrained_lines(document),
-        *sureness_lines(document),
-        *doubts,
-    ]
+    return [*untrained_lines(document), *sureness_lines(document), *doubts]
 
 
 def untrained_lines(document: Mapping[str, Any]) -> list[str]:

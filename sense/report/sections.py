@@ -17,7 +17,7 @@ from padforge.common.page import PageSection, collapsible, columns, figures, hea
 from padforge.common.plotting import ALARM, INK
 from padforge.common.validation import InputError
 from padforge.sense.arrays import MAX_FIBRES
-from padforge.sense.localizer.evaluation import BUILT_PAD, untrained_lines
+from padforge.sense.localizer.evaluation import BUILT_PAD, reserve_lines
 from padforge.sense.recording.recording import Recording
 from padforge.sense.recording.run_directory import JOURNAL, read_journal
 
@@ -95,7 +95,7 @@ def calibration_sections(folder: Path, document: Mapping[str, Any]) -> list[Page
             [paragraph(f"Errors are {BUILT_PAD} with 0 / 1 / 2 / 3 of 6 fibres failed, after 4500 presses.")]
             * simulated
         ),
-        *map(paragraph, untrained_lines(document)),
+        *map(paragraph, reserve_lines(document)),
         paragraph(
             "Mean, standard deviation and worst are over the sets of failed fibres; median and 95th percentile over all"
             " their presses."

@@ -19,6 +19,7 @@ from padforge.sense import settings as sense_settings
 from padforge.sense.localizer import calibration, evaluation
 from padforge.sense.localizer.model import LocalizerModel
 from padforge.sense.localizer.moments import MOMENTS
+from padforge.sense.localizer.network import Weights
 from padforge.sense.rig.arms.ur5 import UR5
 from padforge.sense.rig.devices import RigFault
 from padforge.sense.simulation.simulated_recording import simulate
@@ -101,6 +102,28 @@ def localizer(calibrated: tuple[LocalizerModel, Evaluation]) -> LocalizerModel:
     return calibrated[0]
 
 
+def without_training(weights: Weights, expected_error: float) -> Weights:
+    """Weights of networks that answer 0, and expect such an error of it."""
+    still = {name: np.zeros_like(part) for name, part in weights.items()}
+    still["last.b"][..., still["last.b"].shape[-1] // 2 :] = np.log(expected_error)
+    return still
+
+
+@pytest.fixture(scope="session")
+def bayesian_localizer(localizer: LocalizerModel) -> LocalizerModel:
+    """The Bayesian localizers alone, whose answers no training has touched: they are the same on every processor."""
+    networks = {name: without_training(weights, 0.4) for name, weights in localizer.networks.items()}
+    moments, levels = np.ogrid[: localizer.interval_factors.shape[0], : localizer.interval_factors.shape[1]]
+    growth = (2.0 - moments / 17) * (1 + 0.1 * levels)
+    return replace(
+        localizer,
+        networks=networks,
+        residual_network=without_training(localizer.residual_network, 0.05),
+        interval_factors=growth[:, :, None] * [0.5, 0.3, 0.9],
+        errors=(),
+    )
+
+
 @pytest.fixture(scope="session")
 def deep_recording(once: Once) -> Recording:
     """400 presses of 0.5 to 5 mm, each as hard as a spring would have it, on a pad whose responses do not scatter.
@@ -122,7 +145,12 @@ def deep_recording(once: Once) -> Recording:
 @pytest.fixture(scope="session")
 def deeply_calibrated(once: Once, deep_recording: Recording) -> tuple[LocalizerModel, Evaluation]:
     options = QUICK.model_copy(update={"members": 1, "epochs": 12})
-    return once("deeply-calibrated", lambda folder: calibrate(deep_recording, options))
+
+    @few_moments()
+    def make(folder: Path) -> tuple[LocalizerModel, Evaluation]:
+        return calibrate(deep_recording, options, by_moment=False)
+
+    return once("deeply-calibrated", make)
 
 
 @pytest.fixture(scope="session")

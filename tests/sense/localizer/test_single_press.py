@@ -103,12 +103,13 @@ def test_two_fingers_are_unlike_a_press_and_single_ones_are_not(
 
 def test_stronger_presses_and_failed_fibres_are_no_second_finger(trained: Trained, pad: Recording) -> None:
     presses = trained.later(pad)
+    presses, whole = presses[::2], presses
     for strength in (0.5, 2.0):
         inputs = (strength * (presses.inputs + trained.zero) - trained.zero).astype(np.float32)
         assert find_unlike(trained.tests, replace(presses, inputs=inputs)).mean() <= 0.12
-    failed = [find_unlike(trained.tests, trained.later(fail(pad, [fibre]))).mean() for fibre in range(pad.fibres)]
+    failed = [find_unlike(trained.tests, trained.later(fail(pad, [fibre]))[::2]).mean() for fibre in range(pad.fibres)]
     assert np.mean(failed) <= 0.1
-    masked = replace(presses, fibre_mask=np.tile(np.arange(pad.fibres) != 2, (len(presses), 1)))
+    masked = replace(whole, fibre_mask=np.tile(np.arange(pad.fibres) != 2, (len(whole), 1)))
     assert find_unlike(trained.tests, masked).mean() <= 0.04
 
 
@@ -148,7 +149,7 @@ def test_pads_cast_again_are_other_pads(trained: Trained, others: list[Recording
 def test_pads_that_drift_or_have_failed_fibres_are_no_other_pads(trained: Trained, pad: Recording) -> None:
     rng = np.random.default_rng(3)
     rest_v = np.median(pad.readings, axis=0)
-    gains = np.exp(0.1 * rng.standard_normal((10, pad.fibres)))
+    gains = np.exp(0.1 * rng.standard_normal((3, pad.fibres)))
     drifted = [rest_v + 0.1 * rng.standard_normal(pad.fibres) + gain * (pad.readings - rest_v) for gain in gains]
     changed = [pad, fail(pad, [1]), fail(pad, [0, 4]), *(replace(pad, readings=readings) for readings in drifted)]
     inverted = np.array(pad.readings)
@@ -158,7 +159,7 @@ def test_pads_that_drift_or_have_failed_fibres_are_no_other_pads(trained: Traine
     changed += [replace(pad, readings=inverted), replace(pad, readings=swapped)]
     for recording in changed:
         presses = trained.later(recording)
-        for first in range(0, len(presses) - MIN_PRESSES, 40):
+        for first in range(0, len(presses) - MIN_PRESSES, 90):
             assert not trained.is_other_pad(presses[first : first + MIN_PRESSES])
 
 

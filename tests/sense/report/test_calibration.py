@@ -1,63 +1,180 @@
-"""Figures of a calibration show what its document says."""
+"""What a calibration leaves: its document, lines, tables and figures, kept whole, and what they say of its presses."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from padforge.sense.localizer.evaluation import Evaluation
+from padforge.common.page import PageSection
+from padforge.sense import Evaluation, LocalizerSettings, Recording, evaluate
+from padforge.sense.localizer import evaluation as evaluation_module
+from padforge.sense.localizer.evaluation import calibration_lines, moment_lines
+from padforge.sense.localizer.model import LocalizerModel, write_localization
+from padforge.sense.localizer.moments import MOMENTS
+from padforge.sense.recording.run_directory import Recorder
 from padforge.sense.report import calibration
+from padforge.sense.report.sections import calibration_sections, fibre_loss_sections, recording_sections
+from tests.helpers.documents import document_text
+from tests.helpers.golden import page_text
+from tests.sense.conftest import first_presses
+
+TEST = (1, 2, 4, 5, 7)
 
 
-@pytest.fixture
-def figures(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
-    """Those that are drawn; nothing is written."""
-    drawn: list[Any] = []
-    monkeypatch.setattr(calibration, "save_figure", lambda figure, path: drawn.append(figure))
-    return drawn
+@pytest.fixture(scope="module")
+def few(recording: Recording) -> Recording:
+    return first_presses(recording, 8)
 
 
-def make_evaluation(**parts: object) -> Evaluation:
-    empty = {"errors": [], "by_subset": [], "by_position": [], "by_moment": [], "focus": {}, "idle_share": []}
-    rest = {"split": "random", "test_presses": 3, "test": {}, "provenance": {}}
-    return Evaluation(**(empty | rest | parts))  # type: ignore[arg-type]
-
-
-def test_error_map_draws_true_positions_with_lines_to_those_predicted(figures: list[Any]) -> None:
-    """Errors of 3, 5 and 10 mm."""
-    pressed = [[0.0, 0.0], [10.0, 0.0], [0.0, -20.0]]
-    predicted = [[0.0, 3.0], [13.0, 4.0], [-10.0, -20.0]]
-    calibration.draw_error_map(
-        make_evaluation(test={"pressed_mm": pressed, "predicted_mm": predicted}), Path("none.png")
+@pytest.fixture(scope="module")
+def kept(few: Recording, bayesian_localizer: LocalizerModel) -> tuple[LocalizerModel, Evaluation]:
+    """As after a training on presses 0, 3 and 6."""
+    origin = {"command": "padforge sense calibrate", "seed": 1, "inputs": {"recording": few.digest}}
+    model = replace(
+        bayesian_localizer,
+        training_recording_sha256=few.digest,
+        test=TEST,
+        provenance=origin,
+        radii_presses=24,
+        trained_share=0.25,
     )
-    axes = figures[0].axes[0]
-    lines, dots = axes.collections
-    assert [segment.tolist() for segment in lines.get_segments()] == np.stack([pressed, predicted], axis=1).tolist()
-    assert np.asarray(dots.get_offsets()).tolist() == pressed
-    assert np.asarray(dots.get_array()).tolist() == [3.0, 5.0, 10.0]
-    assert axes.get_title("left").startswith("3 presses never trained on: mean error 6.00 mm")
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(evaluation_module, "MOMENTS", MOMENTS[::4])
+        evaluation = evaluate(model, few, (0, 1, 2))
+    simulated = evaluation.provenance | {"recording_kind": "simulated"}
+    settings = LocalizerSettings().model_dump()
+    return model, replace(evaluation, training_presses=3, settings=settings, provenance=simulated)
 
 
-def test_errors_by_moment_are_drawn_by_time_and_failed_fibres(figures: list[Any]) -> None:
-    rows = [
-        {"since": since, "n_failed": n_failed, "time_s": time_s, "mean_mm": (1 + n_failed) * (scale + time_s)}
-        for since, scale in (("touch", 2.0), ("lift", 1.0))
-        for time_s in (0.1, 0.2)
-        for n_failed in (0, 1)
+def sections_text(sections: list[PageSection]) -> str:
+    parts = [[f"<h2>{section.title}</h2>", *section.body] for section in sections]
+    results = [f"{value}: {what}" for section in sections for value, what in section.figures]
+    return "\n".join([*results, page_text("<main>" + "".join(part for body in parts for part in body) + "</main>")])
+
+
+@pytest.mark.usefixtures("blank")
+def test_calibration_is_kept_whole(
+    kept: tuple[LocalizerModel, Evaluation],
+    few: Recording,
+    figures: list[Any],
+    golden: Any,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(calibration, "calibrate", lambda *_, **__: kept)
+    document = calibration.calibrate_into(few, tmp_path, LocalizerSettings(), without={"health"})
+    assert {file.name for file in tmp_path.iterdir()} == {name for name in calibration.FILES if "health" not in name}
+    golden("sense/calibration/calibration.json", document_text(document), rtol=1e-3)
+    lines = [*calibration_lines(document), *moment_lines(document["by_moment"])]
+    golden("sense/calibration/lines.txt", "\n".join(lines), rtol=1e-3)
+    golden("sense/calibration/page.md", sections_text(calibration_sections(tmp_path, document)), rtol=1e-3)
+    for name, figure in zip(("error_map", "error_by_loss", "error_by_moment"), figures, strict=True):
+        golden(f"sense/calibration/{name}.txt", figure, rtol=1e-2)
+
+
+def test_numbers_of_a_calibration_are_those_of_its_presses(
+    kept: tuple[LocalizerModel, Evaluation], few: Recording
+) -> None:
+    """Recomputed from positions and radii that the document lists, and from predictions without each set of fibres."""
+    model, evaluation = kept
+    test = evaluation.test
+    assert test["press"] == list(TEST)
+    assert test["pressed_mm"] == few.presses_mm[list(TEST)].tolist()
+    errors = np.hypot(*(np.array(test["predicted_mm"]) - test["pressed_mm"]).T)
+    row = evaluation.errors[0]
+    assert (row["mean_mm"], row["median_mm"]) == pytest.approx((errors.sum() / 5, sorted(errors)[2]))
+    assert row["within_r90"] == sum(errors <= test["r90_mm"]) / 5
+    cells = evaluation.by_position
+    assert sum(cell["presses"] * cell["mean_mm"] for cell in cells) == pytest.approx(errors.sum())
+    assert max(cell["max_mm"] for cell in cells) == pytest.approx(max(errors))
+    for each in evaluation.by_subset:
+        found = model.predict(few, each["failed"])
+        away = np.hypot(*(found.positions_mm - few.presses_mm)[list(TEST)].T)
+        assert each["mean_mm"] == pytest.approx(away.mean(), rel=1e-4)
+    for row in evaluation.errors:
+        means = [each["mean_mm"] for each in evaluation.by_subset if len(each["failed"]) == row["n_failed"]]
+        assert len(means) == row["subsets"]
+        assert (row["mean_mm"], row["max_mm"]) == pytest.approx((sum(means) / len(means), max(means)))
+    focused = TEST.index(evaluation.focus["press"])
+    assert evaluation.focus["pressed_mm"] == test["pressed_mm"][focused]
+    assert evaluation.focus["moments"][-1]["predicted_mm"] == pytest.approx(test["predicted_mm"][focused], abs=0.5)
+
+
+def test_places_are_kept_whole(
+    kept: tuple[LocalizerModel, Evaluation], few: Recording, golden: Any, tmp_path: Path
+) -> None:
+    model, evaluation = kept
+    write_localization(model.predict(few), tmp_path / "places.csv")
+    golden("sense/calibration/places.csv", (tmp_path / "places.csv").read_text(), rtol=1e-3)
+    rows = np.genfromtxt(tmp_path / "places.csv", delimiter=",", names=True)
+    found = np.column_stack([rows["x_mm"], rows["y_mm"]])[list(TEST)]
+    np.testing.assert_allclose(found, evaluation.test["predicted_mm"], atol=1e-4)
+    assert rows["r90_mm"][list(TEST)] == pytest.approx(evaluation.test["r90_mm"], abs=1e-4)
+
+
+MEASURED = {"depth_mean_mm": 0.214, "depth_p95_mm": 0.523, "depth_within_r90": 0.87}
+MEASURED |= {"force_mean_n": 1.04, "force_p95_n": 2.66, "force_within_r90": 0.913}
+
+
+def make_row(n_failed: int, subsets: int, **more: float) -> dict[str, float]:
+    """Of errors that all differ."""
+    errors = {"mean_mm": 1.5, "std_mm": 0.25, "max_mm": 2.0, "median_mm": 1.25, "p95_mm": 3.5}
+    row = {name: (1 + n_failed) * value for name, value in errors.items()}
+    return {"n_failed": n_failed, "subsets": subsets, **row, "within_r50": 0.512, "within_r90": 0.907, **more}
+
+
+def test_depth_force_and_losses_of_six_fibres_are_kept_whole(golden: Any, tmp_path: Path) -> None:
+    """Of a rig, with depth and force; and the sets of up to three of six fibres, of errors that grow with their sum."""
+    by_subset = [
+        {"failed": [fibre for fibre in range(6) if chosen >> fibre & 1], "mean_mm": 1 + 0.13 * chosen**0.75}
+        for chosen in range(64)
+        if chosen.bit_count() <= 3
     ]
-    moments = [{"predicted_mm": [1.0, 2.0], "r90_mm": 8.0}, {"predicted_mm": [1.5, 3.0], "r90_mm": 4.0}]
-    evaluation = make_evaluation(by_moment=rows, focus={"pressed_mm": [2.0, 3.0], "moments": moments})
-    calibration.draw_errors_by_moment(evaluation, Path("none.png"))
-    touch, lift, focus = figures[0].axes
-    for axes, since, scale in ((touch, "touch", 2.0), (lift, "lift", 1.0)):
-        for n_failed, line in enumerate(axes.lines):
-            assert (line.get_label(), list(line.get_xdata())) == (f"{n_failed} failed", [0.1, 0.2])
-            assert line.get_ydata() == pytest.approx([(1 + n_failed) * (scale + time_s) for time_s in (0.1, 0.2)])
-        assert axes.get_xlabel() == f"since the {since} (s)"
-    early, late = focus.patches
-    assert [(tuple(circle.center), circle.radius) for circle in (early, late)] == [((1.0, 2.0), 8.0), ((1.5, 3.0), 4.0)]
-    assert early.get_alpha() < late.get_alpha()
-    path, cross = focus.lines
-    assert path.get_xydata().tolist() == [[1.0, 2.0], [1.5, 3.0]]
-    assert cross.get_xydata().tolist() == [[2.0, 3.0]]
+    document = {
+        "errors": [make_row(0, 1, **MEASURED), make_row(3, 20, **{name: 0.9 * x for name, x in MEASURED.items()})],
+        "test_presses": 45,
+        "split": "chronological",
+        "idle_share": [0.1, 0.25, 0.333, 0, 1, 0.5],
+        "by_subset": by_subset,
+        "by_moment": [],
+        "provenance": {"recording_kind": "rig"},
+        "trained_share": 1.0,
+        "radii_presses": 100,
+        "doubts": ["presses may be in inches"],
+    }
+    golden("sense/calibration/lines_of_a_rig.txt", "\n".join(calibration_lines(document)))
+    sections = calibration_sections(tmp_path, document)
+    golden("sense/calibration/page_of_a_rig.md", sections_text(sections))
+    [section] = fibre_loss_sections(tmp_path, document)
+    chart = next(str(part) for part in section.body if "<svg" in part)
+    drawn = chart.partition("<svg")[2].partition("</svg>")[0].replace("><", ">\n<")
+    golden("sense/calibration/loss_chart.svg.txt", drawn)
+    of_two = [{"failed": [], "mean_mm": 1.0}, {"failed": [0], "mean_mm": 7.5}, {"failed": [1], "mean_mm": 3.0}]
+    methods = {"one network": document | {"by_subset": of_two}, "retrained": document | {"by_subset": of_two[:2]}}
+    study = {"methods": methods, "test_presses": 45}
+    golden("sense/calibration/page_of_losses.md", sections_text(fibre_loss_sections(tmp_path, study)))
+
+
+def test_recordings_are_described_whole(golden: Any, tmp_path: Path) -> None:
+    """Of a rig that measures depth and force, of hand presses, of a simulation and of a file."""
+    depths, forces = [1.0, 2.0, 6.0], [3.0, 4.5, 9.0]
+    rig = {"rate_hz": 13.3, "depths_mm": [1.0, 2.0, 6.0]}
+    with Recorder(tmp_path / "recording", 1, {"kind": "rig", "rig": rig}, {}) as recorder:
+        recorder.append(np.arange(10) / 10, np.zeros((10, 1)))
+        for press, (depth, force) in enumerate(zip(depths, forces, strict=True)):
+            recorder.begin((0, press), 3 * press + 1, depth_mm=depth)
+            recorder.finish(3 * press + 2, force_n=force)
+    sources: dict[str, Any] = {
+        "rig": {"kind": "rig", "rig": rig},
+        "hand": {"kind": "hand", "rig": {"rate_hz": 20.0}},
+        "simulated": {"kind": "simulated", "twin": {}, "rig": {"rate_hz": 13.3, "depth_mm": 5.0}},
+        "file": {"kind": "mat", "file": "para5.mat"},
+    }
+    texts = []
+    for name, source in sources.items():
+        folder = tmp_path if name == "rig" else tmp_path / "elsewhere"
+        texts.append(sections_text(recording_sections(folder, {"fibres": 6, "source": source})))
+    golden("sense/calibration/recordings.md", "\n\n".join(texts))
+    assert f"force (N) | 3 | 3.00 | {sorted(forces)[1]:.2f} | 9.00" in texts[0]

@@ -1,6 +1,7 @@
-"""Figures and texts of an identification show what was identified."""
+"""What an identification leaves: its document, lines, section and figures, kept whole, and what they say of the fit."""
 
 import json
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -11,34 +12,92 @@ import pytest
 
 from padforge.common.plotting import FAINT, HORIZONTAL, VERTICAL
 from padforge.design.paths.curves import flatten
+from padforge.design.settings import Contact
 from padforge.sense.report import identification as report
-from padforge.sense.report.identification import identification_sections, identify_into
-from padforge.sense.twin.identification import Identification
+from padforge.sense.report.identification import identification_lines, identification_sections, identify_into
+from padforge.sense.twin.contact_fit import ContactFit
+from padforge.sense.twin.identification import Identification, MeasuredContact
 from padforge.sense.twin.wiring import Wiring
+from tests.helpers.documents import document_text
+from tests.helpers.golden import page_text
+
+Identified = tuple[dict[str, Any], list[Any]]
 
 
 @pytest.fixture
-def write_identification(identification: Identification, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Any:
-    """Return a function to its document, which is written, and its two figures, which are not."""
+def identify(
+    identification: Identification, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, figures: list[Any]
+) -> Callable[..., Identified]:
+    """Return a function to the document and the figures, of which nothing is saved."""
 
-    def write(**changes: object) -> tuple[dict[str, Any], Any, Any]:
-        drawn: list[Any] = []
-        monkeypatch.setattr(report, "save_figure", lambda figure, path: drawn.append(figure))
+    def identify(**changes: object) -> Identified:
+        monkeypatch.setattr(report, "save_figure", lambda figure, path: None)
         monkeypatch.setattr(report, "identify_pad", lambda *_: replace(identification, **changes))
         document = identify_into(Mock(mirrored=True), identification.pad, tmp_path)
         assert json.loads((tmp_path / "identification.json").read_text()) == json.loads(json.dumps(document))
-        return document, *drawn
+        return document, figures
 
-    return write
+    return identify
 
 
-def test_responses_are_drawn_in_millivolts_on_one_scale_a_channel(
-    identification: Identification, write_identification: Any
+def make_contact() -> MeasuredContact:
+    """Four numbers that differ in each of three fits."""
+    as_built = ContactFit(1.114, 1.366, 0.634, 0.021, 0.047, 0.936)
+    on_plan = ContactFit(1.021, 1.204, 0.796, 0.032, 0.058, 0.681)
+    gaussian = ContactFit(1.333, 2.0, 0.0, 0.043, 0.0, 0.612)
+    return MeasuredContact(Contact(depth_mm=4.0), as_built, on_plan, gaussian)
+
+
+def test_identification_is_kept_whole(
+    identification: Identification, identify: Callable[..., Identified], golden: Any, tmp_path: Path
 ) -> None:
-    _, figure, _ = write_identification()
-    held_out, pad = identification.held_out, identification.fit.pad
-    predicted = pad.predict(held_out.positions_mm)
-    panels = np.array([axes for axes in figure.axes if axes.get_label() != "<colorbar>"]).reshape(-1, 3)
+    """Of a pad of which a second wiring is as good, with shares that are told apart."""
+    swapped = Wiring(identification.fit.pad.transform, 0.5, (1, 0, 2, 3), 0.9)
+    shares = {"explained": np.array([0.91, 0.82, 0.73, 0.64]), "explained_smooth": np.array([0.95, 0.8, 0.85, 0.6])}
+    shares |= {"explained_on_plan": 0.551, "noise": 0.0123, "noise_v": np.array([1.1e-3, 2.2e-3, 3.3e-3, 4.4e-3])}
+    document, drawn = identify(alternatives=[swapped], contact=make_contact(), **shares)
+    golden("sense/identification/identification.json", document_text(document), forget=_VERSIONS, rtol=2e-2)
+    golden("sense/identification/lines.txt", "\n".join(identification_lines(document, tmp_path)), rtol=2e-2)
+    sections = identification_sections(tmp_path, document)
+    page = page_text("<main>" + "".join(sections[0].body) + "</main>")
+    golden("sense/identification/page.md", f"# {sections[0].title}\n{sections[0].figures}\n{page}", rtol=2e-2)
+    for name, figure in zip(("responses", "plan"), drawn, strict=True):
+        golden(f"sense/identification/{name}.txt", figure, rtol=2e-2)
+
+
+_VERSIONS = (r'"versions": \{[^}]*\}', r'"created": "[^"]*"')
+
+
+@pytest.mark.parametrize(
+    ("mirrored", "rig_mirrored", "side"),
+    [
+        *((False, None, "as planned"), (True, None, "turned over"), (True, False, "turned over")),
+        *((False, True, "turned over, as [rig] mirrored"), (True, True, "as planned, which [rig] mirrored denies")),
+    ],
+)
+def test_lines_state_the_side_with_regard_to_the_rig(mirrored: bool, rig_mirrored: bool | None, side: str) -> None:
+    """A mirrored rig has mirrored positions already: its twin is mirrored only where that was wrong."""
+    document = {"presses": 10, "channels": [], "explained": 0.9, "explained_on_plan": 0.8, "noise": 0.01}
+    frame = {"mirrored": mirrored, "turn_deg": 0.0, "shift_mm": [0.0, 0.0], "scale": 1.0}
+    document |= {"doubts": [], "frame": frame}
+    document |= {} if rig_mirrored is None else {"rig_mirrored": rig_mirrored}
+    assert any(line.startswith(f"the pad lay {side}") for line in identification_lines(document, Path()))
+
+
+def test_document_and_responses_are_those_of_the_fit(
+    identification: Identification, identify: Callable[..., Identified]
+) -> None:
+    """Millivolts on one scale a channel; offsets to the left of a fibre as it runs, along x or y."""
+    document, (responses, _) = identify()
+    held_out, built = identification.held_out, identification.fit.pad
+    assert (document["presses"], document["held_out"]) == (len(identification.training), len(held_out))
+    assert set(map(tuple, identification.training.positions_mm)).isdisjoint(map(tuple, held_out.positions_mm))
+    predicted = built.predict(held_out.positions_mm)
+    residual = ((held_out.volts - predicted) ** 2).sum(axis=0)
+    spread = ((held_out.volts - held_out.volts.mean(axis=0)) ** 2).sum(axis=0)
+    assert [row["explained"] for row in document["channels"]] == pytest.approx((1 - residual / spread).tolist())
+    assert document["explained"] == pytest.approx((1 - residual / spread).mean())
+    panels = np.array([axes for axes in responses.axes if axes.get_label() != "<colorbar>"]).reshape(-1, 3)
     assert len(panels) == len(identification.live) == 4
     for row, axes in enumerate(panels):
         measured_mv, predicted_mv = 1e3 * held_out.volts[:, row], 1e3 * predicted[:, row]
@@ -47,41 +106,6 @@ def test_responses_are_drawn_in_millivolts_on_one_scale_a_channel(
             np.testing.assert_allclose(dots.get_array(), values)
             np.testing.assert_allclose(dots.get_offsets(), held_out.positions_mm)
         assert len({dots.get_clim() for dots in drawn}) == 1
-        assert axes[0].get_ylabel() == f"channel {row + 1}, fibre {pad.fibres[row] + 1}\ny (mm)"
-
-
-def test_plan_is_drawn_grey_under_the_fibres_as_built(
-    identification: Identification, write_identification: Any
-) -> None:
-    _, _, figure = write_identification()
-    plan, offsets = figure.axes
-    pad, built = identification.pad, identification.fit.pad
-    grey, coloured = ([line for line in plan.lines if (line.get_color() == FAINT) == is_plan] for is_plan in (1, 0))
-    for line, points in zip(grey, flatten(pad, 1e-3), strict=True):
-        np.testing.assert_allclose(line.get_xydata(), pad.to_mm(points))
-    colours = [(HORIZONTAL, VERTICAL)[pad.layout.family(fibre)] for fibre in built.fibres]
-    assert [line.get_color() for line in coloured] == colours
-    for row, line in enumerate(coloured):
-        np.testing.assert_allclose(line.get_xydata(), pad.to_mm(built.path(row)[0]))
-    assert [text.get_text() for text in plan.texts] == [str(fibre + 1) for fibre in built.fibres]
-    presses = plan.collections[0].get_offsets()
-    np.testing.assert_allclose(presses, built.transform.to_plan(identification.training.positions_mm))
-    for line, band, (offset, std, within) in zip(
-        offsets.lines, offsets.collections, identification.lateral_offsets_mm(), strict=False
-    ):
-        x, y = line.get_data()
-        assert (x[0], x[-1]) == (0, 100)
-        np.testing.assert_allclose(y, np.where(within, offset, np.nan))
-        low, high = band.get_datalim(offsets.transData).intervaly
-        assert high - low == pytest.approx(np.ptp([(offset - std)[within], (offset + std)[within]]))
-
-
-def test_offsets_are_to_the_left_of_a_fibre_as_it_runs(
-    identification: Identification, write_identification: Any
-) -> None:
-    """A horizontal fibre runs along x: to its left is y. The mean over what was pressed is the document's."""
-    document, *_ = write_identification()
-    built = identification.fit.pad
     for row, (offset, std, within) in enumerate(identification.lateral_offsets_mm()):
         fibre = built.fibres[row]
         shift_mm = identification.pad.unit_mm * (built.path(row)[0] - built.plan.paths[fibre])
@@ -91,34 +115,22 @@ def test_offsets_are_to_the_left_of_a_fibre_as_it_runs(
         entry = document["channels"][row]
         assert entry["lateral_offset_mm"] == pytest.approx(np.sqrt((offset[within] ** 2).mean()))
         assert entry["lateral_offset_std_mm"] == pytest.approx(std[within].mean())
-        assert entry["explained_smooth"] == identification.explained_smooth[row]
 
 
-def test_document_and_section_state_what_was_identified(
-    identification: Identification, write_identification: Any
+def test_plan_is_drawn_grey_under_the_fibres_as_built(
+    identification: Identification, identify: Callable[..., Identified]
 ) -> None:
-    swapped = Wiring(identification.fit.pad.transform, 0.5, (1, 0, 2, 3), 0.9)
-    shares = {"explained": np.array([0.9, 0.8, 0.7, 0.6]), "explained_smooth": np.zeros(4), "explained_on_plan": 0.55}
-    document, *_ = write_identification(alternatives=[swapped], noise=0.0123, **shares)
-    assert (document["presses"], document["held_out"]) == (
-        len(identification.training.positions_mm),
-        len(identification.held_out.positions_mm),
-    )
-    assert (document["explained"], document["explained_on_plan"]) == (pytest.approx(0.75), 0.55)
-    assert [row["alternative_fibres"] for row in document["channels"]] == [[1], [0], [], []]
-    assert (document["n_alternatives"], document["contact"], document["rig_mirrored"]) == (1, None, True)
-    twin = identification.twin
-    assert document["sensitivity_profile"] == {
-        "distance_mm": twin.distance_mm.tolist(),
-        "weight": twin.weight.tolist(),
-    }
-    [section] = identification_sections(Path(), document)
-    text = " ".join(section.body)
-    assert section.title == "The pad as built"
-    assert f"Identified from {document['presses']} presses: the pad lay turned over, as [rig] mirrored says" in text
-    assert (
-        f"The twin explains 75% of the responses to {document['held_out']} held-out presses, the plan as it is 55%;"
-        " noise is 1.2% of full scale."
-    ) in text
-    assert "doubtful: 1 other pose or wiring explains the presses nearly as well" in text
-    assert section.figures == [("75%", "of the responses explained by the twin")]
+    _, (_, figure) = identify()
+    plan, offsets = figure.axes
+    pad, built = identification.pad, identification.fit.pad
+    grey, coloured = ([line for line in plan.lines if (line.get_color() == FAINT) == is_plan] for is_plan in (1, 0))
+    for line, points in zip(grey, flatten(pad, 1e-3), strict=True):
+        np.testing.assert_allclose(line.get_xydata(), pad.to_mm(points))
+    colours = [(HORIZONTAL, VERTICAL)[pad.layout.family(fibre)] for fibre in built.fibres]
+    assert [line.get_color() for line in coloured] == colours
+    for row, line in enumerate(coloured):
+        np.testing.assert_allclose(line.get_xydata(), pad.to_mm(built.path(row)[0]))
+    presses = plan.collections[0].get_offsets()
+    np.testing.assert_allclose(presses, built.transform.to_plan(identification.training.positions_mm))
+    for line, (offset, _, within) in zip(offsets.lines, identification.lateral_offsets_mm(), strict=False):
+        np.testing.assert_allclose(line.get_ydata(), np.where(within, offset, np.nan))
