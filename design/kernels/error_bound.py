@@ -71,24 +71,24 @@ def error_bound(responses: Any, step: Any, cells: Any, masks: Any, scatter: Any,
             if not is_asked:
                 continue
             # 3. backwards, in the same order
-            by_trace, by_volume = bound / (2 * trace * len(cells)), -bound / (2 * volume * len(cells))
-            by_xx = by_trace + by_volume * (rr + prior[1])
-            by_yy = by_trace + by_volume * prior[0]
-            by_rr = by_volume * xx  # with along_x held: a multiple of x in y does not change the determinant
-            by_ux, by_uy, by_ur = -2 * by_xx * ux / total, -2 * by_yy * uy / total, -2 * by_rr * ur / total
-            by_total = (by_xx * ux * ux + by_yy * uy * uy + by_rr * ur * ur) / (total * total)
+            grad_trace, grad_volume = bound / (2 * trace * len(cells)), -bound / (2 * volume * len(cells))
+            grad_xx = grad_trace + grad_volume * (rr + prior[1])
+            grad_yy = grad_trace + grad_volume * prior[0]
+            grad_rr = grad_volume * xx  # with along_x held: a multiple of x in y does not change the determinant
+            grad_ux, grad_uy, grad_ur = -2 * grad_xx * ux / total, -2 * grad_yy * uy / total, -2 * grad_rr * ur / total
+            grad_total = (grad_xx * ux * ux + grad_yy * uy * uy + grad_rr * ur * ur) / (total * total)
             for f in range(fibres):
                 if masks[k, f] > 0:
                     residual = y[f] - along_x * x[f]
-                    by_residual = 2 * by_rr * residual + by_ur * u[f]
-                    by_x = 2 * by_xx * x[f] + by_ux * u[f] - along_x * by_residual
-                    by_y = 2 * by_yy * y[f] + by_uy * u[f] + by_residual
-                    by_u = by_ux * x[f] + by_uy * y[f] + by_ur * residual + 2 * by_total * u[f]
-                    by_deviation = -(by_x * x[f] + by_y * y[f] + by_u * u[f]) / deviation[f]
-                    by_middle = (by_u * shared + by_deviation * independent * middle[f]) / deviation[f] / 4
-                    along, across = by_x / (2 * step[0] * deviation[f]), by_y / (2 * step[1] * deviation[f])
-                    gradient[k, f, first] += by_middle - along - across
-                    gradient[k, f, first + 1] += by_middle + along - across
-                    gradient[k, f, first + side] += by_middle - along + across
-                    gradient[k, f, first + side + 1] += by_middle + along + across
+                    grad_residual = 2 * grad_rr * residual + grad_ur * u[f]
+                    grad_x = 2 * grad_xx * x[f] + grad_ux * u[f] - along_x * grad_residual
+                    grad_y = 2 * grad_yy * y[f] + grad_uy * u[f] + grad_residual
+                    grad_u = grad_ux * x[f] + grad_uy * y[f] + grad_ur * residual + 2 * grad_total * u[f]
+                    grad_deviation = -(grad_x * x[f] + grad_y * y[f] + grad_u * u[f]) / deviation[f]
+                    grad_middle = (grad_u * shared + grad_deviation * independent * middle[f]) / deviation[f] / 4
+                    along, across = grad_x / (2 * step[0] * deviation[f]), grad_y / (2 * step[1] * deviation[f])
+                    gradient[k, f, first] += grad_middle - along - across
+                    gradient[k, f, first + 1] += grad_middle + along - across
+                    gradient[k, f, first + side] += grad_middle - along + across
+                    gradient[k, f, first + side + 1] += grad_middle + along + across
     return out

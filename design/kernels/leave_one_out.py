@@ -34,8 +34,8 @@ def leave_one_out_errors(responses: Any, positions: Any, masks: Any, count: int,
     # rows by an index, as unpacked ones are not known to be contiguous, and loops over them are not vectorised
     squares, rows = np.empty((3, n, n), np.float32), np.empty((10, n), np.float32)
     kernel, inverse, work = squares[0], squares[1], squares[2]
-    x, y, alpha_x, alpha_y, by_x, by_y = rows[0], rows[1], rows[2], rows[3], rows[4], rows[5]
-    back_x, back_y, by_diagonal, g = rows[6], rows[7], rows[8], rows[9]
+    x, y, alpha_x, alpha_y, grad_x, grad_y = rows[0], rows[1], rows[2], rows[3], rows[4], rows[5]
+    back_x, back_y, grad_diagonal, g = rows[6], rows[7], rows[8], rows[9]
     for a in range(n):  # an assignment to a slice takes two seconds to compile
         x[a], y[a] = positions[a]
     share = np.float32(1 / count)
@@ -44,25 +44,25 @@ def leave_one_out_errors(responses: Any, positions: Any, masks: Any, count: int,
         _invert(kernel, np.float32(ridge), inverse, work)
         for a in range(n):
             alpha_x[a], alpha_y[a] = _product(inverse[a], x), _product(inverse[a], y)
-            by_x[a] = by_y[a] = by_diagonal[a] = 0
+            grad_x[a] = grad_y[a] = grad_diagonal[a] = 0
             if a < count:
                 c = inverse[a, a]
                 length = math.sqrt(alpha_x[a] * alpha_x[a] + alpha_y[a] * alpha_y[a] + EPSILON)
                 out[k] += share * length / c
-                by_x[a], by_y[a] = share * alpha_x[a] / (length * c), share * alpha_y[a] / (length * c)
-                by_diagonal[a] = -share * length / (c * c)
+                grad_x[a], grad_y[a] = share * alpha_x[a] / (length * c), share * alpha_y[a] / (length * c)
+                grad_diagonal[a] = -share * length / (c * c)
         if gradient.shape[1] == 0:
             continue
         # dC = -C dk C gives the derivative of the error by every entry of k, but for the sign
         for a in range(n):
-            back_x[a], back_y[a] = _product(inverse[a], by_x), _product(inverse[a], by_y)
-        _weigh(inverse, by_diagonal, work)
+            back_x[a], back_y[a] = _product(inverse[a], grad_x), _product(inverse[a], grad_y)
+        _weigh(inverse, grad_diagonal, work)
         for a in range(n):
             row, similar = work[a], kernel[a]
             bx, by, ax, ay = back_x[a], back_y[a], alpha_x[a], alpha_y[a]
             for b in range(a):
-                by_entry = 2 * row[b] + bx * alpha_x[b] + by * alpha_y[b] + ax * back_x[b] + ay * back_y[b]
-                row[b] = by_entry * similar[b]
+                grad_entry = 2 * row[b] + bx * alpha_x[b] + by * alpha_y[b] + ax * back_x[b] + ay * back_y[b]
+                row[b] = grad_entry * similar[b]
         for f in range(fibres):
             g[:] = 0
             if masks[k, f] > 0:

@@ -40,8 +40,8 @@ def sum_excess_turns(
     rolled: float,
     all_bends: bool,
     weight: float,
-    by_slope: Any,
-    by_arc: Any,
+    grad_slope: Any,
+    grad_arc: Any,
 ) -> float:
     """Integrate the excess of the turn within `window` of arc length over window / radius, relative to that, (F, P).
 
@@ -53,15 +53,15 @@ def sum_excess_turns(
     fibres, n = arc.shape
     size, total, ways = n + 4, 0.0, 2 if all_bends else 1
     along, heading, turned = np.empty(size), np.zeros(size), np.zeros(size)
-    by_along, by_turned = np.empty(size), np.empty(size)
+    grad_along, grad_turned = np.empty(size), np.empty(size)
     for f in range(fibres):
         along[0], along[1], along[size - 2], along[size - 1] = -window, 0.0, arc[f, n - 1], arc[f, n - 1] + window
         for i in range(n):
             along[i + 2], heading[i + 2] = arc[f, i], math.atan(slope[f, i])
         for i in range(1, size):
             turned[i] = turned[i - 1] + abs(heading[i] - heading[i - 1])
-        by_along[:] = 0
-        by_turned[:] = 0
+        grad_along[:] = 0
+        grad_turned[:] = 0
         for way in range(ways):
             towards, after = 1.0 - 2.0 * way, 1  # the other end of a window lies after the sample, or before it
             for i in range(size):
@@ -80,30 +80,32 @@ def sum_excess_turns(
                 part = weight * (high - low) / (2 * ways)
                 total += part * excess
                 push = towards * part * radius / window * in_plan / angle
-                by_turned[i] -= push
-                by_turned[after - 1] += push * (1 - share)
-                by_turned[after] += push * share
+                grad_turned[i] -= push
+                grad_turned[after - 1] += push * (1 - share)
+                grad_turned[after] += push * share
                 if 0 < share < 1:
                     pull = push * (t1 - t0) / (a1 - a0)
-                    by_along[i] += pull
-                    by_along[after - 1] -= pull * (1 - share)
-                    by_along[after] -= pull * share
-        by_arc[f, n - 1] += by_along[size - 2] + by_along[size - 1]
+                    grad_along[i] += pull
+                    grad_along[after - 1] -= pull * (1 - share)
+                    grad_along[after] -= pull * share
+        grad_arc[f, n - 1] += grad_along[size - 2] + grad_along[size - 1]
         later = 0.0  # derivative by all turns from here on
         for i in range(size - 1, 0, -1):
-            later += by_turned[i]
-            by_heading = later * (1.0 if heading[i] > heading[i - 1] else -1.0 if heading[i] < heading[i - 1] else 0.0)
+            later += grad_turned[i]
+            grad_heading = later * (
+                1.0 if heading[i] > heading[i - 1] else -1.0 if heading[i] < heading[i - 1] else 0.0
+            )
             if 2 <= i < size - 2:
-                by_slope[f, i - 2] += by_heading / (1 + slope[f, i - 2] ** 2)
-                by_arc[f, i - 2] += by_along[i]
+                grad_slope[f, i - 2] += grad_heading / (1 + slope[f, i - 2] ** 2)
+                grad_arc[f, i - 2] += grad_along[i]
             if 2 <= i - 1 < size - 2:
-                by_slope[f, i - 3] -= by_heading / (1 + slope[f, i - 3] ** 2)
+                grad_slope[f, i - 3] -= grad_heading / (1 + slope[f, i - 3] ** 2)
     return total
 
 
 @kernel
 def sum_closeness(
-    points: Any, slope: Any, arc: Any, shares: Any, pairs: Any, gap: float, fold: float, weight: float, by_points: Any
+    points: Any, slope: Any, arc: Any, shares: Any, pairs: Any, gap: float, fold: float, weight: float, grad_points: Any
 ) -> float:
     """Sum what it costs that samples lie nearer than `gap` to another fibre, for pairs (K, 2) of fibre and other.
 
@@ -142,10 +144,10 @@ def sum_closeness(
             total += weight * cost
             if distance > 0:
                 px, py = weight * rate * dx / distance, weight * rate * dy / distance
-                by_points[f, i, 0] += px
-                by_points[f, i, 1] += py
-                by_points[g, nearest, 0] -= px
-                by_points[g, nearest, 1] -= py
+                grad_points[f, i, 0] += px
+                grad_points[f, i, 1] += py
+                grad_points[g, nearest, 0] -= px
+                grad_points[g, nearest, 1] -= py
     return total
 
 
@@ -158,9 +160,9 @@ def sum_order(
     stations: int,
     gap: float,
     weight: float,
-    by_along: Any,
-    by_across: Any,
-    by_slope: Any,
+    grad_along: Any,
+    grad_across: Any,
+    grad_slope: Any,
 ) -> float:
     """Sum what it costs that fibres lie less than `gap` above the next `lower` ones (K,), at evenly spaced stations."""
     total, n = 0.0, along.shape[1]
@@ -185,17 +187,17 @@ def sum_order(
                 t, v, d, j = along[f + side], across[f + side], slope[f + side], spans[side]
                 h = t[j + 1] - t[j]
                 s = (at - t[j]) / h
-                by_t = by_along[f + side]
-                add_value_gradient(t, v, d, j, s, push, 0.0, by_t, by_across[f + side], by_slope[f + side])
+                grad_t = grad_along[f + side]
+                add_value_gradient(t, v, d, j, s, push, 0.0, grad_t, grad_across[f + side], grad_slope[f + side])
                 run = push * pchip_value(t, v, d, j, s)[1]  # the station is held, not s
-                by_t[j] -= run * (1 - s)
-                by_t[j + 1] -= run * s
+                grad_t[j] -= run * (1 - s)
+                grad_t[j + 1] -= run * s
     return total
 
 
 @kernel
 def sum_crossings(
-    plan: Any, pairs: Any, axes: Any, blur: float, limit: float, weights: tuple[float, float], by_plan: Any
+    plan: Any, pairs: Any, axes: Any, blur: float, limit: float, weights: tuple[float, float], grad_plan: Any
 ) -> tuple[float, float]:
     """Count the crossings of pairs (K, 2) of fibres softly, and sum how much flatter they are than `limit`, relative.
 
@@ -207,7 +209,7 @@ def sum_crossings(
     reach = REACH * blur
     for k in range(len(pairs)):
         p, q = plan[pairs[k, 0]], plan[pairs[k, 1]]
-        by_p, by_q, axis = by_plan[pairs[k, 0]], by_plan[pairs[k, 1]], axes[pairs[k, 1]]
+        grad_p, grad_q, axis = grad_plan[pairs[k, 0]], grad_plan[pairs[k, 1]], axes[pairs[k, 1]]
         for i in range(n - 1):
             px, py = p[i + 1, 0] - p[i, 0], p[i + 1, 1] - p[i, 1]
             mx, my = (p[i + 1, 0] + p[i, 0]) / 2, (p[i + 1, 1] + p[i, 1]) / 2
@@ -231,29 +233,32 @@ def sum_crossings(
                 value = weights[0] + weights[1] * flat
                 if value == 0:
                     continue
-                by_area, by_offset = bell * value, -area * bell * value / blur**2
-                by_lp = by_lq = 0.0
+                grad_area, grad_offset = bell * value, -area * bell * value / blur**2
+                grad_lp = grad_lq = 0.0
                 if flat > 0 and sine < 1 - 1e-9:
-                    by_sine = -weights[1] * area * bell / limit / math.sqrt(1 - sine * sine)
-                    by_area += by_sine / (lp * lq + 1e-12)
-                    by_lp, by_lq = -by_sine * sine * lq / (lp * lq + 1e-12), -by_sine * sine * lp / (lp * lq + 1e-12)
+                    grad_sine = -weights[1] * area * bell / limit / math.sqrt(1 - sine * sine)
+                    grad_area += grad_sine / (lp * lq + 1e-12)
+                    grad_lp, grad_lq = (
+                        -grad_sine * sine * lq / (lp * lq + 1e-12),
+                        -grad_sine * sine * lp / (lp * lq + 1e-12),
+                    )
                 sign = 1.0 if product > 0 else -1.0 if product < 0 else 0.0
-                dpx, dpy = by_area * sign * qy + by_lp * px / lp, -by_area * sign * qx + by_lp * py / lp
-                dqx, dqy = -by_area * sign * py + by_lq * qx / lq, by_area * sign * px + by_lq * qy / lq
-                hx, hy = by_offset * ox / 2, by_offset * oy / 2
-                by_p[i, 0] += hx - dpx
-                by_p[i, 1] += hy - dpy
-                by_p[i + 1, 0] += hx + dpx
-                by_p[i + 1, 1] += hy + dpy
-                by_q[j - 1, 0] -= hx + dqx
-                by_q[j - 1, 1] -= hy + dqy
-                by_q[j, 0] -= hx - dqx
-                by_q[j, 1] -= hy - dqy
+                dpx, dpy = grad_area * sign * qy + grad_lp * px / lp, -grad_area * sign * qx + grad_lp * py / lp
+                dqx, dqy = -grad_area * sign * py + grad_lq * qx / lq, grad_area * sign * px + grad_lq * qy / lq
+                hx, hy = grad_offset * ox / 2, grad_offset * oy / 2
+                grad_p[i, 0] += hx - dpx
+                grad_p[i, 1] += hy - dpy
+                grad_p[i + 1, 0] += hx + dpx
+                grad_p[i + 1, 1] += hy + dpy
+                grad_q[j - 1, 0] -= hx + dqx
+                grad_q[j - 1, 1] -= hy + dqy
+                grad_q[j, 0] -= hx - dqx
+                grad_q[j, 1] -= hy - dqy
     return count, flatness
 
 
 @kernel
-def sum_border_slopes(points: Any, slope: Any, shares: Any, zone: float, weight: float, by_slope: Any) -> float:
+def sum_border_slopes(points: Any, slope: Any, shares: Any, zone: float, weight: float, grad_slope: Any) -> float:
     """Integrate by how much slopes are steeper than 45 degrees less than `zone` from either end of their fibre.
 
     The gradient is by the slopes; points and shares are held.
@@ -264,22 +269,22 @@ def sum_border_slopes(points: Any, slope: Any, shares: Any, zone: float, weight:
             along, steep = points[f, i, 0], abs(slope[f, i]) - 1
             if steep > 0 and (along < zone or along > points[f, n - 1, 0] - zone):
                 total += weight * shares[f, i] * steep
-                by_slope[f, i] += weight * shares[f, i] * math.copysign(1.0, slope[f, i])
+                grad_slope[f, i] += weight * shares[f, i] * math.copysign(1.0, slope[f, i])
     return total
 
 
 @kernel
-def add_arc_gradient(points: Any, by_arc: Any, by_points: Any) -> None:
-    """Add the gradient of sum(by_arc * arc), of the arc lengths of the polylines through points (F, P, 2)."""
+def add_arc_gradient(points: Any, grad_arc: Any, grad_points: Any) -> None:
+    """Add the gradient of sum(grad_arc * arc), of the arc lengths of the polylines through points (F, P, 2)."""
     for f in range(len(points)):
         later = 0.0
         for i in range(points.shape[1] - 1, 0, -1):
-            later += by_arc[f, i]
+            later += grad_arc[f, i]
             dx, dy = points[f, i, 0] - points[f, i - 1, 0], points[f, i, 1] - points[f, i - 1, 1]
             step = math.hypot(dx, dy)
             if later != 0 and step > 0:
                 px, py = later * dx / step, later * dy / step
-                by_points[f, i, 0] += px
-                by_points[f, i, 1] += py
-                by_points[f, i - 1, 0] -= px
-                by_points[f, i - 1, 1] -= py
+                grad_points[f, i, 0] += px
+                grad_points[f, i, 1] += py
+                grad_points[f, i - 1, 0] -= px
+                grad_points[f, i - 1, 1] -= py
