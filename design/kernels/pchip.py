@@ -12,7 +12,7 @@ _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(8)
 
 @kernel
 def piece_of(at: float, edges: Any, pieces: int) -> int:
-    """Return the index of the piece that contains `at` by bisection of ascending `edges`; the first if none does."""
+    """Return the index of the piece that contains `at`, or the nearest one, by bisection of ascending `edges`."""
     low, high = 0, pieces
     while high - low > 1:
         middle = (low + high) // 2
@@ -34,7 +34,7 @@ def extremes(values: Any) -> tuple[float, float]:
 
 @kernel
 def _end_slope(h0: float, h1: float, m0: float, m1: float) -> float:
-    """Return the slope at an end knot: three-point rule, limited to preserve the shape."""
+    """Return the slope at an end knot by the three-point formula, limited to preserve the shape."""
     d = ((2 * h0 + h1) * m0 - h0 * m1) / (h0 + h1)
     if d * m0 <= 0:
         return 0.0
@@ -121,7 +121,7 @@ def add_slopes_gradient(t: Any, v: Any, d: Any, upstream: Any, grad_t: Any, grad
 
 @kernel
 def pchip_value(t: Any, v: Any, d: Any, j: int, s: float) -> tuple[float, float]:
-    """Return value and slope of the curve through (t, v) with slopes d at 0 <= s <= 1 of span j."""
+    """Return value and slope of the curve through (t, v) with the slopes d, at a fraction s of span j."""
     h, r = t[j + 1] - t[j], 1 - s
     m = (v[j + 1] - v[j]) / h
     value = v[j] + h * s * (m * s * (3 - 2 * s) + r * (d[j] * r - d[j + 1] * s))
@@ -165,7 +165,7 @@ def pchip_sample(t: Any, v: Any, step: float, out: Any) -> None:
         a1, a2, a3 = h * d[j], 3 * rise - h * (2 * d[j] + d[j + 1]), h * (d[j] + d[j + 1]) - 2 * rise
         end = max(min(math.ceil(t[j + 1] / step), len(out) - 1), i)
         part, start, first, per_h = out[i:end], t[j], v[j], 1 / h
-        for k in range(len(part)):  # over a slice: the compiler need not look for negative indices, and vectorises
+        for k in range(len(part)):  # a slice has no negative indices, so that the compiler vectorises the loop
             s = ((i + k) * step - start) * per_h
             part[k] = first + s * (a1 + s * (a2 + s * a3))
         i = end
@@ -184,9 +184,9 @@ def population_slopes(along: Any, across: Any) -> Any:
 
 @kernel
 def sample_spans(along: Any, across: Any, slope: Any, shares: Any, points: Any, slopes: Any) -> None:
-    """Sample fibres (F, n) at the `shares` (K,) of every span, and at the last knot.
+    """Sample fibres (F, n) at the fractions `shares` (K,) of every span, and at the last knot.
 
-    Written are `points` (F, P, 2), along and across, and `slopes` (F, P), with P = K (n - 1) + 1.
+    Results are `points` (F, P, 2), along and across, and `slopes` (F, P), with P = K (n - 1) + 1.
     """
     count, n = len(shares), along.shape[1]
     for f in range(len(along)):
@@ -230,7 +230,7 @@ def add_samples_gradient(
 
 @kernel
 def fibre_slopes_gradient(along: Any, across: Any, slope: Any, upstream: Any) -> Any:
-    """Compute the gradient (2, F, n) of sum(upstream * slope) by along and by across, of the slopes of a pad."""
+    """Compute the gradient (2, F, n) of sum(upstream * slope), with the slopes of a pad, by along and across."""
     out = np.zeros((2, *along.shape))
     for f in range(len(along)):
         add_slopes_gradient(along[f], across[f], slope[f], upstream[f], out[0, f], out[1, f])
@@ -239,9 +239,9 @@ def fibre_slopes_gradient(along: Any, across: Any, slope: Any, upstream: Any) ->
 
 @kernel
 def arc_lengths_gradient(along: Any, across: Any, slope: Any, out: Any) -> Any:
-    """Compute the arc lengths (F,) of fibres, to 1e-3 where they are steep, and their gradients into out (3, F, n).
+    """Compute the arc lengths (F,) of fibres, to 1e-3 if they are steep.
 
-    These are by along, across and slope, of each fibre by its own.
+    Their gradients, of each fibre by its along, across and slope, go into `out` (3, F, n).
     """
     lengths = np.zeros(len(along))
     out[:] = 0
