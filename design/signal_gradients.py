@@ -69,4 +69,4 @@ class FibreCurves:
             kernel = lambda upstream: signals_gradient(t, v, d, max_offsets[0], ends, presses, upstream, shape)  # noqa: E731
         if profiling.is_profiling():
             record_visits(t[None], compute_max_offsets(v[None], ends), ends, presses, shape[1], visited)
-        return out.T, lambda by_signals: np.asarray(kernel(np.ascontiguousarray(by_signals.T)))
+        return out.T, lambda grad_signals: np.asarray(kernel(np.ascontiguousarray(grad_signals.T)))

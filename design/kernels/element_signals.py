@@ -27,53 +27,64 @@ from padforge.design.kernels.pchip import extremes
 Array = NDArray[np.float64]
 
 PROFILE_PRECISION = 5e-5
-"""Error of signals of a profile in a search, as a share of the largest one: far below that of measured profiles."""
+"""Maximum error of signals of a profile in a search, relative to the largest signal: far below that of measurements."""
 LAYER_PRECISION = 1.5e-2
-"""Root of the mean squared error of signals of a layer near a press in a search, as a share of the largest one. Over a
-pad it is a tenth to a quarter of it. Strains of a shallow fibre step at the edge of the contact, and to resolve the
-step takes twice as long."""
+"""RMS error of signals of a layer near a press in a search, relative to the largest signal. Over a whole pad it is a
+tenth to a quarter of that. The strain of a shallow fibre has a step at the edge of the contact; resolving it would take
+twice as long.
+"""
 FINE_PRECISION = 1e-3
-"""The same where a pad is evaluated."""
-_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(8)  # fewer do not resolve the bends of a span
+"""The same in the evaluation of a pad."""
+_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(8)  # lower orders do not resolve the bends of a span
 _NODES, _WEIGHTS = (1 + _NODES) / 2, _WEIGHTS / 2  # on [0, 1]
 _LAYER_NODES, _LAYER_WEIGHTS = np.polynomial.legendre.leggauss(5)
 _LAYER_NODES, _LAYER_WEIGHTS = (1 + _LAYER_NODES) / 2, _LAYER_WEIGHTS / 2
 _FAR_NODES, _FAR_WEIGHTS = np.array([0.5]), np.array([1.0])
-FAR_SPACING = 0.5
-"""Spacing of elements beyond `WeightLaw.near` in a search, as a share of that distance; by the midpoint rule."""
-MAX_REFINEMENTS = 24
-"""Refinements of the spacing by a fifth, from a quarter of the profile on; a steep profile needs them."""
-MIN_STEPS, MAX_STEPS = 1 << 14, 1 << 17
-"""Steps of a `weight_table`: two for each of the narrowest row of its profile, within these."""
 MAX_PIECES = 512
-"""Pieces of a span, to bound memory; only a profile hundreds of times shorter than a span would need more."""
+"""Maximum number of pieces of a span, which bounds memory. Only a profile hundreds of times shorter than a span would
+need more.
+"""
 
 
 class Elements(NamedTuple):
-    """Fibres cut into E elements, twice where presses may be far; all but three fields of shape (E,)."""
+    """Fibres cut into E elements: fine ones for near presses, then coarse ones for far presses.
 
-    horizontals: int  # number of fibres, the first ones, that run along x
-    starts: Any  # first element of each span, and in the last column of the next fibre; shape (F, n)
-    far_starts: Any  # the same of the coarser elements, all behind the others, for presses that are far from a span
-    along: Array  # coordinate along the fibre's axis, grid units
-    across: Array  # coordinate across it, grid units
-    length: Array  # grid units
-    tangent_along: Array  # unit tangent, along the fibre's axis
-    tangent_across: Array  # and across it
-    share: Array  # position on its span, 0..1
-    weight: Array  # quadrature weight, as a share of the span
+    Attributes:
+        horizontals: number of fibres, the first ones, that run along x.
+        starts: first fine element of each span and, in the last column, the end of the last span; shape (F, n).
+        far_starts: the same of coarse elements; shape (F, n).
+        along: coordinates along the axis of the fibre; shape (E,), grid units.
+        across: coordinates across it; shape (E,), grid units.
+        length: lengths; shape (E,), grid units.
+        tangent_along: unit tangents, along the axis; shape (E,).
+        tangent_across: unit tangents, across it; shape (E,).
+        share: positions on the span, from 0 to 1; shape (E,).
+        weight: quadrature weights, relative to the span; shape (E,).
+    """
+
+    horizontals: int
+    starts: Any
+    far_starts: Any
+    along: Array
+    across: Array
+    length: Array
+    tangent_along: Array
+    tangent_across: Array
+    share: Array
+    weight: Array
 
 
 def weight_table(law: WeightLaw) -> Array:
-    """Return cubics of w and v in equal steps of the squared distance, with the values and slopes of the profile there.
+    """Return w and v as piecewise cubics in equal steps of the squared distance, a Hermite interpolant of the profile.
 
-    A step of the table has the four coefficients of each in one line of the processor's cache, where the profile's
-    rows, of higher degree, have to be searched. They agree to about 1e-7 of the largest weight.
+    The profile itself has rows of higher degree that must be searched; a step of the table fits in one cache line. The
+    two agree to about 1e-7 of the largest weight.
 
     Returns:
-        Coefficients by family, step, and w before v, in shares of a step; 0 from the end on; shape (2, steps + 1, 8).
+        Coefficients of w, then of v, by family and step, in powers of the fraction of a step; 0 after the end of the
+        profile; shape (2, steps + 1, 8).
     """
-    steps = min(max(MIN_STEPS, 2 * len(law.bins)), MAX_STEPS)
+    steps = min(max(1 << 14, 2 * len(law.bins)), 1 << 17)  # two for the width of the narrowest row of the profile
     table = np.zeros((2, steps + 1, 8))
     for family, profile in enumerate(law.profile):
         _tabulate(profile, law, table[family])
@@ -81,7 +92,7 @@ def weight_table(law: WeightLaw) -> Array:
 
 
 def _tabulate(profile: Array, law: WeightLaw, out: Array) -> None:
-    """Write the cubics of one family, all but the last row."""
+    """Write the cubics of one family into all rows except the last."""
     steps = len(out) - 1
     width, step = law.radius * law.radius / steps, np.arange(steps)
     low, high = step * width, np.minimum(step + 1, steps * (1 - EPS)) * width
@@ -93,9 +104,9 @@ def _tabulate(profile: Array, law: WeightLaw, out: Array) -> None:
 
 
 def _evaluate(profile: Array, column: int, squares: Array) -> tuple[Array, Array]:
-    """Return a polynomial of a profile, PLAIN or DIRECTED, at squared distances, and its derivative, of any shape.
+    """Return a polynomial of a profile, PLAIN or DIRECTED, and its derivative at squared distances of any shape.
 
-    It is `evaluate_row` for arrays: a kernel of few calls would take longer to compile than all of them.
+    This is `evaluate_row` in NumPy: it is called so rarely that compiling a kernel would take longer.
     """
     row = profile[np.searchsorted(profile[:, 0], squares, side="right") - 1]
     c, x = np.moveaxis(row[..., column : column + DEGREE + 1], -1, 0), squares - row[..., 0]
@@ -106,25 +117,24 @@ def _evaluate(profile: Array, column: int, squares: Array) -> tuple[Array, Array
 
 
 def element_spacings(law: WeightLaw, precision: float) -> tuple[float, float]:
-    """Return the largest spacing at which straight fibres of both families are precise, and that of far elements.
+    """Return the spacings of fine and of coarse elements at which signals of straight fibres are precise.
 
-    The error, as a share of the largest signal, is at most `precision`; of a layer it is the root of its mean square
-    near the press.
+    The error relative to the largest signal is at most `precision`; for a layer this is the RMS error near the press.
     """
     families = law.profile[: 1 + int((law.profile[0] != law.profile[1]).any())]
-    far = FAR_SPACING * law.near * math.sqrt(precision / LAYER_PRECISION)
-    return min(_spacing(profile, law, precision) for profile in families), far
+    far = 0.5 * law.near * math.sqrt(precision / LAYER_PRECISION)  # the midpoint rule has an error of second order
+    return min(_fine_spacing(profile, law, precision) for profile in families), far
 
 
-def _spacing(profile: Array, law: WeightLaw, precision: float) -> float:
+def _fine_spacing(profile: Array, law: WeightLaw, precision: float) -> float:
     end = law.radius
     distances, shifts = end * np.arange(32) / 32, np.arange(16)[:, None] / 16
-    if law.edge:  # beyond the edge of a contact strains are smooth
+    if law.edge:  # outside the edge of a contact, strains are smooth
         distances, shifts = 1.5 * law.edge * np.arange(12) / 12, np.arange(6)[:, None] / 6
     rule, weights = (_LAYER_NODES, _LAYER_WEIGHTS) if law.directional else (_NODES, _WEIGHTS)
 
     def straight_signals(spacing: float) -> Array:
-        """Return signals (distances, shifts) by pieces of a span that begin at shifted positions."""
+        """Return the signals (distances, shifts) of elements of this spacing that begin at shifted positions."""
         width = len(rule) * spacing
         begin = width * (np.arange(-math.ceil(end / width) - 1, math.ceil(end / width) + 1) + shifts)
         nodes = (begin[..., None] + width * rule).reshape(len(shifts), -1)
@@ -132,9 +142,9 @@ def _spacing(profile: Array, law: WeightLaw, precision: float) -> float:
         return np.stack([straight_weights(nodes, distance, profile, law) @ lengths for distance in distances])
 
     spacing = end / 4
-    for _ in range(MAX_REFINEMENTS):
+    for _ in range(24):  # down to 1 / 200, for steep profiles
         signals = straight_signals(spacing)
-        reference = signals.mean(axis=1, keepdims=True)  # far more precise than any one of them
+        reference = signals.mean(axis=1, keepdims=True)  # errors of different shifts cancel in the mean
         error, largest = np.abs(signals - reference), np.abs(reference).max()
         if (math.sqrt((error**2).mean()) if law.directional else error.max()) <= precision * largest:
             break
@@ -144,7 +154,7 @@ def _spacing(profile: Array, law: WeightLaw, precision: float) -> float:
 
 @kernel
 def straight_weights(along: Any, distance: float, profile: Any, law: Any) -> Any:
-    """Return the weights, of any shape, of elements of a straight fibre that passes the press at a distance."""
+    """Return the weights of elements at coordinates of any shape along a straight fibre at a distance to the press."""
     out = np.empty(along.shape)
     for i, at in np.ndenumerate(along):
         out[i] = weigh_profile(at, distance, 1.0, 0.0, profile, law)
@@ -153,8 +163,8 @@ def straight_weights(along: Any, distance: float, profile: Any, law: Any) -> Any
 
 @kernel(inline="always")
 def _count_pieces(h: float, rise: float, d0: float, d1: float, longest: float) -> int:
-    """Return the number of equal pieces of a span, at most `longest` on average."""
-    # the slope at which a span rises is a quadratic, which keeps within its Bezier points
+    """Return the number of equal pieces of a span, of a mean length of at most `longest`."""
+    # the slope of a span is a quadratic, which stays within its Bezier points
     steepest = max(abs(h * d0), abs(h * d1), abs(3 * rise - h * (d0 + d1)))
     return math.ceil(min(math.hypot(h, steepest) / longest, 1.0 * MAX_PIECES))
 
@@ -163,9 +173,22 @@ def _count_pieces(h: float, rise: float, d0: float, d1: float, longest: float) -
 def _count_elements(
     along: Any, across: Any, slope: Any, horizontals: int, low: Any, high: Any, nodes: int, spacing: float, total: int
 ) -> Any:
-    """Return the pieces (F, n) of spans, none beyond `low` and `high` (2,), and where their elements start from total.
+    """Count pieces and elements of spans.
 
-    The last column of the starts is where the next fibre's do.
+    Args:
+        along: knots along the fibres; shape (F, n).
+        across: knots across the fibres; shape (F, n).
+        slope: slopes at the knots; shape (F, n).
+        horizontals: number of fibres that run along x.
+        low: lower corner of the rectangle outside which spans get no pieces; shape (2,).
+        high: upper corner; shape (2,).
+        nodes: elements of a piece.
+        spacing: maximum mean length of an element.
+        total: number of elements before the first span.
+
+    Returns:
+        Number of pieces of each span, and its first element; both of shape (F, n). The last column of the latter has
+        the end of the last span.
     """
     fibres, n = along.shape
     pieces, starts = np.zeros((fibres, n), np.int64), np.zeros((fibres, n), np.int64)
@@ -210,8 +233,8 @@ def _place_elements(
 def fibre_elements(
     along: Any, across: Any, slope: Any, horizontals: int, presses: Any, law: Any, spacings: tuple[float, float]
 ) -> Any:
-    """Cut one pad's spans into `Elements`, near and far ones, except spans beyond the profile of every press."""
-    low, high = np.empty((2, 2)), np.empty((2, 2))  # of presses near a span, and of all
+    """Cut the spans of a pad into `Elements`, except spans outside the profiles of all presses."""
+    low, high = np.empty((2, 2)), np.empty((2, 2))  # rectangles of fine and of coarse elements
     for axis in range(2):
         least, largest = extremes(presses[:, axis])
         for i, reach in enumerate((min(law.near, law.radius), law.radius)):
@@ -231,7 +254,7 @@ def fibre_elements(
 
 @kernel
 def weigh_elements(elements: Any, along: Any, sensitivity: Any) -> None:
-    """Multiply the lengths of elements by the sensitivity (F, K) of their fibre, given at even steps along its axis."""
+    """Multiply the lengths of elements by the sensitivity (F, K) of their fibre at even steps along its axis."""
     fibres, n = along.shape
     last = sensitivity.shape[1] - 1
     for f in range(fibres):
@@ -245,16 +268,17 @@ def weigh_elements(elements: Any, along: Any, sensitivity: Any) -> None:
 
 @kernel
 def _is_near(t: Any, v: Any, j: int, ct: float, cv: float, end: float) -> bool:
-    """Whether span j, which lies in the box of its ends, comes within `end` of (ct, cv) along both axes."""
+    """Return whether the box of the ends of span j, in which it lies, is within `end` of (ct, cv) along both axes."""
     is_beside = t[j] < ct + end and t[j + 1] > ct - end
     return is_beside and min(v[j], v[j + 1]) < cv + end and max(v[j], v[j + 1]) > cv - end
 
 
 @kernel
 def element_signals(along: Any, across: Any, elements: Any, presses: Any, law: Any, table: Any, out: Any) -> int:
-    """Compute signals of one pad from its elements, by the `weight_table` of the law, into `out` (Q, F).
+    """Compute the signals of a pad from its elements and the `weight_table` of the law into `out` (Q, F).
 
-    Returned is the number of spans visited.
+    Returns:
+        Number of spans visited.
     """
     (fibres, n), end, visited = along.shape, law.radius, 0
     steps = table.shape[1] - 1
@@ -276,7 +300,7 @@ def element_signals(along: Any, across: Any, elements: Any, presses: Any, law: A
                     dt, dv = elements.along[k] - ct, elements.across[k] - cv
                     square = dt * dt + dv * dv
                     at = min(square * rate, 1.0 * steps)
-                    i = np.uint64(at)  # unsigned: the compiler need not look for negative indices
+                    i = np.uint64(at)  # unsigned, so that no code for negative indices is compiled
                     x = at - np.int64(i)
                     weight = rows[i, 0] + x * (rows[i, 1] + x * (rows[i, 2] + x * rows[i, 3]))
                     if law.directional and square > 0:
@@ -303,9 +327,9 @@ def sum_elements(points: Any, length: Any, tangents: Any, presses: Any, law: Any
 def _differentiate_elements(
     along: Any, across: Any, elements: Any, presses: Any, upstream: Any, law: Any, table: Any, out: Any
 ) -> None:
-    """Add the derivatives of sum(upstream * signals) to out (E, 5).
+    """Add the gradient of sum(upstream * signals) to `out` (E, 5).
 
-    They are by each element's along, across and length, and by both parts of its unit tangent.
+    Its columns are the gradients by along, across, length, tangent_along and tangent_across of each element.
     """
     (fibres, n), end = along.shape, law.radius
     steps = table.shape[1] - 1
@@ -357,7 +381,7 @@ def elements_gradient(
 ) -> Any:
     """Compute the gradient (3, F, n) of sum(upstream (Q, F) * signals) by along, across and slope of one pad.
 
-    Slopes are held independent of knots; the elements are from `fibre_elements` of the same arguments.
+    Slopes are treated as independent of knots. The elements are those of `fibre_elements` for the same arguments.
     """
     fibres, n = along.shape
     out, element_gradient = np.zeros((3, fibres, n)), np.zeros((len(elements.length), 5))
@@ -385,13 +409,13 @@ def _pass_to_knots(
                 speed = h + abs(dv_ds) if is_manhattan else norm
                 speed_t = 1.0 if is_manhattan else h / speed
                 speed_v = math.copysign(1.0, dv_ds) if is_manhattan else dv_ds / speed
-                longer = element_gradient[k, 2] * elements.weight[k]
+                grad_speed = element_gradient[k, 2] * elements.weight[k]
                 ut, uv = elements.tangent_along[k], elements.tangent_across[k]
-                # what turns the tangent is across it
-                turn = (element_gradient[k, 4] * ut - element_gradient[k, 3] * uv) / norm
+                # only the part of the gradient across the unit tangent turns it
+                grad_turn = (element_gradient[k, 4] * ut - element_gradient[k, 3] * uv) / norm
                 differentiate_cubic(s, h, d0, d1, d_point, d_tangent)
                 for x in range(6):
-                    moved = element_gradient[k, 0] * d_point[x, 0] + element_gradient[k, 1] * d_point[x, 1]
-                    stretched = longer * (speed_t * d_tangent[x, 0] + speed_v * d_tangent[x, 1])
-                    turned = turn * (ut * d_tangent[x, 1] - uv * d_tangent[x, 0])
-                    out[x // 2, f, j + x % 2] += moved + stretched + turned
+                    by_position = element_gradient[k, 0] * d_point[x, 0] + element_gradient[k, 1] * d_point[x, 1]
+                    by_length = grad_speed * (speed_t * d_tangent[x, 0] + speed_v * d_tangent[x, 1])
+                    by_tangent = grad_turn * (ut * d_tangent[x, 1] - uv * d_tangent[x, 0])
+                    out[x // 2, f, j + x % 2] += by_position + by_length + by_tangent

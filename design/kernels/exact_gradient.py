@@ -1,11 +1,11 @@
 """Gradient of the exact signals with respect to knots and slopes.
 
-The signal of a stretch [a, b] of a span, S = integral of w(|p|^2) l ds with p the position from the press centre and l
-the length per s, has the derivative (Leibniz integral rule) by a variable x of the span
+The signal of a stretch [a, b] of a span is S = integral of w(|p|^2) l ds, with the position p relative to the press
+centre and the length l per s. By the Leibniz integral rule, its derivative by a variable x of the span is
 
     dS/dx = [w l ds/dx]_a^b + integral of (2 w' (p . dp/dx) l + w dl/dx) ds,   ds/dx = -(n . dp/dx) / (n . dp/ds)
 
-at an end where the span crosses a boundary with normal n, and ds/dx = 0 at an end that is a knot.
+at an end at which the span crosses a boundary with normal n, and ds/dx = 0 at an end that is a knot.
 """
 
 import math
@@ -27,15 +27,15 @@ from padforge.design.kernels.geometry import EPS, INVERSE, MANHATTAN, UNIFORM, f
 from padforge.design.kernels.pchip import piece_of
 
 MIN_SINE = 0.02
-"""Smallest sine of the angle between fibre and boundary: below, the derivative would grow without bound."""
+"""Minimum sine of the angle between fibre and boundary, without which the derivative would be unbounded."""
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(12)
 
 
 @kernel
 def differentiate_cubic(s: float, h: float, d0: float, d1: float, d_point: Any, d_tangent: Any) -> None:
-    """Compute dp/dx and its derivative by s for x = t0, t1, v0, v1, d0, d1, into two arrays (6, 2).
+    """Compute dp/dx and its derivative by s for x = t0, t1, v0, v1, d0, d1 into two arrays (6, 2).
 
-    The span has the length h along its axis and the slopes d0 and d1 at its knots; s is 0..1.
+    The span has the length h along its axis and the slopes d0 and d1 at its knots; s is between 0 and 1.
     """
     d_point[:] = 0.0
     d_tangent[:] = 0.0
@@ -69,7 +69,7 @@ def _boundary_normal(t: float, v: float, chains: Any, radius: float) -> tuple[fl
 
 @kernel
 def _differentiate_weight(square: float, law: Any) -> float:
-    """Return the derivative of `weigh` by the squared distance, for every weight but a profile."""
+    """Return the derivative of `weigh` by the squared distance, for all weights except a profile."""
     radius, weight = law.radius, law.weight
     if weight == UNIFORM:
         return 0.0
@@ -80,15 +80,15 @@ def _differentiate_weight(square: float, law: Any) -> float:
 
 @kernel
 def _add_boundary_term(s: float, s0: float, sign: float, d0: float, d1: float, shape: Any, work: Any, out: Any) -> None:
-    """Add the boundary term at s of a stretch to out (6,); sign is 1 for its last end and -1 for its first."""
+    """Add the boundary term at s of a stretch to out (6,); sign is 1 at its end and -1 at its beginning."""
     (chains, _, law), (span, d_point, d_tangent) = shape, work
     t, v = span[0] + span[1] * s, evaluate_cubic(span, s)
     dt_ds, dv_ds = span[1], span[3] + s * (2 * span[4] + 3 * s * span[5])
     nt, nv = _boundary_normal(t, v, chains, law.radius)
     normal_rate = nt * dt_ds + nv * dv_ds
-    least = MIN_SINE * math.hypot(nt, nv) * math.hypot(dt_ds, dv_ds)
-    if abs(normal_rate) < least:
-        normal_rate = least if normal_rate > 0 else -least
+    min_rate = MIN_SINE * math.hypot(nt, nv) * math.hypot(dt_ds, dv_ds)
+    if abs(normal_rate) < min_rate:
+        normal_rate = min_rate if normal_rate > 0 else -min_rate
     speed = dt_ds + abs(dv_ds) if law.length == MANHATTAN else math.hypot(dt_ds, dv_ds)
     value = sign * weigh(t * t + v * v, law) * speed
     differentiate_cubic(s + s0, span[1], d0, d1, d_point, d_tangent)
@@ -100,7 +100,7 @@ def _add_boundary_term(s: float, s0: float, sign: float, d0: float, d1: float, s
 def _add_inner_term(
     a: float, b: float, s0: float, d0: float, d1: float, shape: Any, work: Any, stack: Any, out: Any
 ) -> None:
-    """Add the integral over [a, b] to out (6,): a closed form, or quadrature on the pieces that suit the signal."""
+    """Add the integral over [a, b] to out (6,), in closed form or by quadrature on the same pieces as the signal."""
     law, (span, d_point, d_tangent) = shape[2], work
     is_manhattan = law.length == MANHATTAN
     if law.weight == UNIFORM and is_manhattan:
@@ -153,7 +153,7 @@ def _differentiate_span(
     work: Any,
     change: Any,
 ) -> None:
-    """Set `change` (6,) to the derivatives of the signal of span j for a press at (ct, cv); `work` is overwritten."""
+    """Compute the derivatives of the signal of span j for a press at (ct, cv) into `change` (6,)."""
     span, (chains, extents, law) = work[0], shape
     s0 = centre_cubic(t[j], t[j + 1], v[j], v[j + 1], d[j], d[j + 1], ct, cv, span)
     change[:] = 0.0
@@ -173,8 +173,8 @@ def signals_gradient(
 ) -> Any:
     """Compute the gradient (3, F, n) of sum(upstream * signals) by along, across and slope of one pad.
 
-    Slopes are held independent of knots. `upstream` is (Q, F), `max_offsets` (2,); the law has any weight but PROFILE,
-    which `element_signals` differentiates.
+    Slopes are treated as independent of knots. `upstream` is (Q, F), `max_offsets` (2,). The weight of the law must not
+    be PROFILE, for which see `element_signals`.
     """
     (fibres, n), (chains, extents, law) = along.shape, shape
     out, change = np.zeros((3, fibres, n)), np.empty(6)

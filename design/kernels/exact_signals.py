@@ -1,12 +1,12 @@
 """Exact signals of a shape: line integrals along PCHIP spans inside the press, without sampling.
 
-Frame: a fibre runs along t and deviates across it, v; both are measured from the press centre. A span is the cubic
-t = r + h s, v = e0 + e1 s + e2 s^2 + e3 s^3 in a parameter s whose zero is the point of the span abreast of the
-centre, so that small presses keep their relative accuracy.
+A fibre runs along t and deviates from its axis by v; both are relative to the press centre. A span is the cubic
+t = r + h s, v = e0 + e1 s + e2 s^2 + e3 s^3. The parameter s is zero at the point of the span nearest to the centre
+along t, so that the signals of small presses have a small relative error.
 
-A polygon is two chains over t, upper and lower, linear between shared breakpoints; a circle has none. PCHIP spans are
-monotone, so most pieces are accepted or rejected by comparing ends; roots are computed only where the fibre and a chain
-may intersect.
+A polygon is bounded by two chains over t, upper and lower, linear between common breakpoints; a circle has no
+breakpoints. PCHIP spans are monotone, so most pieces are accepted or rejected by comparing their ends; roots are
+computed only if the fibre may intersect a chain.
 """
 
 import math
@@ -29,7 +29,7 @@ from padforge.design.kernels.geometry import (
 )
 from padforge.design.kernels.pchip import piece_of
 
-# G7-K15 rule on [-1, 1]: nodes and Kronrod weights of the positive half, the centre last; Gauss weights of every second
+# G7-K15 rule on [-1, 1]: nodes and Kronrod weights from 1 to 0, and Gauss weights of every second of these nodes
 NODES, KRONROD = np.ascontiguousarray(
     np.array(
         [
@@ -53,12 +53,9 @@ GAUSS = np.array(
     ]
 )
 MAX_HALVINGS = 48
+"""Maximum depth of the halved intervals of a quadrature."""
 PRECISION = 1e-11
-"""Relative error of a piece without a closed form."""
-MAX_TURN = 8.0
-"""Ratio of the steepest rise of a piece to its least one, or to its run, up to which the quadrature converges fast."""
-PIECES, PATIENCE = 500, 100
-"""Beyond PIECES the tolerance doubles with every PATIENCE more pieces: halving pure rounding errors would not end."""
+"""Maximum relative error of a piece without a closed form."""
 
 
 @kernel
@@ -101,25 +98,29 @@ def integrate_kronrod(span: Any, a: float, b: float, law: Any) -> tuple[float, f
 
 @kernel
 def is_precise(error: float, pieces: int) -> bool:
-    """Whether the error of a piece, the `pieces`-th that was integrated, is acceptable."""
-    return not error > PRECISION * 2.0 ** (max(pieces - PIECES, 0) / PATIENCE)  # that of a piece without length is NaN
+    """Return whether the relative error of the `pieces`-th integrated piece is acceptable.
+
+    After 500 pieces the tolerance doubles with every 100 more, since halving does not reduce rounding errors. The error
+    of a piece without length is NaN, which is acceptable.
+    """
+    return not error > PRECISION * 2.0 ** (max(pieces - 500, 0) / 100)
 
 
 @kernel
 def _has_turn(span: Any, a: float, b: float, law: Any) -> bool:
-    """Whether a fibre turns from its axis to a steep rise within [a, b] so sharply that the quadrature may miss it.
+    """Return whether a fibre turns from its axis to a steep rise within [a, b] so sharply that quadrature may miss it.
 
-    It turns where the rise is about the run, and both add up to the length there: a share of about run / steepest rise
-    of [a, b], on which the length differs by about the run.
+    The turn is where the rise dv/ds is about the run dt/ds. It takes a fraction of about run / max_rise of [a, b], in
+    which the length per s is wrong by about the run. Up to a ratio of 8 the quadrature converges fast.
     """
     if law.length == MANHATTAN:
         return False
     first, last = abs(_rise(span, a)), abs(_rise(span, b))
-    least, most = min(first, last), max(first, last)
-    vertex = -span[4] / (3 * span[5]) if span[5] != 0 else a  # of the rise, which has one sign
+    min_rise, max_rise = min(first, last), max(first, last)
+    vertex = -span[4] / (3 * span[5]) if span[5] != 0 else a  # of the rise, which does not change its sign
     if a < vertex < b:
-        least, most = min(least, abs(_rise(span, vertex))), max(most, abs(_rise(span, vertex)))
-    return most > MAX_TURN * max(least, span[1]) and span[1] ** 2 * (b - a) > PRECISION * most
+        min_rise, max_rise = min(min_rise, abs(_rise(span, vertex))), max(max_rise, abs(_rise(span, vertex)))
+    return max_rise > 8.0 * max(min_rise, span[1]) and span[1] ** 2 * (b - a) > PRECISION * max_rise
 
 
 @kernel
@@ -151,8 +152,8 @@ def _integrate_stretch(span: Any, a: float, b: float, law: Any, stack: Any) -> f
     return total
 
 
-_PROBES = (0.5, 0.22, 0.78)
-_CLEAR = 1e6  # a value this many tolerances from zero has a certain sign
+_PROBES = (0.5, 0.22, 0.78)  # positions between two roots at which a sign is determined
+_SIGN_CERTAIN_FACTOR = 1e6  # the sign of a value is certain if it is this many tolerances
 
 
 @kernel
@@ -218,7 +219,7 @@ def _find_inside_circle(
     count_inside, begin = np.int64(0), a
     for i in range(count + 1):
         end = b if i == count else roots[i]
-        # no sign changes between roots, but a touch may lie there: the largest of three values has the sign
+        # the sign does not change between roots, but the span may touch the circle: take the largest of three values
         largest = 0.0
         for share in _PROBES:
             s = begin + share * (end - begin)
@@ -226,7 +227,7 @@ def _find_inside_circle(
             depth = radius * radius - t * t - v * v
             if abs(depth) > abs(largest):
                 largest = depth
-            if abs(largest) > _CLEAR * radius * tolerance:
+            if abs(largest) > _SIGN_CERTAIN_FACTOR * radius * tolerance:
                 break
         if largest >= -2 * radius * tolerance:
             count_inside = _append_stretch(stretches, count_inside, begin, end)
@@ -246,13 +247,13 @@ def _find_between_lines(
     stretches: Any,
     count_inside: Any,
 ) -> Any:
-    """Append the stretches on which the span is between two lines of which `near` ones may cross it."""
+    """Append the stretches of [start, after] on which the span is between two lines; `near` says which may cross it."""
     roots, work, p, _ = scratch
-    (u0, u1, l0, l1), count = lines, np.int64(0)
+    (upper_start, upper_end, lower_start, lower_end), count = lines, np.int64(0)
     if near[0]:
-        count = _find_line_roots(span, start, after, u0, u1, tolerance, roots, count, work, p)
+        count = _find_line_roots(span, start, after, upper_start, upper_end, tolerance, roots, count, work, p)
     if near[1]:
-        count = _find_line_roots(span, start, after, l0, l1, tolerance, roots, count, work, p)
+        count = _find_line_roots(span, start, after, lower_start, lower_end, tolerance, roots, count, work, p)
     shell_sort(roots, count)
     begin = start
     for i in range(count + 1):
@@ -260,11 +261,14 @@ def _find_between_lines(
         above, below = 0.0, 0.0
         for share in _PROBES:
             s = begin + share * (end - begin)
-            x, at = (s - start) / (after - start), evaluate_cubic(span, s)
-            to_upper, to_lower = u0 + (u1 - u0) * x - at, at - l0 - (l1 - l0) * x
+            x, v = (s - start) / (after - start), evaluate_cubic(span, s)
+            to_upper, to_lower = (
+                upper_start + (upper_end - upper_start) * x - v,
+                v - lower_start - (lower_end - lower_start) * x,
+            )
             above = to_upper if abs(to_upper) > abs(above) else above
             below = to_lower if abs(to_lower) > abs(below) else below
-            if min(abs(above), abs(below)) > _CLEAR * tolerance:
+            if min(abs(above), abs(below)) > _SIGN_CERTAIN_FACTOR * tolerance:
                 break
         if above >= -tolerance and below >= -tolerance:
             count_inside = _append_stretch(stretches, count_inside, begin, end)
@@ -276,13 +280,20 @@ def _find_between_lines(
 def find_one_crossing(
     span: Any, a: float, b: float, from_a: float, from_b: float, rise: float, tolerance: float
 ) -> float:
-    """Return the share of [a, b] after which a span crosses a line once: 0 if it never does, NaN if that is not clear.
+    """Return the fraction of [a, b] at which a span crosses a line once: 0 if it never does, NaN if that is not clear.
 
-    The line has a `rise`; the span ends at the distances `from_a` and `from_b` from it, above it if they are positive.
+    Args:
+        span: coefficients of the span; shape (6,).
+        a: start of the interval of s.
+        b: end of it.
+        from_a: height of the span above the line at a.
+        from_b: height of the span above the line at b.
+        rise: rise of the line from a to b.
+        tolerance: height that counts as 0.
     """
     w = b - a
     p1, p2, p3 = _rise(span, a) * w - rise, (span[4] + 3 * a * span[5]) * w * w, span[5] * w**3
-    # between both ends in Bernstein form, which tells the number of crossings
+    # the inner Bernstein coefficients, whose signs bound the number of crossings (Descartes' rule)
     first, second = from_a + p1 / 3, from_b - (p1 + 2 * p2 + 3 * p3) / 3
     if not min(abs(from_a), abs(from_b)) > tolerance:
         return math.nan
@@ -300,7 +311,7 @@ def find_one_crossing(
         else:
             low = u
         step = value / slope if slope != 0 else math.inf
-        if (abs(p2) + 3 * abs(p3)) * step * step <= EPS / 4 * abs(slope):  # a bound of what the step leaves
+        if (abs(p2) + 3 * abs(p3)) * step * step <= EPS / 4 * abs(slope):  # a bound of the error after the step
             u = min(max(u - step, 0.0), 1.0)
             break
         u -= step
@@ -311,24 +322,50 @@ def find_one_crossing(
     return u
 
 
+@kernel
+def _find_beside_line(
+    span: Any, a: float, b: float, from_a: float, from_b: float, rise: float, is_upper: bool, tolerance: float
+) -> tuple[float, float]:
+    """Return the stretch of [a, b] below an upper line, or above a lower one; NaN unless `find_one_crossing` is clear.
+
+    If there is none, the stretch begins at b.
+    """
+    share = find_one_crossing(span, a, b, from_a, from_b, rise, tolerance)
+    if math.isnan(share):
+        return math.nan, math.nan
+    cut = a + share * (b - a) if share > 0 else b
+    return (a, cut) if (from_a < 0) == is_upper else (cut, b)
+
+
 @kernel(inline="always")  # as `_density`
 def find_stretches_inside(
     span: Any, a: float, b: float, chains: Any, extents: Any, radius: float, tolerance: float, scratch: Any, out: Any
 ) -> Any:
-    """Find the stretches of [a, b] inside a press of a radius, into `out`; return their number.
+    """Find the stretches of [a, b] inside a press, and return their number.
 
-    What is outside by up to `tolerance` counts as on the boundary. The chains of a circle have no breakpoints. What all
-    spans need is given by itself: to take an array out of a tuple costs as much as the rest.
+    The arguments are no tuple, since taking an array out of a tuple costs as much as all other steps.
+
+    Args:
+        span: coefficients r, h, e0, e1, e2, e3 of the span; shape (6,).
+        a: start of the interval of s.
+        b: end of it.
+        chains: breakpoints t, and v of the upper and of the lower chain there; shape (3, B), B = 0 for a circle.
+        extents: box of the press and radius of its inscribed circle, as `frame_shape` returns; shape (5,).
+        radius: radius of the press.
+        tolerance: distance outside up to which a point counts as on the boundary.
+        scratch: work arrays of `make_scratch`.
+        out: receives begin and end of each stretch.
     """
     r, h, inner = span[0], span[1], extents[4]
-    # a span lies in the box of its ends, since it is monotone: most boxes are wholly inside or wholly outside
-    t0, t1, v, v1 = r + h * a, r + h * b, evaluate_cubic(span, a), evaluate_cubic(span, b)
-    far_t, far_v = max(abs(t0), abs(t1)), max(abs(v), abs(v1))
+    # 1. Most spans lie wholly inside or outside, as does the box of their ends, since they are monotone.
+    t_start, t_end, v_start, v_end = r + h * a, r + h * b, evaluate_cubic(span, a), evaluate_cubic(span, b)
+    far_t, far_v = max(abs(t_start), abs(t_end)), max(abs(v_start), abs(v_end))
     if far_t * far_t + far_v * far_v < inner * inner:
         return _append_stretch(out, np.int64(0), a, b)
-    near_t, near_v = max(t0, -t1, 0.0), max(min(v, v1), -max(v, v1), 0.0)
+    near_t, near_v = max(t_start, -t_end, 0.0), max(min(v_start, v_end), -max(v_start, v_end), 0.0)
     if near_t * near_t + near_v * near_v > (radius + tolerance) * (radius + tolerance):
         return 0
+    # 2. Clip [a, b] to the extent of the press along t.
     last = chains.shape[1] - 1
     a = max(a, ((-radius if last < 0 else chains[0, 0]) - r) / h)
     b = min(b, ((radius if last < 0 else chains[0, last]) - r) / h)
@@ -336,55 +373,54 @@ def find_stretches_inside(
         return 0
     if last < 0:
         return _find_inside_circle(span, a, b, radius, tolerance, scratch, out)
-    count_inside, start, end, per_h = np.int64(0), a, r + h * b, 1 / h
-    t0, v, k = r + h * a, evaluate_cubic(span, a), piece_of(r + h * a, chains[0], last)
+    # 3. For a polygon, compare each piece [start, after] between two breakpoints with a line above and a line below.
+    count, start, t_last, per_h = np.int64(0), a, r + h * b, 1 / h
+    t_start, v_start, k = r + h * a, evaluate_cubic(span, a), piece_of(r + h * a, chains[0], last)
     while start < b:
-        if k == last - 1 or chains[0, k + 1] >= end:
-            after, t1 = b, end
+        if k == last - 1 or chains[0, k + 1] >= t_last:
+            after, t_end = b, t_last
         else:
-            t1 = chains[0, k + 1]
-            after = (t1 - r) * per_h
+            t_end = chains[0, k + 1]
+            after = (t_end - r) * per_h
         if after <= start:
             k += 1
             continue
-        v_after = evaluate_cubic(span, after)
-        far_t, far_v = max(abs(t0), abs(t1)), max(abs(v), abs(v_after))
-        if far_t * far_t + far_v * far_v < inner * inner:  # as for the whole span: no chain is near
-            count_inside = _append_stretch(out, count_inside, start, after)
-            start, t0, v, k = after, t1, v_after, k + 1
+        v_end = evaluate_cubic(span, after)
+        far_t, far_v = max(abs(t_start), abs(t_end)), max(abs(v_start), abs(v_end))
+        if far_t * far_t + far_v * far_v < inner * inner:
+            count = _append_stretch(out, count, start, after)
+            start, t_start, v_start, k = after, t_end, v_end, k + 1
             continue
         width = chains[0, k + 1] - chains[0, k]
-        x0 = 0.0 if t0 == chains[0, k] else (t0 - chains[0, k]) / width
-        x1 = 1.0 if t1 == chains[0, k + 1] else (t1 - chains[0, k]) / width
-        u0, u1 = chains[1, k] * (1 - x0) + chains[1, k + 1] * x0, chains[1, k] * (1 - x1) + chains[1, k + 1] * x1
-        l0, l1 = chains[2, k] * (1 - x0) + chains[2, k + 1] * x0, chains[2, k] * (1 - x1) + chains[2, k + 1] * x1
-        least, most = min(v, v_after), max(v, v_after)
-        if most <= min(u0, u1) and least >= max(l0, l1):
-            count_inside = _append_stretch(out, count_inside, start, after)
-        elif least <= max(u0, u1) + tolerance and most >= min(l0, l1) - tolerance:
-            near = most >= min(u0, u1), least <= max(l0, l1)
-            if near[0] != near[1]:  # mostly one line is crossed, once
-                y0, y1 = (u0, u1) if near[0] else (l0, l1)
-                share = find_one_crossing(span, start, after, v - y0, v_after - y1, y1 - y0, tolerance)
-                if not math.isnan(share):
-                    begins_inside = (v < y0) == near[0]
-                    cut = start + share * (after - start) if share > 0 else after
-                    if begins_inside:
-                        count_inside = _append_stretch(out, count_inside, start, cut)
-                    elif cut < after:
-                        count_inside = _append_stretch(out, count_inside, cut, after)
-                    start, t0, v, k = after, t1, v_after, k + 1
-                    continue
-            count_inside = _find_between_lines(
-                span, start, after, (u0, u1, l0, l1), near, tolerance, scratch, out, count_inside
-            )
-        start, t0, v, k = after, t1, v_after, k + 1
-    return count_inside
+        x0 = 0.0 if t_start == chains[0, k] else (t_start - chains[0, k]) / width
+        x1 = 1.0 if t_end == chains[0, k + 1] else (t_end - chains[0, k]) / width
+        upper_start = chains[1, k] * (1 - x0) + chains[1, k + 1] * x0
+        upper_end = chains[1, k] * (1 - x1) + chains[1, k + 1] * x1
+        lower_start = chains[2, k] * (1 - x0) + chains[2, k + 1] * x0
+        lower_end = chains[2, k] * (1 - x1) + chains[2, k + 1] * x1
+        min_v, max_v = min(v_start, v_end), max(v_start, v_end)
+        may_cross = max_v >= min(upper_start, upper_end), min_v <= max(lower_start, lower_end)
+        if max_v <= min(upper_start, upper_end) and min_v >= max(lower_start, lower_end):
+            count = _append_stretch(out, count, start, after)
+        elif min_v <= max(upper_start, upper_end) + tolerance and max_v >= min(lower_start, lower_end) - tolerance:
+            begin = end = math.nan
+            if may_cross[0] != may_cross[1]:  # usually the span crosses this line once
+                y0, y1 = (upper_start, upper_end) if may_cross[0] else (lower_start, lower_end)
+                begin, end = _find_beside_line(
+                    span, start, after, v_start - y0, v_end - y1, y1 - y0, may_cross[0], tolerance
+                )
+            if math.isnan(begin):
+                lines = upper_start, upper_end, lower_start, lower_end
+                count = _find_between_lines(span, start, after, lines, may_cross, tolerance, scratch, out, count)
+            elif begin < after:
+                count = _append_stretch(out, count, begin, end)
+        start, t_start, v_start, k = after, t_end, v_end, k + 1
+    return count
 
 
 @kernel
 def _compute_stretch_signal(span: Any, a: float, b: float, law: Any, scratch: Any) -> float:
-    """Return the signal of a stretch inside the press, split where the weight bends."""
+    """Return the signal of a stretch inside the press, split where the weight is not smooth."""
     roots, work, p, stack = scratch
     count = np.int64(0)
     if law.weight == INVERSE:
@@ -400,10 +436,10 @@ def _compute_stretch_signal(span: Any, a: float, b: float, law: Any, scratch: An
 def centre_cubic(
     t0: float, t1: float, v0: float, v1: float, d0: float, d1: float, ct: float, cv: float, out: Any
 ) -> float:
-    """Expand the span between two knots about its point abreast of the press centre, into `out` (6,).
+    """Expand the span between two knots about its point nearest to the press centre along t, into `out` (6,).
 
     Returns:
-        Share s0 of the span before that point; s runs from -s0 to 1 - s0.
+        Fraction s0 of the span before that point; s runs from -s0 to 1 - s0.
     """
     h, rise = t1 - t0, v1 - v0
     s0 = min(max((ct - t0) / h, 0.0), 1.0)
@@ -453,9 +489,9 @@ def _compute_fibre_signal(
 
 @kernel
 def make_scratch(breaks: int) -> Any:
-    """Allocate one thread's work arrays, for stretches inside, and for roots, their stack, a polynomial, a quadrature.
+    """Allocate the work arrays of a thread: stretches, and (roots, their stack, a polynomial, intervals of quadrature).
 
-    Each piece between `breaks` breakpoints holds at most 4 stretches: 6 roots cut it into 7 parts.
+    A piece between two of the `breaks` breakpoints has at most 4 stretches, since 6 roots cut it into 7 parts.
     """
     scratch = np.empty(16), np.empty(SCRATCH), np.empty(7), np.empty((MAX_HALVINGS + 2, 2))
     return np.empty((4 * breaks + 8, 2)), scratch
@@ -465,10 +501,18 @@ def make_scratch(breaks: int) -> Any:
 def exact_signals(
     curves: Any, max_offsets: Any, ends: Any, presses: Any, shape: Any, begin: int, end: int, sparse: Any, signal: Any
 ) -> int:
-    """Compute signals of pads, only for fibres that a press can touch, for presses `begin` to `end` of all P Q.
+    """Compute signals of pads for some presses, only of the fibres that a press can touch.
 
-    They go into `signal` (P Q F,), zeros before. Or, for one pad, as a sparse matrix into the fibre indices of `sparse`
-    and into `signal`, if the former's starts (Q + 1,), from `count_touched`, are not empty.
+    Args:
+        curves: along, across and slope of the knots; each of shape (P, F, n).
+        max_offsets: maximum offsets of the fibres of each family; shape (P, 2).
+        ends: positions at which the fibres end.
+        presses: shape (Q, 2).
+        shape: chains, extents and law of the press.
+        begin: first of the P Q presses.
+        end: index after the last one.
+        sparse: empty arrays, or for one pad the starts (Q + 1,) of `count_touched` and an array for fibre indices.
+        signal: receives the signals; shape (P Q F,), zeros, or as many values as there are fibre indices.
 
     Returns:
         Number of spans visited.
@@ -496,7 +540,7 @@ def _compute_signals(
     stretches: Any,
     scratch: Any,
 ) -> int:
-    """Compute `exact_signals` with the shape in both frames and work arrays given: no array may be made here."""
+    """Compute `exact_signals` from the shape in both frames, with work arrays, since no array may be allocated here."""
     (along, across, slope), (starts, fibre) = curves, sparse
     fibres, visited = along.shape[1], 0
     for index in range(begin, end):

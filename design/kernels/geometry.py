@@ -17,44 +17,65 @@ EPS = 2.0**-52
 UNIFORM, INVERSE_SQUARE, INVERSE, PROFILE = 0, 1, 2, 3
 MANHATTAN, EUCLIDEAN = 0, 1
 DEGREE = 7
-"""Degree of the polynomials of a profile: those of a layer; splines are cubic, and their other coefficients are 0."""
-PLAIN, DIRECTED, COLUMNS = 1, 2 + DEGREE, 3 + 2 * DEGREE
-"""First columns of the coefficients of w and v in a row of a profile, and their number."""
-NO_PROFILE, NO_BINS = np.empty((2, 0, COLUMNS)), np.empty(0, np.int32)
-MAX_BINS = 1 << 15
+"""Degree of the polynomials of a layer's profile; those of splines are cubic, with their other coefficients 0."""
+PLAIN = 1
+"""First column of the coefficients of w in a row of a profile."""
+DIRECTED = 2 + DEGREE
+"""First column of the coefficients of v."""
+COLUMNS = 3 + 2 * DEGREE
+"""Number of columns of a profile."""
 
 
 class Ends(NamedTuple):
-    """Positions of fibre ends: horizontal i (from 0) is at the height (i + 1) spacing_y, vertical i alike."""
+    """Positions of fibre ends: horizontal i (from 0) at the height (i + 1) spacing_y, vertical i at (i + 1) spacing_x.
 
-    horizontals: int  # number of horizontals
-    verticals: int  # number of verticals
-    spacing_y: float  # distance of horizontals, grid units
-    spacing_x: float  # distance of verticals, grid units
+    Attributes:
+        horizontals: number of horizontals.
+        verticals: number of verticals.
+        spacing_y: distance of horizontals, grid units.
+        spacing_x: distance of verticals, grid units.
+    """
+
+    horizontals: int
+    verticals: int
+    spacing_y: float
+    spacing_x: float
 
 
 class WeightLaw(NamedTuple):
     """Weight of a fibre element in a press.
 
-    A profile is w(d) + v(d) cos^2 phi, with d the distance to the press centre and phi the angle between the fibre and
-    the way there; v is 0 at d = 0. It has a table for each family, whose fibres may lie at another depth: rows of a
-    squared distance, and the coefficients of the polynomials w and v in the excess over it, up to the next row's.
+    A profile is w(d) + v(d) cos^2 phi, with the distance d to the press centre and the angle phi between the fibre and
+    the direction to the centre; v is 0 at d = 0. It has a table for each family, since their fibres may lie at
+    different depths. A row of the table has a squared distance, and the coefficients of the polynomials w and v in the
+    excess over that squared distance, which hold up to that of the next row.
+
+    Attributes:
+        radius: circumradius of the shape, or the distance at which a profile ends.
+        weight: UNIFORM, INVERSE_SQUARE, INVERSE or PROFILE.
+        length: MANHATTAN or EUCLIDEAN.
+        profile: the tables; shape (2, B, COLUMNS), or (B, COLUMNS) in the frame of a family.
+        bins: row of the profile at the beginning of each of equal steps of the squared distance.
+        bin_rate: steps per squared distance.
+        directional: whether v is not 0.
+        near: distance from which the profile is smooth enough for a coarse quadrature.
+        edge: distance of the edge of a contact, at which the profile bends most; 0 if there is none.
     """
 
-    radius: float  # circumradius of the shape, or the distance at which a profile ends
-    weight: int  # UNIFORM, INVERSE_SQUARE, INVERSE or PROFILE
-    length: int  # MANHATTAN or EUCLIDEAN
-    profile: Array = NO_PROFILE  # shape (2, B, COLUMNS), or (B, COLUMNS) in the frame of a family
-    bins: NDArray[np.int32] = NO_BINS  # row of the profile at the begin of each of equal steps of the squared distance
-    bin_rate: float = 0.0  # steps per squared distance
-    directional: bool = False  # whether v counts
-    near: float = math.inf  # distance beyond which the profile is so smooth that a coarse quadrature serves
-    edge: float = 0.0  # distance at which the profile bends most, the edge of a contact; 0 if there is none
+    radius: float
+    weight: int
+    length: int
+    profile: Array = np.empty((2, 0, COLUMNS))
+    bins: NDArray[np.int32] = np.empty(0, np.int32)
+    bin_rate: float = 0.0
+    directional: bool = False
+    near: float = math.inf
+    edge: float = 0.0
 
 
 @kernel
 def weigh(square: float, law: Any) -> float:
-    """Return the weight of a fibre element at a squared distance from the press centre, in a shape."""
+    """Return the weight of a fibre element in a shape, at a squared distance from the press centre."""
     radius, weight = law.radius, law.weight
     if weight == UNIFORM:
         return 1.0
@@ -96,9 +117,9 @@ def weigh_profile(dt: float, dv: float, ut: float, uv: float, profile: Any, law:
     return weight
 
 
-@kernel(_nrt=False)  # as above, and its callers compile sooner than with it inlined
+@kernel(_nrt=False)  # avoids counting references too, and its callers compile faster than with inlining
 def weigh_element(t: float, v: float, run: float, rise: float, law: Any) -> float:
-    """Return the weight of an element at (t, v) from the press centre that runs along (run, rise), by a framed law."""
+    """Return the weight of an element at (t, v) from the press centre of the direction (run, rise), by a framed law."""
     if law.weight != PROFILE:
         return weigh(t * t + v * v, law)
     norm = math.sqrt(run * run + rise * rise)
@@ -108,18 +129,24 @@ def weigh_element(t: float, v: float, run: float, rise: float, law: Any) -> floa
 def profile_law(
     length: int, families: tuple[tuple[Array, Array, Array], ...], near: float = math.inf, edge: float = 0.0
 ) -> WeightLaw:
-    """Return the law of profiles by their (distances, weights w, weights v), once for both families or for each.
+    """Return the law of profiles through weights at distances.
 
-    All have the same distances. Both functions are a `profile_spline` through them, or with an edge polynomials of the
-    squared distance through every DEGREE + 1 of them, each of which begins where the last one ends.
+    Without an edge, the functions w and v are a `profile_spline`. With an edge, they are polynomials of the squared
+    distance, each through DEGREE + 1 points, of which the last one is the first of the next polynomial.
+
+    Args:
+        length: MANHATTAN or EUCLIDEAN.
+        families: distances, which are equal for all, weights w and weights v; once for both families, or for each.
+        near: distance from which a coarse quadrature is sufficient.
+        edge: distance of the edge of a contact; 0 if there is none.
     """
     fit = _fit_polynomials if edge else _fit_splines
     tables = [fit(*family) for family in families]
     profile = np.ascontiguousarray(np.stack([tables[0], tables[-1]]))
     end, starts = float(families[0][0][-1]), profile[0, :, 0]
     finest = float(np.diff(np.append(starts, end**2)).min())
-    steps = min(MAX_BINS, math.ceil(end**2 / finest - 1e-6))
-    # a row that begins at a step's begin, to rounding, is its row
+    steps = min(1 << 15, math.ceil(end**2 / finest - 1e-6))
+    # the factor makes a row that begins with a step, except for rounding, the row of that step
     bins = np.searchsorted(starts, np.arange(steps + 1) * (end**2 / steps) * (1 + 1e-12), side="right") - 1
     directional = any(bool(np.any(directed)) for _, _, directed in families)
     return WeightLaw(end, PROFILE, length, profile, bins.astype(np.int32), steps / end**2, directional, near, edge)
@@ -149,12 +176,12 @@ def _fit_polynomials(distance: Array, plain: Array, directed: Array) -> Array:
 def frame_shape(radius: float, sides: int | None) -> tuple[tuple[Array, Array], Array]:
     """Return a polygon of `sides` in a circle of `radius`, or the circle if None, in the frame of each family.
 
-    A circle has no breakpoints. At t a polygon extends up to the lowest of its upper edges' lines and down to the
-    highest of its lower ones.
+    At t a polygon extends up to the lowest line through an upper edge and down to the highest through a lower edge.
+    A circle has no breakpoints.
 
     Returns:
-        Chains, two of (3, B) breakpoints t, upper v and lower v; and extents (2, 5): min and max t, min and max v,
-        radius of the inscribed circle.
+        Two chains (3, B), of breakpoints t, upper v and lower v; and extents (2, 5): minimum and maximum t, minimum and
+        maximum v, radius of the inscribed circle.
     """
     if sides is None:
         empty = np.empty((3, 0))
@@ -193,28 +220,28 @@ def max_offsets(across: Any, ends: Any) -> Any:
         for f in range(fibres):
             family = 0 if f < ends.horizontals else 1
             level = (f + 1) * ends.spacing_y if family == 0 else (f - ends.horizontals + 1) * ends.spacing_x
-            for at in across[p, f]:
-                out[p, family] = max(out[p, family], abs(at - level))
+            for v in across[p, f]:
+                out[p, family] = max(out[p, family], abs(v - level))
     return out
 
 
 @kernel
 def find_touched_range(cv: float, extents: Any, max_offset: float, ends: Any, family: int) -> tuple[int, int]:
-    """Find the first fibre that a press at `cv` can touch, of all fibres, and the one to stop before.
+    """Return the range (first, last + 1) of the fibres of a family that a press at `cv` can touch.
 
-    They are those of the family whose level plus offset is within the extents (5,) of the press.
+    Their levels are within the extents (5,) of the press plus the maximum offset of a fibre from its level.
     """
     before = 0 if family == 0 else ends.horizontals
     count, spacing = (ends.horizontals, ends.spacing_y) if family == 0 else (ends.verticals, ends.spacing_x)
-    slack = 8 * EPS * (abs(cv) + extents[3])  # a fibre on the boundary is touched, whichever way rounding goes
-    first = min(max(math.ceil((cv + extents[2] - max_offset - slack) / spacing) - 1, 0.0), float(count))
-    end = min(max(math.floor((cv + extents[3] + max_offset + slack) / spacing), 0.0), float(count))
+    tolerance = 8 * EPS * (abs(cv) + extents[3])  # includes fibres on the boundary despite rounding
+    first = min(max(math.ceil((cv + extents[2] - max_offset - tolerance) / spacing) - 1, 0.0), float(count))
+    end = min(max(math.floor((cv + extents[3] + max_offset + tolerance) / spacing), 0.0), float(count))
     return before + int(first), before + int(end)
 
 
 @kernel
 def count_touched(max_offsets: Any, presses: Any, extents: Any, ends: Any) -> Any:
-    """Return the cumulative counts (Q + 1,), from 0, of fibres that presses can touch on one pad; offsets (2,)."""
+    """Return the cumulative number (Q + 1,) of fibres that presses can touch on one pad of `max_offsets` (2,)."""
     starts = np.zeros(len(presses) + 1, np.int64)
     for q in range(len(presses)):
         starts[q + 1] = starts[q]
@@ -225,23 +252,23 @@ def count_touched(max_offsets: Any, presses: Any, extents: Any, ends: Any) -> An
 
 
 _BOX_SEGMENTS = 8
-"""Segments per bounding box, which is tested before they are."""
+"""Segments per bounding box."""
 
 
 @kernel
 def _clip_to_slab(
-    value: float, slope: float, least: float, most: float, low: float, high: float
+    value: float, slope: float, lower: float, upper: float, low: float, high: float
 ) -> tuple[float, float]:
-    """Clip low..high to where value + t slope is within least..most; low > high where nowhere."""
+    """Clip low..high to the t of lower <= value + t slope <= upper; low > high if there are none."""
     if slope == 0:
-        return (low, high) if least <= value <= most else (1.0, 0.0)
-    first, last = (least - value) / slope, (most - value) / slope
+        return (low, high) if lower <= value <= upper else (1.0, 0.0)
+    first, last = (lower - value) / slope, (upper - value) / slope
     return max(low, min(first, last)), min(high, max(first, last))
 
 
 @kernel(inline="always")
 def _clip_to_disc(x: float, y: float, dx: float, dy: float, radius: float) -> tuple[float, float]:
-    """Clip 0..1 to where (x, y) + t (dx, dy) is within `radius` of 0; low > high where nowhere."""
+    """Clip 0..1 to the t at which (x, y) + t (dx, dy) is within `radius` of 0; low > high if there are none."""
     square, middle = dx * dx + dy * dy, x * dx + y * dy
     root = middle * middle - square * (x * x + y * y - radius * radius)
     if root < 0:
@@ -254,10 +281,10 @@ def _clip_to_disc(x: float, y: float, dx: float, dy: float, radius: float) -> tu
 def _clip_to_capsule(
     x: float, y: float, dx: float, dy: float, ex: float, ey: float, width: float
 ) -> tuple[float, float]:
-    """Clip 0..1 to where (x, y) + t (dx, dy) is within `width` of the segment from 0 to (ex, ey).
+    """Clip 0..1 to the t at which (x, y) + t (dx, dy) is within `width` of the segment from 0 to (ex, ey).
 
-    The set near a segment is a rectangle with a disc at either end. It is convex, so a line is inside from the first to
-    the last position at which it is in one of the three.
+    The points near a segment are a rectangle and a disc at either end. Their union is convex, so a line is inside from
+    the first to the last t at which it is in one of the three.
     """
     low, high = 1.0, 0.0
     length = math.hypot(ex, ey)
@@ -297,9 +324,15 @@ def _bound_segments(points: Any, first: Any, margin: float) -> tuple[Any, Any, A
 def find_near_intervals(points: Any, first: Any, others: Any, other_first: Any, width: float) -> Any:
     """Find the intervals of polylines that are nearer than `width` to segments of other polylines.
 
-    `points` (n, 2) are the vertices of all polylines, one after the other, `first` (L + 1,) the index of the first one
-    of each, and n; the same for the others. Intervals (k, 4) are the polyline, the other one, and the arc lengths of
-    start and end.
+    Args:
+        points: vertices of all polylines, one after the other; shape (n, 2).
+        first: index of the first vertex of each, and n; shape (L + 1,).
+        others: vertices of the other polylines.
+        other_first: the index of their first vertices.
+        width: maximum distance.
+
+    Returns:
+        Index of the polyline, index of the other one, and arc lengths of start and end; shape (k, 4).
     """
     sides, segments, lines = _bound_segments(points, first, width)
     other_sides, other_segments, other_lines = _bound_segments(others, other_first, 0.0)
@@ -310,17 +343,17 @@ def find_near_intervals(points: Any, first: Any, others: Any, other_first: Any, 
     intervals, count = np.empty((64, 4)), 0
     for box in range(len(sides)):
         x_min, y_min, x_max, y_max = sides[box]
-        for beside in range(len(other_sides)):
-            if other_sides[beside, 0] > x_max or other_sides[beside, 2] < x_min:
+        for other in range(len(other_sides)):
+            if other_sides[other, 0] > x_max or other_sides[other, 2] < x_min:
                 continue
-            if other_sides[beside, 1] > y_max or other_sides[beside, 3] < y_min:
+            if other_sides[other, 1] > y_max or other_sides[other, 3] < y_min:
                 continue
             for i in range(segments[box, 0], segments[box, 1]):
                 x, y, length = points[i, 0], points[i, 1], arcs[i + 1] - arcs[i]
                 dx, dy = points[i + 1, 0] - x, points[i + 1, 1] - y
                 if length == 0:
                     continue
-                for j in range(other_segments[beside, 0], other_segments[beside, 1]):
+                for j in range(other_segments[other, 0], other_segments[other, 1]):
                     ox, oy = others[j, 0] - x, others[j, 1] - y
                     ex, ey = others[j + 1, 0] - others[j, 0], others[j + 1, 1] - others[j, 1]
                     if min(ox, ox + ex) > max(0.0, dx) + width or max(ox, ox + ex) < min(0.0, dx) - width:
@@ -332,7 +365,7 @@ def find_near_intervals(points: Any, first: Any, others: Any, other_first: Any, 
                         continue
                     if count == len(intervals):
                         intervals = np.concatenate((intervals, np.empty_like(intervals)))
-                    intervals[count, 0], intervals[count, 1] = lines[box], other_lines[beside]
+                    intervals[count, 0], intervals[count, 1] = lines[box], other_lines[other]
                     intervals[count, 2], intervals[count, 3] = arcs[i] + since * length, arcs[i] + until * length
                     count += 1
     return intervals[:count]
@@ -346,7 +379,7 @@ SCRATCH = (_DEPTH + 2, _MAX_DEGREE + 3)
 
 @kernel
 def shell_sort(values: Any, count: Any) -> None:
-    """Sort values[:count] in place (Shell 1959): NumPy's sort takes a second to compile."""
+    """Sort values[:count] in place (Shell 1959), since NumPy's sort takes a second to compile."""
     gap = count
     while gap > 1:
         gap = max(gap * 5 // 11, 1)
@@ -360,7 +393,7 @@ def shell_sort(values: Any, count: Any) -> None:
 
 @kernel
 def refine_root(p: Any, degree: int, low: float, high: float, rising: bool) -> float:
-    """Find the one sign change of p in (low, high) by Newton's method, safeguarded by bisection."""
+    """Find the only sign change of p in (low, high) by Newton's method, safeguarded by bisection."""
     u = 0.5 * (low + high)
     for _ in range(100):
         value, slope = p[degree], 0.0
@@ -386,10 +419,11 @@ def refine_root(p: Any, degree: int, low: float, high: float, rising: bool) -> f
 def find_unit_roots(p: Any, degree: Any, tolerance: float, out: Any, count: Any, work: Any) -> int:
     """Append the sign changes of sum p[i] u^i on (0, 1), ascending, to out[count:]; return the new count.
 
-    Bernstein subdivision: coefficients without a change of sign exclude a root, with one change they isolate one
-    (Descartes' rule); else the interval is halved by de Casteljau's algorithm. A polynomial whose coefficients are all
-    within `tolerance` of 0 only touches zero. The degree, at most `_MAX_DEGREE`, is an int64: kernels are compiled anew
-    for each literal. `work` is a stack of [coefficients ..., low, high] of the shape SCRATCH.
+    Bernstein subdivision: by Descartes' rule, coefficients without a change of sign exclude a root, and one change
+    isolates one; otherwise the interval is halved by de Casteljau's algorithm. A polynomial whose coefficients are all
+    within `tolerance` of 0 is assumed not to change its sign. The degree, at most `_MAX_DEGREE`, is an int64, since
+    literals are types of their own to compile for. `work` is a stack of [coefficients ..., low, high] of the shape
+    SCRATCH.
     """
     lo, hi = _MAX_DEGREE + 1, _MAX_DEGREE + 2
     for j in range(degree + 1):  # power to Bernstein form: b_j = sum_i C(j, i) / C(n, i) p_i
@@ -402,7 +436,7 @@ def find_unit_roots(p: Any, degree: Any, tolerance: float, out: Any, count: Any,
     top = 0
     while top >= 0:
         b = work[top]
-        # a zero counts as positive, so that a root at the border of two halves shows in one of them
+        # a zero counts as positive, so that a root at the border of two halves is found in exactly one of them
         changes, largest = 0, abs(b[0])
         for j in range(1, degree + 1):
             largest = max(largest, abs(b[j]))
@@ -416,13 +450,13 @@ def find_unit_roots(p: Any, degree: Any, tolerance: float, out: Any, count: Any,
             top -= 1
         elif top >= _DEPTH:
             top -= 1
-        else:  # de Casteljau at the middle; the lower half goes on top of the stack, so roots come in order
+        else:  # de Casteljau at the middle, with the lower half on top of the stack, so that roots are ascending
             lower = work[top + 1]
             for j in range(degree + 1):
                 lower[j] = b[0]
                 for i in range(degree - j):
                     b[i] = 0.5 * (b[i] + b[i + 1])
-            # after the sweep b holds the last diagonal reversed: the upper half
+            # b now has the coefficients of the upper half
             middle = 0.5 * (b[lo] + b[hi])
             lower[lo], lower[hi] = b[lo], middle
             b[lo] = middle
@@ -434,12 +468,17 @@ def find_unit_roots(p: Any, degree: Any, tolerance: float, out: Any, count: Any,
 def sum_overlaps(
     samples: Any, slope: Any, arc: Any, pairs: Any, middles: Any, half: float, width: float, gradient: Any
 ) -> float:
-    """Sum how much nearer than `width`, relative to it, points of fibres are to the tangent of one of the other family.
+    """Sum the overlap, 1 - distance / width if positive, of points of fibres with tracks of the other family.
 
-    Two points count for each of the `middles` (K,), at the arc length `half` before and after it. `pairs` are the fibre
-    of each middle and the one of the other family that it is near. `samples` (F, P, 2) of the fibres are along and
-    across their axis, with `slope` and `arc` lengths (F, P). The derivative of the sum by `samples`, for points at
-    fixed arc lengths, is added to `gradient`.
+    Args:
+        samples: samples of the fibres along and across their axis; shape (F, P, 2).
+        slope: slopes at the samples; shape (F, P).
+        arc: arc lengths of the samples; shape (F, P).
+        pairs: fibre of each of K stretches, and the near fibre of the other family; each of shape (K,).
+        middles: arc lengths of the middles of the stretches; shape (K,).
+        half: distance along the fibre of the two points of a stretch from its middle.
+        width: distance to the tangent of the other fibre at which the overlap is 0.
+        gradient: receives the gradient by `samples`, for points at fixed arc lengths; shape (F, P, 2).
     """
     (fibres, neighbours), n_samples, total = pairs, samples.shape[1], 0.0
     for k in range(len(fibres)):
@@ -451,11 +490,11 @@ def sum_overlaps(
             dx, dy = samples[f, after, 1] - samples[f, after - 1, 1], samples[f, after, 0] - samples[f, after - 1, 0]
             x, y = samples[f, after - 1, 1] + share * dx, samples[f, after - 1, 0] + share * dy
             # 2. its distance to the tangent at the nearest sample of the other fibre
-            nearest, least = 0, np.inf
+            nearest, min_square = 0, np.inf
             for i in range(n_samples):
                 square = (samples[g, i, 0] - x) ** 2 + (samples[g, i, 1] - y) ** 2
-                if square < least:
-                    nearest, least = i, square
+                if square < min_square:
+                    nearest, min_square = i, square
             norm_slope = math.hypot(1.0, slope[g, nearest])
             nx, ny = -slope[g, nearest] / norm_slope, 1.0 / norm_slope
             distance = (x - samples[g, nearest, 0]) * nx + (y - samples[g, nearest, 1]) * ny
@@ -463,19 +502,19 @@ def sum_overlaps(
             if overlap <= 0:
                 continue
             total += overlap
-            push = -math.copysign(1.0, distance) / width
-            # the tangent turns with the sample on the other side of the foot point
+            grad_distance = -math.copysign(1.0, distance) / width
+            # the tangent also turns with the sample on the other side of the foot point
             beyond = (x - samples[g, nearest, 0]) * ny - (y - samples[g, nearest, 1]) * nx
             behind = min(max(nearest + (1 if beyond > 0 else -1), 0), n_samples - 1)
             step = abs(arc[g, behind] - arc[g, nearest])
             foot = min(abs(beyond) / step, 1.0) if step > 0 else 0.0
             for i, weight in ((nearest, 1.0 - foot), (behind, foot)):
-                gradient[g, i, 0] -= weight * push * nx
-                gradient[g, i, 1] -= weight * push * ny
-            # 3. gradient for the point's own fibre, projected: points keep their arc length
+                gradient[g, i, 0] -= weight * grad_distance * nx
+                gradient[g, i, 1] -= weight * grad_distance * ny
+            # 3. gradient of the fibre of the point, without its part along the fibre, since arc lengths are fixed
             norm = math.hypot(dx, dy)
             along = (nx * dx + ny * dy) / norm
-            px, py = push * (nx - along * dx / norm), push * (ny - along * dy / norm)
+            px, py = grad_distance * (nx - along * dx / norm), grad_distance * (ny - along * dy / norm)
             for i, weight in ((after - 1, 1.0 - share), (after, share)):
                 gradient[f, i, 1] += weight * px
                 gradient[f, i, 0] += weight * py

@@ -12,7 +12,7 @@ _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(8)
 
 @kernel
 def piece_of(at: float, edges: Any, pieces: int) -> int:
-    """Return the index of the piece that contains `at` by bisection of ascending `edges`; the first if none does."""
+    """Return the index of the piece that contains `at`, or the nearest one, by bisection of ascending `edges`."""
     low, high = 0, pieces
     while high - low > 1:
         middle = (low + high) // 2
@@ -34,7 +34,7 @@ def extremes(values: Any) -> tuple[float, float]:
 
 @kernel
 def _end_slope(h0: float, h1: float, m0: float, m1: float) -> float:
-    """Return the slope at an end knot: three-point rule, limited to preserve the shape."""
+    """Return the slope at an end knot by the three-point formula, limited to preserve the shape."""
     d = ((2 * h0 + h1) * m0 - h0 * m1) / (h0 + h1)
     if d * m0 <= 0:
         return 0.0
@@ -81,12 +81,12 @@ def _add_end_slope_gradient(h0: float, h1: float, m0: float, m1: float, upstream
 
 
 @kernel(inline="always")
-def add_slopes_gradient(t: Any, v: Any, d: Any, upstream: Any, by_t: Any, by_v: Any) -> None:
+def add_slopes_gradient(t: Any, v: Any, d: Any, upstream: Any, grad_t: Any, grad_v: Any) -> None:
     """Add the gradient of sum(upstream * d) of `pchip_slopes`, by t and by v."""
     n = len(t)
-    by_h, by_m, change = np.zeros(n - 1), np.zeros(n - 1), np.empty(4)
+    grad_h, grad_m, change = np.zeros(n - 1), np.zeros(n - 1), np.empty(4)
     if n == 2:
-        by_m[0] = upstream[0] + upstream[1]
+        grad_m[0] = upstream[0] + upstream[1]
     else:
         for k in range(1, n - 1):
             if d[k] == 0:
@@ -95,33 +95,33 @@ def add_slopes_gradient(t: Any, v: Any, d: Any, upstream: Any, by_t: Any, by_v: 
             m0, m1 = (v[k] - v[k - 1]) / h0, (v[k + 1] - v[k]) / h1
             w0, w1 = 2 * h1 + h0, h1 + 2 * h0
             share = upstream[k] * d[k] / (w0 + w1)
-            by_m[k - 1] += share * d[k] * w0 / m0**2
-            by_m[k] += share * d[k] * w1 / m1**2
-            by_w0, by_w1 = share * (1 - d[k] / m0), share * (1 - d[k] / m1)
-            by_h[k - 1] += by_w0 + 2 * by_w1
-            by_h[k] += by_w1 + 2 * by_w0
+            grad_m[k - 1] += share * d[k] * w0 / m0**2
+            grad_m[k] += share * d[k] * w1 / m1**2
+            grad_w0, grad_w1 = share * (1 - d[k] / m0), share * (1 - d[k] / m1)
+            grad_h[k - 1] += grad_w0 + 2 * grad_w1
+            grad_h[k] += grad_w1 + 2 * grad_w0
         for end, beside in ((0, 1), (n - 2, n - 3)):
             h0, h1 = t[end + 1] - t[end], t[beside + 1] - t[beside]
             m0, m1 = (v[end + 1] - v[end]) / h0, (v[beside + 1] - v[beside]) / h1
             change[:] = 0
             _add_end_slope_gradient(h0, h1, m0, m1, upstream[0 if end == 0 else n - 1], change)
-            by_h[end] += change[0]
-            by_h[beside] += change[1]
-            by_m[end] += change[2]
-            by_m[beside] += change[3]
+            grad_h[end] += change[0]
+            grad_h[beside] += change[1]
+            grad_m[end] += change[2]
+            grad_m[beside] += change[3]
     for k in range(n - 1):
         h = t[k + 1] - t[k]
-        rise = by_m[k] / h
-        run = by_h[k] - rise * (v[k + 1] - v[k]) / h
-        by_v[k] -= rise
-        by_v[k + 1] += rise
-        by_t[k] -= run
-        by_t[k + 1] += run
+        rise = grad_m[k] / h
+        run = grad_h[k] - rise * (v[k + 1] - v[k]) / h
+        grad_v[k] -= rise
+        grad_v[k + 1] += rise
+        grad_t[k] -= run
+        grad_t[k + 1] += run
 
 
 @kernel
 def pchip_value(t: Any, v: Any, d: Any, j: int, s: float) -> tuple[float, float]:
-    """Return value and slope of the curve through (t, v) with slopes d at 0 <= s <= 1 of span j."""
+    """Return value and slope of the curve through (t, v) with the slopes d, at a fraction s of span j."""
     h, r = t[j + 1] - t[j], 1 - s
     m = (v[j + 1] - v[j]) / h
     value = v[j] + h * s * (m * s * (3 - 2 * s) + r * (d[j] * r - d[j + 1] * s))
@@ -130,19 +130,28 @@ def pchip_value(t: Any, v: Any, d: Any, j: int, s: float) -> tuple[float, float]
 
 @kernel
 def add_value_gradient(
-    t: Any, v: Any, d: Any, j: int, s: float, by_value: float, by_slope: float, by_t: Any, by_v: Any, by_d: Any
+    t: Any,
+    v: Any,
+    d: Any,
+    j: int,
+    s: float,
+    grad_value: float,
+    grad_slope: float,
+    grad_t: Any,
+    grad_v: Any,
+    grad_d: Any,
 ) -> None:
-    """Add the gradient of by_value * value + by_slope * slope of `pchip_value`, for s held, by t, by v and by d."""
+    """Add the gradient of grad_value * value + grad_slope * slope of `pchip_value`, for s held, by t, by v and by d."""
     h, r = t[j + 1] - t[j], 1 - s
     m = (v[j + 1] - v[j]) / h
-    rise = by_value * s * s * (3 - 2 * s) + by_slope * 6 * s * r / h
-    by_v[j] += by_value - rise
-    by_v[j + 1] += rise
-    by_d[j] += by_value * h * s * r * r + by_slope * r * (1 - 3 * s)
-    by_d[j + 1] -= by_value * h * s * s * r + by_slope * s * (2 - 3 * s)
-    run = by_value * s * r * (d[j] * r - d[j + 1] * s) - by_slope * 6 * m * s * r / h
-    by_t[j] -= run
-    by_t[j + 1] += run
+    rise = grad_value * s * s * (3 - 2 * s) + grad_slope * 6 * s * r / h
+    grad_v[j] += grad_value - rise
+    grad_v[j + 1] += rise
+    grad_d[j] += grad_value * h * s * r * r + grad_slope * r * (1 - 3 * s)
+    grad_d[j + 1] -= grad_value * h * s * s * r + grad_slope * s * (2 - 3 * s)
+    run = grad_value * s * r * (d[j] * r - d[j + 1] * s) - grad_slope * 6 * m * s * r / h
+    grad_t[j] -= run
+    grad_t[j + 1] += run
 
 
 @kernel
@@ -156,7 +165,7 @@ def pchip_sample(t: Any, v: Any, step: float, out: Any) -> None:
         a1, a2, a3 = h * d[j], 3 * rise - h * (2 * d[j] + d[j + 1]), h * (d[j] + d[j + 1]) - 2 * rise
         end = max(min(math.ceil(t[j + 1] / step), len(out) - 1), i)
         part, start, first, per_h = out[i:end], t[j], v[j], 1 / h
-        for k in range(len(part)):  # over a slice: the compiler need not look for negative indices, and vectorises
+        for k in range(len(part)):  # a slice has no negative indices, so that the compiler vectorises the loop
             s = ((i + k) * step - start) * per_h
             part[k] = first + s * (a1 + s * (a2 + s * a3))
         i = end
@@ -175,9 +184,9 @@ def population_slopes(along: Any, across: Any) -> Any:
 
 @kernel
 def sample_spans(along: Any, across: Any, slope: Any, shares: Any, points: Any, slopes: Any) -> None:
-    """Sample fibres (F, n) at the `shares` (K,) of every span, and at the last knot.
+    """Sample fibres (F, n) at the fractions `shares` (K,) of every span, and at the last knot.
 
-    Written are `points` (F, P, 2), along and across, and `slopes` (F, P), with P = K (n - 1) + 1.
+    Results are `points` (F, P, 2), along and across, and `slopes` (F, P), with P = K (n - 1) + 1.
     """
     count, n = len(shares), along.shape[1]
     for f in range(len(along)):
@@ -196,30 +205,32 @@ def add_samples_gradient(
     across: Any,
     slope: Any,
     shares: Any,
-    by_points: Any,
-    by_slopes: Any,
-    by_along: Any,
-    by_across: Any,
-    by_slope: Any,
+    grad_points: Any,
+    grad_slopes: Any,
+    grad_along: Any,
+    grad_across: Any,
+    grad_slope: Any,
 ) -> None:
-    """Add the gradient of sum(by_points * points) + sum(by_slopes * slopes) of `sample_spans`, by knots and slopes."""
+    """Add the gradient of sum(grad_points * points + grad_slopes * slopes) of `sample_spans` by knots and slopes."""
     count, n = len(shares), along.shape[1]
     for f in range(len(along)):
-        t, v, d, by_t, by_v, by_d = along[f], across[f], slope[f], by_along[f], by_across[f], by_slope[f]
+        t, v, d, grad_t, grad_v, grad_d = along[f], across[f], slope[f], grad_along[f], grad_across[f], grad_slope[f]
         for j in range(n - 1):
             for k in range(count):
                 i = j * count + k
-                by_t[j] += by_points[f, i, 0] * (1 - shares[k])
-                by_t[j + 1] += by_points[f, i, 0] * shares[k]
-                add_value_gradient(t, v, d, j, shares[k], by_points[f, i, 1], by_slopes[f, i], by_t, by_v, by_d)
-        by_t[n - 1] += by_points[f, -1, 0]
-        by_v[n - 1] += by_points[f, -1, 1]
-        by_d[n - 1] += by_slopes[f, -1]
+                grad_t[j] += grad_points[f, i, 0] * (1 - shares[k])
+                grad_t[j + 1] += grad_points[f, i, 0] * shares[k]
+                add_value_gradient(
+                    t, v, d, j, shares[k], grad_points[f, i, 1], grad_slopes[f, i], grad_t, grad_v, grad_d
+                )
+        grad_t[n - 1] += grad_points[f, -1, 0]
+        grad_v[n - 1] += grad_points[f, -1, 1]
+        grad_d[n - 1] += grad_slopes[f, -1]
 
 
 @kernel
 def fibre_slopes_gradient(along: Any, across: Any, slope: Any, upstream: Any) -> Any:
-    """Compute the gradient (2, F, n) of sum(upstream * slope) by along and by across, of the slopes of a pad."""
+    """Compute the gradient (2, F, n) of sum(upstream * slope), with the slopes of a pad, by along and across."""
     out = np.zeros((2, *along.shape))
     for f in range(len(along)):
         add_slopes_gradient(along[f], across[f], slope[f], upstream[f], out[0, f], out[1, f])
@@ -228,9 +239,9 @@ def fibre_slopes_gradient(along: Any, across: Any, slope: Any, upstream: Any) ->
 
 @kernel
 def arc_lengths_gradient(along: Any, across: Any, slope: Any, out: Any) -> Any:
-    """Compute the arc lengths (F,) of fibres, to 1e-3 where they are steep, and their gradients into out (3, F, n).
+    """Compute the arc lengths (F,) of fibres, to 1e-3 if they are steep.
 
-    These are by along, across and slope, of each fibre by its own.
+    Their gradients, of each fibre by its along, across and slope, go into `out` (3, F, n).
     """
     lengths = np.zeros(len(along))
     out[:] = 0
@@ -245,6 +256,6 @@ def arc_lengths_gradient(along: Any, across: Any, slope: Any, out: Any) -> Any:
                 lengths[f] += weight * h * speed
                 out[0, f, j] -= weight * speed
                 out[0, f, j + 1] += weight * speed
-                by_rate = weight * h * rate / speed
-                add_value_gradient(t, v, d, j, s, 0.0, by_rate, out[0, f], out[1, f], out[2, f])
+                grad_rate = weight * h * rate / speed
+                add_value_gradient(t, v, d, j, s, 0.0, grad_rate, out[0, f], out[1, f], out[2, f])
     return lengths

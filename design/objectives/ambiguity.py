@@ -1,12 +1,12 @@
-"""Localisation ambiguity: how far away the presses lie that noise makes a press be taken for.
+"""Localisation ambiguity: the mean distance between a press and those that it is confused with because of noise.
 
-With signals s_a of presses a at positions p_a, and the set K of fibres that work, press a is read as b with the
-posterior
+For presses a with the signals s_a and the positions p_a, and the set K of working fibres, the posterior probability of
+b given a, and the ambiguity, are
 
     w_ab = exp(-|s_a - s_b|^2_K / 4 sigma^2) / sum_c exp(-|s_a - s_c|^2_K / 4 sigma^2),
     A_K = mean_a sum_b w_ab |p_a - p_b|.
 
-4 sigma^2, and not 2 sigma^2, since both readings are noisy.
+The exponents have 4 sigma^2 instead of 2 sigma^2 since both readings are noisy.
 """
 
 import math
@@ -23,19 +23,21 @@ from padforge.design.paths.curves import lengths
 from padforge.design.paths.keep_outs import is_outside
 from padforge.design.settings import Contact, PadSettings
 
-SIDE, MAX_SUBSETS = 20, 64
-"""Presses along a side of the grid, and sets of failed fibres of a size."""
 AMBIGUITY_NOISE = 0.05
-"""Of a signal, share of full scale, under which pads are compared: under less, no good pad confuses anything."""
+"""Noise of signals, relative to full scale, for comparing pads: with less, no good pad confuses any presses."""
 MAX_NEG_LOG_LIKELIHOOD = 20.0
-"""Beyond it (2e-9 of the likelihood of the press itself) a press is not taken for another one."""
+"""Presses are not confused if their likelihood ratio is below exp(-20) = 2e-9."""
 MAX_EXPONENT = 300.0
-"""Up to here exp(-sum) is the product of the exponentials, without overflow."""
+"""Up to this sum of squares, a likelihood may be computed as a product of exponentials without overflow."""
 
 
 def free_presses(size: PadSettings) -> Array:
-    """Return (Q, 2) up to SIDE x SIDE positions over what is pressed, grid units, in no keep-out; refuse if none is."""
-    presses = grid_positions(size.sensed, SIDE)
+    """Return the positions (Q, 2), grid units, of a 20 x 20 grid over the pressed rectangle that are outside keep-outs.
+
+    Raises:
+        InputError: there are none.
+    """
+    presses = grid_positions(size.sensed, side=20)
     presses = presses[is_outside(presses, size)]
     if not len(presses):
         raise InputError("[pad] keep_out_mm covers all that is pressed ([pad] sensed_mm), allowed is a part of it")
@@ -45,7 +47,15 @@ def free_presses(size: PadSettings) -> Array:
 def ambiguities(
     pad: Morphology, contact: Contact, max_failures: int | tuple[float, ...], noise: float, size: PadSettings
 ) -> list[float]:
-    """Compute the ambiguity, grid units, with 0, 1, ... fibres failed on a grid of presses; noise in full scales."""
+    """Compute the ambiguity, grid units, with 0, 1, ... fibres failed, on a grid of presses.
+
+    Args:
+        pad: the fibres.
+        contact: contact model of the presses.
+        max_failures: maximum number of failed fibres, or weights of 0, 1, ... failed fibres.
+        noise: noise of the signals, relative to full scale.
+        size: settings of the pad, with the rectangle that is pressed.
+    """
     presses = free_presses(size)
     return _by_press(relative_stretch(pad, presses, contact), presses, max_failures, noise).mean(axis=1).tolist()
 
@@ -53,56 +63,63 @@ def ambiguities(
 def ambiguity_map(
     pad: Morphology, presses: Array, contact: Contact, max_failures: int | tuple[float, ...], noise: float
 ) -> Array:
-    """Compute the ambiguity (K, Q), grid units, of every press with 0, 1, ... K - 1 fibres failed, fast enough to edit.
+    """Compute the ambiguity (K, Q), grid units, of every press with 0, 1, ... K - 1 fibres failed.
 
-    Each of the `presses` (Q, 2) may be taken for any other. Signals have the precision of a search; `noise` is a share
-    of full scale.
+    Each of the `presses` (Q, 2) may be confused with any other. Signals have the precision of a search, so that the map
+    can follow an editor. `noise` is relative to full scale.
     """
     stretch = signals(pad, presses, contact, precision=search_precision(contact)) / lengths(pad)
     return _by_press(stretch, presses, max_failures, noise)
 
 
 def _by_press(stretch: Array, presses: Array, max_failures: int | tuple[float, ...], noise: float) -> Array:
-    """Return the ambiguity (K, Q), of relative stretches (Q, F), with noise in means of the fibres' largest ones."""
-    largest = stretch.max(axis=0)
-    scale = largest[largest > 0].mean() if largest.any() else 1.0
+    """Return the ambiguity (K, Q) for relative stretches (Q, F), whose full scale is the mean maximum of the fibres."""
+    maxima = stretch.max(axis=0)
+    full_scale = maxima[maxima > 0].mean() if maxima.any() else 1.0
     fibres = stretch.shape[1]
-    most = min(len(failure_shares(max_failures)), fibres) - 1
-    subsets = [failure_subsets(fibres, n_failed, MAX_SUBSETS) for n_failed in range(most + 1)]
-    # rows of equal length, filled up with F
-    failed = np.array([(*row, *(fibres,) * (most - len(row))) for level in subsets for row in level], dtype=np.int64)
-    values = press_ambiguities(np.ascontiguousarray(stretch / (2 * noise * scale)), presses, failed)
+    n_most = min(len(failure_shares(max_failures)), fibres) - 1
+    subsets = [failure_subsets(fibres, n_failed, max_subsets=64) for n_failed in range(n_most + 1)]
+    padded = [(*row, *(fibres,) * (n_most - len(row))) for level in subsets for row in level]  # to rows of equal length
+    values = press_ambiguities(
+        np.ascontiguousarray(stretch / (2 * noise * full_scale)), presses, np.array(padded, dtype=np.int64)
+    )
     ends = np.cumsum([len(level) for level in subsets])
     return np.stack([level.mean(axis=1) for level in np.split(values, ends[:-1], axis=1)])
 
 
 @kernel
 def press_ambiguities(signals: Any, presses: Any, failed: Any) -> Any:
-    """Compute sum_b w_ab |p_a - p_b| (Q, L) exactly, without the pairs of presses that add nothing.
+    """Compute sum_b w_ab |p_a - p_b| for each press a and each set of failed fibres, skipping pairs of no likelihood.
 
-    `signals` (Q, F) are divided by twice their noise; `failed` (L, K) are indices of failed fibres, F where fewer fail.
+    Args:
+        signals: signals divided by twice their noise; shape (Q, F).
+        presses: positions; shape (Q, 2), grid units.
+        failed: indices of the failed fibres of each set, filled up with F; shape (L, K).
+
+    Returns:
+        The sums; shape (Q, L), grid units.
     """
     count, fibres = signals.shape
-    sets, most = failed.shape
+    sets, max_failures = failed.shape
     out, weight = np.zeros((count, sets)), np.ones((count, sets))
-    square, factor, largest = np.zeros(fibres + 1), np.ones(fibres + 1), np.empty(most)
+    square, factor, largest = np.zeros(fibres + 1), np.ones(fibres + 1), np.empty(max_failures)
     likelihood = np.empty(sets)
     for a in range(count):
         for b in range(a):
-            # 1. squared distance of the signals, and its `most` largest terms in descending order
+            # 1. squared distance of the signals, and its `max_failures` largest terms in descending order
             total = 0.0
             largest[:] = 0.0
             for f in range(fibres):
                 term = (signals[a, f] - signals[b, f]) ** 2
                 square[f] = term
                 total += term
-                for k in range(most):
+                for k in range(max_failures):
                     if term > largest[k]:
                         term, largest[k] = largest[k], term
-            least = total
-            for k in range(most):
-                least -= largest[k]
-            if least > MAX_NEG_LOG_LIKELIHOOD:  # whichever fibres fail
+            min_remaining = total
+            for k in range(max_failures):
+                min_remaining -= largest[k]
+            if min_remaining > MAX_NEG_LOG_LIKELIHOOD:  # whichever fibres fail
                 continue
             # 2. likelihood without the terms of the failed fibres
             if total < MAX_EXPONENT:
@@ -111,12 +128,12 @@ def press_ambiguities(signals: Any, presses: Any, failed: Any) -> Any:
                 product = math.exp(-total)
                 for k in range(sets):
                     likelihood[k] = product
-                    for j in range(most):
+                    for j in range(max_failures):
                         likelihood[k] *= factor[failed[k, j]]
             else:
                 for k in range(sets):
                     remaining = total
-                    for j in range(most):
+                    for j in range(max_failures):
                         remaining -= square[failed[k, j]]
                     likelihood[k] = math.exp(-remaining)
             # 3. both presses of the pair

@@ -1,18 +1,17 @@
-"""Expected localization error: that of Bayes' rule on one reading of a held press, and a little for learning it.
+"""Expected localization error of a pad: that of the posterior mean, given one reading of a held press.
 
-The response x of a fibre is its relative stretch in full scales of straight fibres. It scatters by a floor and by a
-share of itself, of whose variance all fibres have a part in common:
+The response x of a fibre is its relative stretch in full scales of straight fibres. Its noise has a floor, and a part
+proportional to the response, a fraction `common` of whose variance is shared by all fibres:
 
-    x' = x (1 + share (sqrt(common) g + sqrt(1 - common) g_f)) + floor e_f,       g, g_f, e_f ~ N(0, 1),
+    x' = x (1 + share (sqrt(common) g + sqrt(1 - common) g_f)) + floor e_f,       g, g_f, e_f ~ N(0, 1).
 
-so that at a position p, where x is x_p, it is normal with the covariance
+At a position p of the responses x_p, the reading x' is normal with the mean x_p and the covariance
 
     S_p = diag(floor^2 + share^2 (1 - common) x_p^2) + share^2 common x_p x_p'.
 
-Bayes' rule takes the mean of the posterior N(x'; x_p, S_p) over all positions, which are equally likely. On average no
-localizer of that reading has a lesser mean square, and a network errs LEARNING times as much once it has learnt the
-rule from many presses. A search minimises a formula that is differentiable (`expected_error`); this one counts every
-confusion in full.
+The estimate is the mean of the posterior over all positions, with the likelihood N(x'; x_p, S_p) and a uniform prior.
+No other localizer has a smaller mean squared error; a network trained on many presses errs LEARNING times as much. A
+search minimises a differentiable approximation (`expected_error`); the error computed here includes every confusion.
 """
 
 import math
@@ -34,58 +33,76 @@ from padforge.design.paths.keep_outs import is_outside
 from padforge.design.settings import Contact, PadSettings, Rectangle, Scatter, SearchSettings
 
 LEARNING = 1.05
-"""Error of networks of three layers trained on 20 000 presses, over that of Bayes' rule: 1.02 to 1.09."""
-STEP, FAR_STEP, MAX_FAR, MARGIN = 0.1, 0.7, 2048, 1.0
-"""Steps of the grids of positions, grid units: of the fine one over a window and MARGIN around it, whose step is about
-that of a posterior's standard deviation, which suffices for a sum over Gaussians, and of the coarse one over the
-remaining pad, of at most MAX_FAR positions."""
-PRESSES, MIN_PRESSES, MAX_SETS, MIN_SETS = 8192, 64, 64, 8
-"""Presses that are localized for each number of failed fibres, over all windows and sets, and by each of these at
-least; sets of failed fibres of a size, fewer for each of several windows."""
-LEAST_NOISE = 5e-3
-"""Floor of the scatter, full scales, that lesser ones are taken for: the grid would not resolve the posterior."""
+"""Error of networks of three layers trained on 20 000 presses, relative to that of the posterior mean: 1.02 to 1.09."""
+STEP = 0.1
+"""Step of the fine grid of positions, over a window and its surroundings, grid units. It is about the standard
+deviation of a posterior, which is fine enough for a sum over Gaussians.
+"""
+MARGIN = 1.0
+"""Width of these surroundings, grid units."""
+FAR_STEP = 0.7
+"""Minimum step of the coarse grid over the remaining pad, grid units."""
+MAX_FAR = 2048
+"""Maximum number of positions of the coarse grid."""
+PRESSES = 8192
+"""Presses that are localized for each number of failed fibres, over all windows and sets of failed fibres."""
+MIN_PRESSES = 64
+"""Minimum number of presses for each set of failed fibres."""
+MAX_SETS = 64
+"""Maximum number of sets of failed fibres of each size, divided among the windows."""
+MIN_SETS = 8
+"""Number of such sets for a window even if there are many windows."""
+MIN_NOISE = 5e-3
+"""Minimum floor of the scatter, full scales: below, the grid would not resolve the posterior."""
 Mask = NDArray[np.bool_]
 
 
 class Positions(NamedTuple):
-    """Positions that a press may have, and what fibres respond there."""
+    """Positions that a press may have, each of which stands for a cell around it.
 
-    places: Array  # shape (P, 2), grid units
-    log_prior: Array  # logarithms of the areas they stand for; shape (P,)
-    responses: Array  # shape (P, F), full scales
-    blur: Array  # variance of the responses within these areas; shape (P, F)
+    Attributes:
+        places: the positions; shape (P, 2), grid units.
+        log_prior: logarithms of the areas of the cells; shape (P,).
+        responses: responses of the fibres; shape (P, F), full scales.
+        blur: variances of the responses within the cells; shape (P, F).
+    """
+
+    places: Array
+    log_prior: Array
+    responses: Array
+    blur: Array
 
 
-@threadpool_limits.wrap(limits=1, user_api="blas")  # threads that wait for each other take longer beside other work
+@threadpool_limits.wrap(limits=1, user_api="blas")  # several threads wait for each other, and other work goes on
 def expected_errors(pad: Morphology, contact: Contact, search: SearchSettings, size: PadSettings) -> list[float]:
-    """Compute the expected errors, grid units, with 0, 1, ... fibres failed, always of the same draws.
+    """Compute the expected errors with 0, 1, ... fibres failed, grid units, always with the same random numbers.
 
     Args:
         pad: the fibres.
-        contact: what a press does to them.
-        search: says how many fibres may fail, and how responses scatter.
-        size: says what is pressed.
+        contact: contact model of the presses.
+        search: number of fibres that may fail, and scatter of the responses.
+        size: settings of the pad, with the rectangle that is pressed.
     """
     fibres, windows = len(pad.knots), evaluation_windows(size.sensed)
     levels = range(min(len(failure_shares(search.max_failures)), fibres))
     masks = [failure_masks(fibres, k, max(MAX_SETS // len(windows), MIN_SETS)) > 0 for k in levels]
     scale = straight_full_scale(pad.layout, contact, size.sensed_mm)
     scatter = scatter_of_full_scale(search.response_scatter, contact, scale)
-    scatter = scatter._replace(floor=max(scatter.floor, LEAST_NOISE))
+    scatter = scatter._replace(floor=max(scatter.floor, MIN_NOISE))
     rng, errors = np.random.default_rng(0), []
     for window in windows:
-        pressed = _random_presses(window, PRESSES // len(windows), size, rng)
-        if not len(pressed):
+        presses = _random_presses(window, PRESSES // len(windows), size, rng)
+        if not len(presses):
             continue
-        readings = scatter.sample(relative_stretch(pad, pressed, contact) / scale, rng)
+        readings = scatter.sample(relative_stretch(pad, presses, contact) / scale, rng)
         positions = possible_positions(pad, contact, size, window, scale)
         errors.append([])
         for sets in masks:
-            count, means = max(len(pressed) // len(sets), MIN_PRESSES), []
-            for number, working in enumerate(sets):  # each set has presses of its own, as far as there are enough
-                rows = np.arange(number * count, (number + 1) * count) % len(pressed)
-                located = bayes_positions(readings[rows], positions, scatter, working)
-                means.append(np.hypot(*(located - pressed[rows]).T).mean())
+            count, means = max(len(presses) // len(sets), MIN_PRESSES), []
+            for index, working in enumerate(sets):  # sets share presses only if there are too few of them
+                rows = np.arange(index * count, (index + 1) * count) % len(presses)
+                estimates = bayes_positions(readings[rows], positions, scatter, working)
+                means.append(np.hypot(*(estimates - presses[rows]).T).mean())
             errors[-1].append(np.mean(means))
     return (LEARNING * np.mean(errors, axis=0)).tolist()
 
@@ -93,63 +110,68 @@ def expected_errors(pad: Morphology, contact: Contact, search: SearchSettings, s
 def possible_positions(
     pad: Morphology, contact: Contact, size: PadSettings, window: Rectangle, scale: float
 ) -> Positions:
-    """Return what a press in a window may be taken for: a fine grid there, and a coarse one over the remaining pad."""
+    """Return the positions that a press in a window may have: a fine grid, and a coarse one over the remaining pad."""
     low, high = np.array(size.sensed)
     near_low, near_high = np.clip(np.add(window, [[-MARGIN], [MARGIN]]), low, high)
-    parts = [_responding_grid(pad, contact, near_low, near_high, STEP)]
+    grids = [_position_grid(pad, contact, near_low, near_high, STEP)]
     if (near_low > low).any() or (near_high < high).any():
-        far = _responding_grid(pad, contact, low, high, max(FAR_STEP, math.sqrt((high - low).prod() / MAX_FAR)))
+        far = _position_grid(pad, contact, low, high, max(FAR_STEP, math.sqrt((high - low).prod() / MAX_FAR)))
         is_far = ((far.places < near_low) | (far.places > near_high)).any(axis=1)
-        parts.append(Positions(*(part[is_far] for part in far)))
-    positions = Positions(*map(np.concatenate, zip(*parts, strict=True)))
+        grids.append(Positions(*(values[is_far] for values in far)))
+    positions = Positions(*map(np.concatenate, zip(*grids, strict=True)))
     free = is_outside(positions.places, size)
-    places, log_prior, responses, blur = (part[free] for part in positions)
+    places, log_prior, responses, blur = (values[free] for values in positions)
     return Positions(places, log_prior, responses / scale, blur / scale**2)
 
 
-def _responding_grid(pad: Morphology, contact: Contact, low: Array, high: Array, step: float) -> Positions:
-    """Return a grid of cell centres over a rectangle, of about such a step, with responses not in full scales."""
+def _position_grid(pad: Morphology, contact: Contact, low: Array, high: Array, step: float) -> Positions:
+    """Return the centres of cells of a rectangle, `step` or a little less apart, with relative stretches."""
     counts = np.maximum(np.ceil((high - low) / step).astype(int), 2)
     cell = (high - low) / counts
     places = low + cell * (np.stack(np.meshgrid(*map(np.arange, counts), indexing="ij"), axis=-1) + 0.5)
     responses = relative_stretch(pad, places.reshape(-1, 2), contact).reshape(*counts, -1)
-    change = np.stack(np.gradient(responses, axis=(0, 1)))  # from a cell to the next one
-    blur, log_prior = (change**2).sum(axis=0) / 12, np.full(counts, math.log(cell.prod()))
+    differences = np.stack(np.gradient(responses, axis=(0, 1)))  # from cell to cell
+    blur = (differences**2).sum(axis=0) / 12  # the variance of a uniform distribution over a cell
+    n = counts.prod()
     return Positions(
-        places.reshape(-1, 2), log_prior.ravel(), *(a.reshape(counts.prod(), -1) for a in (responses, blur))
+        places.reshape(n, 2), np.full(n, math.log(cell.prod())), responses.reshape(n, -1), blur.reshape(n, -1)
     )
 
 
 def _random_presses(window: Rectangle, presses: int, size: PadSettings, rng: np.random.Generator) -> Array:
-    """Return about so many presses of a window in random order, one in each cell of a grid, but for keep-outs."""
+    """Return about `presses` positions outside keep-outs, in random order, one in each cell of a grid over a window."""
     low, high = np.array(window)
     side = math.ceil(math.sqrt(presses))
     cells = rng.permutation(np.stack(np.meshgrid(*[np.arange(side)] * 2), axis=-1).reshape(-1, 2))
-    pressed = low + (high - low) * (cells + rng.random(cells.shape)) / side
-    return pressed[is_outside(pressed, size)]
+    positions = low + (high - low) * (cells + rng.random(cells.shape)) / side
+    return positions[is_outside(positions, size)]
 
 
 def bayes_positions(readings: Array, positions: Positions, scatter: Scatter, working: Mask) -> Array:
-    """Return the means (Q, 2) of the posteriors of presses, by the readings of the fibres that work.
+    """Return the posterior means (Q, 2) of presses, given the readings of the working fibres.
 
-    The common part of the covariance has rank one: its inverse is that of Sherman and Morrison.
+    The shared part of the covariance has rank one, so that the Sherman-Morrison formula gives its inverse. With the
+    precisions d = 1 / (floor^2 + share^2 (1 - common) x^2 + blur) of single fibres, u = share sqrt(common) x and
+    e = 1 + sum(d u^2), twice the log-posterior of a position is, up to a constant,
+
+        sum(log d - d (z - x)^2) + (sum(d u (z - x)))^2 / e - log e + 2 log_prior.
 
     Args:
-        readings: responses as they scatter, shape (Q, F), full scales.
-        positions: what a press may be.
-        scatter: of responses.
-        working: which fibres work, shape (F,).
+        readings: noisy responses z; shape (Q, F), full scales.
+        positions: positions that a press may have, with responses x.
+        scatter: scatter of the responses.
+        working: mask of the working fibres; shape (F,).
     """
     z, x, blur = readings[:, working], positions.responses[:, working], positions.blur[:, working]
-    precision = 1 / (scatter.floor**2 + scatter.share**2 * (1 - scatter.common) * x**2 + blur)  # of each fibre alone
-    common = scatter.share * math.sqrt(scatter.common) * x
-    excess = 1 + (common**2 * precision).sum(axis=1)
-    along = common * precision / np.sqrt(excess)[:, None]
+    precision = 1 / (scatter.floor**2 + scatter.share**2 * (1 - scatter.common) * x**2 + blur)
+    shared = scatter.share * math.sqrt(scatter.common) * x
+    excess = 1 + (shared**2 * precision).sum(axis=1)
+    direction = shared * precision / np.sqrt(excess)[:, None]
     constant = (np.log(precision) - precision * x**2).sum(axis=1) - np.log(excess) + 2 * positions.log_prior
-    # twice its logarithm: of each fibre alone, and of their common gain; in single precision and in place, for speed
+    # single precision and operations in place are for speed
     coefficients = np.hstack([-precision, 2 * precision * x])
     log_posterior = np.float32(np.hstack([z**2, z])) @ np.float32(coefficients.T) + np.float32(constant)
-    gain = np.float32(z) @ np.float32(along.T) - np.float32((along * x).sum(axis=1))
+    gain = np.float32(z) @ np.float32(direction.T) - np.float32((direction * x).sum(axis=1))
     log_posterior += np.square(gain, out=gain)
     log_posterior -= log_posterior.max(axis=1, keepdims=True)
     log_posterior *= np.float32(0.5)

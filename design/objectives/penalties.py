@@ -1,7 +1,7 @@
 """The rules of `[rules]` as penalties with gradients, in the order of their exact checks in `rules`.
 
-A penalty is 0 where its rule holds with a margin, and grows with the breach. Each is relative to its limit and averaged
-over the pad, so that they add. The exact check on the finished curves decides; penalties lead the search there.
+A penalty is 0 if its rule is kept with a margin, and grows with the violation. Each is relative to its limit and
+averaged over the pad, so that they can be added. They guide the search; the exact check on the finished curves decides.
 """
 
 import math
@@ -38,59 +38,79 @@ from padforge.design.settings import TRACK_WIDTH_MM, Layout, PadSettings, RulesS
 PER_SPAN = 12
 """Samples of a span between two knots."""
 SPAN_SHARES = (1 - np.cos(np.arange(PER_SPAN) * (math.pi / PER_SPAN))) / 2
-"""Where they lie in it: denser towards its ends, where it bends."""
-ORDER_SAMPLES = 40
-"""Samples per grid unit at which the order of a family is compared."""
-BLUR = 0.1
-"""Standard deviation of the mollified crossing count, grid units."""
-MIN_CLEARANCE = 0.1
-"""From keep-outs, grid units, to which distances are relative where the rule asks for less."""
-MIN_ORDER_GAP = 0.01
-"""By which a fibre lies above its lower neighbour at least, grid units."""
+"""Positions of the samples in a span, from 0 to 1, denser towards its ends, where it bends."""
 COMMON_WEIGHT = 0.2
-"""Of common tracks: at 1 the search keeps fibres apart that may cross."""
+"""Weight of the penalty of common tracks; with 1, the search keeps fibres from crossing that may cross."""
 MAX_COMPARISONS = 10**8
-"""Pairs of samples compared at once: some seconds."""
+"""Maximum number of pairs of samples in one comparison, which then takes some seconds."""
 
 
 class Gradient:
-    """The gradient of all penalties by what they are computed from, which each adds to.
+    """Gradients of the sum of all penalties by their inputs, to which each penalty adds its own.
 
-    Shares of arc, by which samples are weighted, are held (`rule_penalties`): it is not quite that of the sum.
+    The arc lengths by which samples are weighted are treated as constants (see `rule_penalties`).
+
+    Attributes:
+        points: by the samples; shape (F, P, 2).
+        slope: by the slopes at the samples; shape (F, P).
+        arc: by the arc lengths of the samples; shape (F, P).
+        along: by the knots' coordinates along the fibres; shape (F, N + 2).
+        across: by those across the fibres; shape (F, N + 2).
+        knot_slope: by the slopes at the knots; shape (F, N + 2).
     """
 
     def __init__(self, samples: Array, knots: Array) -> None:
-        self.points, self.slope, self.arc = (
-            np.zeros((*samples.shape, 2)),
-            np.zeros_like(samples),
-            np.zeros_like(samples),
-        )
+        self.points = np.zeros((*samples.shape, 2))
+        self.slope, self.arc = np.zeros((2, *samples.shape))
         self.along, self.across, self.knot_slope = np.zeros((3, *knots.shape))
 
 
 class Penalties(NamedTuple):
-    """Penalties of the rules that can be broken, and the gradient of their sum."""
+    """Penalties of the rules that can be broken, and the gradient of their sum by the knots.
 
-    values: dict[str, float]  # by the key of `[rules]`
-    by_along: Array  # (F, N + 2), by the knots' coordinates along the fibres, with shares of arc held
-    by_across: Array  # (F, N + 2), by those across them
+    Attributes:
+        values: penalties by the key of `[rules]`.
+        grad_along: gradient by the coordinates along the fibres; shape (F, N + 2).
+        grad_across: gradient by those across the fibres; shape (F, N + 2).
+    """
+
+    values: dict[str, float]
+    grad_along: Array
+    grad_across: Array
 
 
 @dataclass(frozen=True)
 class FibreSamples:
-    """Fibres sampled densely, with what their penalties depend on."""
+    """Densely sampled fibres, and the settings of their penalties; lengths in grid units.
 
-    along: Array  # coordinates of the knots along the fibres; shape (F, N + 2), grid units
-    across: Array  # those at right angles to them
-    knot_slope: Array  # slopes there
-    points: Array  # samples along and across; shape (F, P, 2)
-    slope: Array  # shape (F, P)
-    arc: Array  # arc length from the start; shape (F, P)
+    Attributes:
+        along: coordinates of the knots along the fibres; shape (F, N + 2).
+        across: coordinates of the knots across the fibres; shape (F, N + 2).
+        knot_slope: slopes at the knots; shape (F, N + 2).
+        points: samples, along and across; shape (F, P, 2).
+        slope: slopes at the samples; shape (F, P).
+        arc: arc lengths of the samples from the start; shape (F, P).
+        pad: settings of the pad.
+        rules: limits of the design rules.
+        margin: factor on the limits, so that a curve of penalty 0 passes the exact check.
+        all_bends: whether bends between samples count too.
+    """
+
+    along: Array
+    across: Array
+    knot_slope: Array
+    points: Array
+    slope: Array
+    arc: Array
     pad: PadSettings
-    layout: Layout
     rules: RulesSettings
-    margin: float  # factor on the limits, so that a curve with penalty 0 passes the exact check
-    all_bends: bool  # whether bends between samples count, too
+    margin: float
+    all_bends: bool
+
+    @property
+    def layout(self) -> Layout:
+        """Number and spacing of the fibres."""
+        return self.pad.layout
 
     def scale(self, limit_mm: float) -> float:
         """Return a lower limit with the margin, grid units."""
@@ -108,14 +128,19 @@ class FibreSamples:
 
     @cached_property
     def shares(self) -> Array:
-        """(F, P) arc length that belongs to each sample."""
+        """Arc length that each sample represents; shape (F, P)."""
         step = np.diff(self.arc, axis=1) / 2
         return np.pad(step, ((0, 0), (1, 0))) + np.pad(step, ((0, 0), (0, 1)))
 
-    def plan(self, of_points: Array) -> Array:
-        """Return samples along and across, or a gradient by them, as along x and y; shape (F, P, 2)."""
+    @property
+    def family_pairs(self) -> list[tuple[int, int]]:
+        """All pairs of a horizontal and a vertical."""
+        return list(product(*(range(rows.start, rows.stop) for rows in self.layout.families)))
+
+    def swap_axes(self, points: Array) -> Array:
+        """Convert samples (F, P, 2), or gradients by them, from (along, across) to (x, y), or back."""
         split = self.layout.horizontals
-        return np.concatenate([of_points[:split], of_points[split:, :, ::-1]])
+        return np.concatenate([points[:split], points[split:, :, ::-1]])
 
 
 def penalties(
@@ -123,8 +148,15 @@ def penalties(
 ) -> Penalties:
     """Compute the penalty of each rule that can be broken, and the gradient of their sum by the knots.
 
-    The gradient holds the share of arc that each sample stands for.
-    The knots are (F, N + 2) coordinates along and across the fibres, grid units; `margin` is a factor on the limits.
+    The gradient treats the arc length that each sample represents as a constant.
+
+    Args:
+        along: coordinates of the knots along the fibres; shape (F, N + 2), grid units.
+        across: coordinates of the knots across the fibres; shape (F, N + 2), grid units.
+        pad: settings of the pad.
+        rules: limits of the design rules.
+        margin: factor on the limits.
+        all_bends: whether bends between samples count too.
 
     Raises:
         InputError: so many fibres and knots that a comparison of their samples takes too long.
@@ -135,18 +167,27 @@ def penalties(
     points = np.empty((*slope.shape, 2))
     sample_spans(along, across, knot_slope, SPAN_SHARES, points, slope)
     arc = np.pad(np.linalg.norm(np.diff(points, axis=1), axis=-1).cumsum(axis=1), ((0, 0), (1, 0)))
-    fibres = FibreSamples(along, across, knot_slope, points, slope, arc, pad, pad.layout, rules, margin, all_bends)
-    by = Gradient(slope, along)
-    values = {name: value for name, penalty in PENALTIES.items() if (value := penalty(fibres, by)) is not None}
-    add_arc_gradient(points, by.arc, by.points)
-    where = along, across, knot_slope
-    add_samples_gradient(*where, SPAN_SHARES, by.points, by.slope, by.along, by.across, by.knot_slope)
-    through_slopes = fibre_slopes_gradient(*where, by.knot_slope)
-    return Penalties(values, by.along + through_slopes[0], by.across + through_slopes[1])
+    fibres = FibreSamples(along, across, knot_slope, points, slope, arc, pad, rules, margin, all_bends)
+    gradient = Gradient(slope, along)
+    values = {name: value for name, penalty in PENALTIES.items() if (value := penalty(fibres, gradient)) is not None}
+    add_arc_gradient(points, gradient.arc, gradient.points)
+    add_samples_gradient(
+        along,
+        across,
+        knot_slope,
+        SPAN_SHARES,
+        gradient.points,
+        gradient.slope,
+        gradient.along,
+        gradient.across,
+        gradient.knot_slope,
+    )
+    through_slopes = fibre_slopes_gradient(along, across, knot_slope, gradient.knot_slope)
+    return Penalties(values, gradient.along + through_slopes[0], gradient.across + through_slopes[1])
 
 
 def check_comparisons(fibres: int, samples: int) -> None:
-    """Refuse so many fibres, or pairs of fibres, that comparing their samples takes too long."""
+    """Check that comparing the samples of so many fibres, or pairs of fibres, does not take too long."""
     if fibres * samples**2 > MAX_COMPARISONS:
         raise InputError(
             f"the rules take {fibres * samples**2} comparisons for so many fibres and knots, allowed are "
@@ -154,11 +195,11 @@ def check_comparisons(fibres: int, samples: int) -> None:
         )
 
 
-def _bends(fibres: FibreSamples, by: Gradient) -> float | None:
+def _bends(fibres: FibreSamples, gradient: Gradient) -> float | None:
     """Penalise turns of more than window / radius within a window of arc length, relative to that angle.
 
-    Where the pad is worn bent, fibres turn by `rolled` more at right angles to that, as a fibre along x does; leads are
-    outside the pad.
+    On a pad that is worn bent, fibres also turn by `rolled` at right angles to the plane of the pad; the leads, which
+    are outside the pad, do not.
     """
     radius_mm = fibres.rules.min_mean_bend_radius_mm
     if radius_mm == 0:
@@ -166,122 +207,133 @@ def _bends(fibres: FibreSamples, by: Gradient) -> float | None:
     radius, window = fibres.scale(radius_mm), radius_mm / fibres.layout.unit_mm / 2
     rolled = radius_mm / 2 / (fibres.pad.bent_radius_mm or math.inf)
     weight, all_bends = 1 / len(fibres.arc) / fibres.mean_run, fibres.all_bends
-    return sum_excess_turns(fibres.slope, fibres.arc, radius, window, rolled, all_bends, weight, by.slope, by.arc)
+    return sum_excess_turns(
+        fibres.slope, fibres.arc, radius, window, rolled, all_bends, weight, gradient.slope, gradient.arc
+    )
 
 
-def _gaps(fibres: FibreSamples, by: Gradient) -> float | None:
-    """Penalise neighbours in a family that come nearer than the gap, relative to it."""
+def _gaps(fibres: FibreSamples, gradient: Gradient) -> float | None:
+    """Penalise neighbours of a family that are nearer to each other than the gap, relative to it."""
     gap, lower = fibres.scale(fibres.rules.min_gap_mm), fibres.lower
     if gap == 0 or not lower:
         return None
-    check_comparisons(*fibres.arc.shape)
-    return _closeness(fibres, [pair for fibre in lower for pair in ((fibre, fibre + 1), (fibre + 1, fibre))], gap, by)
+    pairs = [pair for fibre in lower for pair in ((fibre, fibre + 1), (fibre + 1, fibre))]
+    return _closeness(fibres, pairs, gap, gradient)
 
 
-def _folds(fibres: FibreSamples, by: Gradient) -> float | None:
-    """Penalise a fibre that comes nearer than the gap to a part of itself FOLD gaps or more away along it."""
+def _folds(fibres: FibreSamples, gradient: Gradient) -> float | None:
+    """Penalise a fibre that is nearer than the gap to a part of itself that is FOLD gaps or more away along it."""
     gap = fibres.scale(fibres.rules.min_gap_mm)
-    if gap <= fibres.scale(fibres.rules.min_mean_bend_radius_mm):  # fibres that keep that radius keep folds apart
+    if gap <= fibres.scale(fibres.rules.min_mean_bend_radius_mm):  # a bend of that radius keeps the gap
         return None
+    return _closeness(fibres, [(fibre, fibre) for fibre in range(len(fibres.arc))], gap, gradient)
+
+
+def _closeness(fibres: FibreSamples, pairs: list[tuple[int, int]], gap: float, gradient: Gradient) -> float:
     check_comparisons(*fibres.arc.shape)
-    return _closeness(fibres, [(fibre, fibre) for fibre in range(len(fibres.arc))], gap, by)
+    samples = fibres.points, fibres.slope, fibres.arc, fibres.shares
+    return sum_closeness(*samples, np.array(pairs), gap, FOLD * gap, 1 / fibres.arc.size, gradient.points)
 
 
-def _closeness(fibres: FibreSamples, pairs: list[tuple[int, int]], gap: float, by: Gradient) -> float:
-    where = fibres.points, fibres.slope, fibres.arc, fibres.shares, np.array(pairs)
-    return sum_closeness(*where, gap, FOLD * gap, 1 / fibres.arc.size, by.points)
-
-
-def _family_crossings(fibres: FibreSamples, by: Gradient) -> float | None:
-    """Penalise fibres too little above their lower neighbour, or, where some may cross, too many crossings."""
+def _family_crossings(fibres: FibreSamples, gradient: Gradient) -> float | None:
+    """Penalise fibres that are not above their lower neighbour or, if some may cross, too many crossings."""
     layout, lower, limit = fibres.layout, fibres.lower, fibres.rules.same_family_crossings
     if not lower:
         return None
     if limit > 0:
         pairs = [pair for rows in layout.families for pair in combinations(range(rows.start, rows.stop), 2)]
-        return _excess_crossings(fibres, pairs, limit / fibres.margin, by)
-    gap = max(fibres.scale(fibres.rules.min_gap_mm), MIN_ORDER_GAP)
-    stations = math.ceil(ORDER_SAMPLES * max(layout.extent)) + 1
-    where = fibres.along, fibres.across, fibres.knot_slope, np.array(lower), stations
-    return sum_order(*where, gap, 1 / (len(lower) * stations), by.along, by.across, by.knot_slope)
+        return _excess_crossings(fibres, pairs, limit / fibres.margin, gradient)
+    gap = max(fibres.scale(fibres.rules.min_gap_mm), 0.01)
+    stations = math.ceil(40 * max(layout.extent)) + 1  # 40 per grid unit
+    return sum_order(
+        fibres.along,
+        fibres.across,
+        fibres.knot_slope,
+        np.array(lower),
+        stations,
+        gap,
+        1 / (len(lower) * stations),
+        gradient.along,
+        gradient.across,
+        gradient.knot_slope,
+    )
 
 
-def _max_crossings(fibres: FibreSamples, by: Gradient) -> float | None:
+def _max_crossings(fibres: FibreSamples, gradient: Gradient) -> float | None:
     """Penalise too many crossings of horizontals with verticals."""
     limit, counts = fibres.rules.max_crossings, fibres.layout.counts
     if limit is None or not min(counts):
         return None
-    # every horizontal crosses every vertical: no margin may ask for fewer than that
-    return _excess_crossings(fibres, _across(fibres), max(limit / fibres.margin, math.prod(counts)), by)
+    # the margin must not ask for fewer crossings than one of every horizontal with every vertical
+    return _excess_crossings(fibres, fibres.family_pairs, max(limit / fibres.margin, math.prod(counts)), gradient)
 
 
-def _crossing_angles(fibres: FibreSamples, by: Gradient) -> float | None:
+def _crossing_angles(fibres: FibreSamples, gradient: Gradient) -> float | None:
     """Penalise crossings flatter than the limit, relative to it."""
     limit = math.radians(fibres.margin * fibres.rules.min_crossing_angle_deg)
     if limit == 0 or not min(fibres.layout.counts):
         return None
     weight = 2 / fibres.layout.fibres
-    return weight * _crossings(fibres, _across(fibres), limit, (0.0, weight), by)[1]
+    return weight * _crossings(fibres, fibres.family_pairs, limit, (0.0, weight), gradient)[1]
 
 
-def _common_tracks(fibres: FibreSamples, by: Gradient) -> float | None:
-    """Penalise stretches longer than the limit in which fibres of both families lie nearer than a track's width.
+def _common_tracks(fibres: FibreSamples, gradient: Gradient) -> float | None:
+    """Penalise stretches longer than the limit in which fibres of both families are nearer than a track's width.
 
-    Two points of every such stretch count, limit / 2 before and behind its middle.
+    The penalty is evaluated at two points of every such stretch, limit / 2 before and after its middle.
     """
     layout, rules = fibres.layout, fibres.rules
     if rules.max_common_track_mm is None or not min(layout.counts):
         return None
     width, limit = TRACK_WIDTH_MM / layout.unit_mm, rules.max_common_track_mm / fibres.margin / layout.unit_mm
-    lines, total, gradient = fibres.plan(fibres.points), 0.0, np.zeros_like(fibres.points)
+    lines, total, grad_points = fibres.swap_axes(fibres.points), 0.0, np.zeros_like(fibres.points)
     for one, other in (layout.families, layout.families[::-1]):
         stretches = common_stretches([*lines[one]], [*lines[other]], width)
-        long = stretches.length > limit
-        middle = (stretches.begin[long] + stretches.end[long]) / 2
-        pairs = one.start + stretches.line[long], other.start + stretches.other[long]
-        where = fibres.points, fibres.slope, fibres.arc, pairs, middle
-        total += sum_overlaps(*where, limit / 2, width, gradient)
+        is_long = stretches.length > limit
+        middle = (stretches.begin[is_long] + stretches.end[is_long]) / 2
+        pairs = one.start + stretches.line[is_long], other.start + stretches.other[is_long]
+        samples = fibres.points, fibres.slope, fibres.arc
+        total += sum_overlaps(*samples, pairs, middle, limit / 2, width, grad_points)
     weight = COMMON_WEIGHT * limit / 4 / len(fibres.arc) / fibres.mean_run  # the mean of two points, along either fibre
-    by.points += weight * gradient
+    gradient.points += weight * grad_points
     return weight * total
 
 
-def _borders(fibres: FibreSamples, by: Gradient) -> float | None:
-    """Penalise slopes of more than 45 degrees in the zone by the wall that fibres come from."""
+def _borders(fibres: FibreSamples, gradient: Gradient) -> float | None:
+    """Penalise slopes of more than 45 degrees near the walls at which fibres end."""
     zone = fibres.rules.border_mm / fibres.layout.unit_mm
     if zone == 0:
         return None
     weight = 1 / len(fibres.arc) / fibres.mean_run
-    return sum_border_slopes(fibres.points, fibres.slope, fibres.shares, zone, weight, by.slope)
+    return sum_border_slopes(fibres.points, fibres.slope, fibres.shares, zone, weight, gradient.slope)
 
 
-def _keep_outs(fibres: FibreSamples, by: Gradient) -> float | None:
-    """Penalise fibres nearer than the clearance to a keep-out, or inside, relative to it."""
+def _keep_outs(fibres: FibreSamples, gradient: Gradient) -> float | None:
+    """Penalise fibres that are inside a keep-out or nearer to it than the clearance, relative to it."""
     if not fibres.pad.keep_out_mm:
         return None
-    clearance, plan = max(fibres.scale(fibres.rules.keep_out_mm), MIN_CLEARANCE), fibres.plan(fibres.points)
-    samples, gradient, total = np.asarray(shapely.points(plan)), np.zeros_like(plan), 0.0
+    clearance, plan = max(fibres.scale(fibres.rules.keep_out_mm), 0.1), fibres.swap_axes(fibres.points)
+    samples, grad_plan, total = np.asarray(shapely.points(plan)), np.zeros_like(plan), 0.0
     for polygon in keep_outs(fibres.pad):
         shapely.prepare(polygon)
         near = np.nonzero(shapely.dwithin(polygon, samples, clearance))
         edge, points = polygon.exterior, samples[near]
         nearest = shapely.line_interpolate_point(edge, shapely.line_locate_point(edge, points))
         offset = plan[near] - shapely.get_coordinates(nearest)
-        outward = 1 - 2 * shapely.contains(polygon, points).astype(float)
+        sign = 1 - 2 * shapely.contains(polygon, points).astype(float)
         distance = np.linalg.norm(offset, axis=1)
-        total += float(np.maximum(1 - outward * distance / clearance, 0).sum())
-        # dwithin: all of them count
-        gradient[near] -= (outward / np.maximum(distance, 1e-12) / clearance)[:, None] * offset
+        total += float(np.maximum(1 - sign * distance / clearance, 0).sum())
+        grad_plan[near] -= (sign / np.maximum(distance, 1e-12) / clearance)[:, None] * offset
     weight = 1 / fibres.arc.size
-    by.points += weight * fibres.plan(gradient)
+    gradient.points += weight * fibres.swap_axes(grad_plan)
     return weight * total
 
 
-def _lengths(fibres: FibreSamples, by: Gradient) -> float:
+def _lengths(fibres: FibreSamples, gradient: Gradient) -> float:
     """Penalise fibres longer than the limit, relative to it."""
     share = fibres.layout.unit_mm * fibres.margin / fibres.rules.max_length_mm
     excess = np.maximum(fibres.arc[:, -1] * share - 1, 0)
-    by.arc[:, -1] += (excess > 0) * (share / len(excess))
+    gradient.arc[:, -1] += (excess > 0) * (share / len(excess))
     return float(excess.mean())
 
 
@@ -297,28 +349,23 @@ PENALTIES: dict[str, Callable[[FibreSamples, Gradient], float | None]] = {
     "keep_out_mm": _keep_outs,
     "max_length_mm": _lengths,
 }
-"""By the key of `[rules]`; None where the limit cannot be met or missed."""
+"""Penalties by the key of `[rules]`. They return None if the rule cannot be broken on this pad."""
 
 
-def _across(fibres: FibreSamples) -> list[tuple[int, int]]:
-    """Return all pairs of a horizontal with a vertical."""
-    return list(product(*(range(rows.start, rows.stop) for rows in fibres.layout.families)))
-
-
-def _excess_crossings(fibres: FibreSamples, pairs: list[tuple[int, int]], limit: float, by: Gradient) -> float:
-    count, share = _crossings(fibres, pairs, 0.0, (0.0, 0.0), by)[0], 1 / max(1.0, limit)
+def _excess_crossings(fibres: FibreSamples, pairs: list[tuple[int, int]], limit: float, gradient: Gradient) -> float:
+    count, weight = _crossings(fibres, pairs, 0.0, (0.0, 0.0), gradient)[0], 1 / max(1.0, limit)
     if count > limit:
-        _crossings(fibres, pairs, 0.0, (share, 0.0), by)
-    return max(count - limit, 0.0) * share
+        _crossings(fibres, pairs, 0.0, (weight, 0.0), gradient)
+    return max(count - limit, 0.0) * weight
 
 
 def _crossings(
-    fibres: FibreSamples, pairs: list[tuple[int, int]], limit: float, weights: tuple[float, float], by: Gradient
+    fibres: FibreSamples, pairs: list[tuple[int, int]], limit: float, weights: tuple[float, float], gradient: Gradient
 ) -> tuple[float, float]:
-    """Return `sum_crossings`, whose gradient is added with these weights."""
+    """Return `sum_crossings`, with crossings blurred by 0.1 grid units, and add its gradient with these weights."""
     check_comparisons(len(pairs), fibres.arc.shape[1])
     axes = np.repeat([0, 1], fibres.layout.counts)
-    gradient = np.zeros_like(fibres.points)
-    sums = sum_crossings(fibres.plan(fibres.points), np.array(pairs), axes, BLUR, limit, weights, gradient)
-    by.points += fibres.plan(gradient)
+    plan, grad_plan = fibres.swap_axes(fibres.points), np.zeros_like(fibres.points)
+    sums = sum_crossings(plan, np.array(pairs), axes, 0.1, limit, weights, grad_plan)
+    gradient.points += fibres.swap_axes(grad_plan)
     return sums

@@ -1,9 +1,9 @@
 """Scores of a pad: the table of terms that `score`, the searches, design.json and the report have in common.
 
-To add a term, write a function of a `ScoredPad` and add a row to TERMS; `score`, design.json and the report then have
-it (published ones only `score`, and designs for a shape). For a search to minimise it as well, name in the row the key
-of `[search]` that holds its weight (added to `SearchSettings`, 0 by default) and `loss`, its value and gradient at a
-step.
+To add a term, write a function of a `ScoredPad` and add a row to TERMS; it then appears in `score`, in design.json and
+in the report (published terms only in `score` and in designs for a shape). For a search to minimise it as well, add its
+weight to `SearchSettings`, 0 by default, and name in the row the key of the weight and its `loss`, the function that
+returns its value and gradient.
 
 To add a rule, see `padforge.design.objectives.rules`.
 """
@@ -29,23 +29,32 @@ from padforge.design.signal_gradients import FibreCurves
 
 @dataclass(frozen=True)
 class ScoredPad:
-    """A pad and what its terms depend on."""
+    """A pad and the settings on which its terms depend.
 
-    pad: Morphology  # the fibres
-    contact: Contact  # what a press does to them
-    search: SearchSettings  # says how many fibres may fail, and how responses scatter
-    rules: RulesSettings  # limits of the penalties
-    size: PadSettings  # says what is pressed
-    noise: float = AMBIGUITY_NOISE  # of a signal in the ambiguity, share of full scale
+    Attributes:
+        pad: the fibres.
+        contact: contact model of the presses.
+        search: number of fibres that may fail, and scatter of the responses.
+        rules: limits of the penalties.
+        size: settings of the pad, with the rectangle that is pressed.
+        noise: noise of the signals in the ambiguity, relative to full scale.
+    """
+
+    pad: Morphology
+    contact: Contact
+    search: SearchSettings
+    rules: RulesSettings
+    size: PadSettings
+    noise: float = AMBIGUITY_NOISE
 
     def terms(self, names: Collection[str] = ()) -> dict[str, float]:
-        """Compute the terms by name: those of the rows of TERMS that are named, or all."""
+        """Compute the terms of the rows of TERMS with these names, or of all rows, by name."""
         values: dict[str, float] = {}
         for term in TERMS:
             if not names or term.name in names:
                 value = term.compute(self)
-                parts = value if isinstance(value, Mapping) else {"": value}
-                values |= {f"{term.name}_{key}".rstrip("_"): part for key, part in parts.items()}
+                by_suffix = value if isinstance(value, Mapping) else {"": value}
+                values |= {f"{term.name}_{suffix}".rstrip("_"): number for suffix, number in by_suffix.items()}
         return values
 
     @cached_property
@@ -55,43 +64,52 @@ class ScoredPad:
 
     @cached_property
     def serpentine_signals(self) -> Array:
-        """(Q, F) signals of presses in an order of neighbours."""
+        """Signals of presses along a serpentine; shape (Q, F)."""
         return signals(self.pad, serpentine_presses(self.size.sensed, 32, 5 / 49), self.contact)
 
     @property
     def published_contact(self) -> Contact:
-        """The contact of the published terms, which are of a shape."""
+        """The contact of the published terms, which must be a shape."""
         return self.contact if self.contact.model == "shape" else PUBLISHED_CONTACT
 
     @cached_property
     def published(self) -> formula.PublishedTerms:
-        """The published objective and its parts."""
+        """The published objective and its terms."""
         return formula.published_terms(self.pad, self.published_contact)[0]
 
 
 @dataclass(frozen=True)
 class Term:
-    """A row of the table of terms."""
+    """A row of the table of terms.
 
-    name: str  # of the value, or the beginning of the names of several
-    description: str  # for people; `{}` stands for the end of the name
-    compute: Callable[[ScoredPad], float | Mapping[object, float]]  # its value, or several by the end of their name
-    weight: str | None = None  # key of `[search]` by which a search weighs it; None if it does not
-    # its value at a step of a search, for a contact and for what is pressed, and its gradient (3, F, n) by the curves
+    Attributes:
+        name: name of the value, or the common prefix of several.
+        description: text for people; `{}` stands for the suffix of the name.
+        compute: returns the value, or several by their suffix.
+        weight: key of its weight in `[search]`; None if no search minimises it.
+        loss: returns its value in a search and its gradient (3, F, n) by the curves.
+        is_published: whether it belongs to the published method, whose contact is a shape.
+    """
+
+    name: str
+    description: str
+    compute: Callable[[ScoredPad], float | Mapping[object, float]]
+    weight: str | None = None
     loss: Callable[[FibreCurves, Contact, PadSettings], tuple[float, Array]] | None = None
-    is_published: bool = False  # whether it is of the published method, whose contact is a shape
+    is_published: bool = False
 
 
 def sharpness(signals: Array) -> float:
-    """Return Z of signals (F, Q), grid units, as published but for the quantisation, which has no gradient."""
+    """Return Z of signals (F, Q), grid units, as published except for the quantisation, which has no gradient."""
     return float(np.abs(np.diff(signals, n=2, axis=1)).mean())
 
 
 def _sharpness_loss(curves: FibreCurves, contact: Contact, size: PadSettings) -> tuple[float, Array]:
     signals, differentiate = curves.signals(serpentine_presses(size.sensed, SEARCH_SIDE), contact)
     signs = np.sign(np.diff(signals, n=2, axis=1))
-    by_signals = np.diff(np.pad(signs, ((0, 0), (2, 2))), n=2, axis=1)  # the transpose of a second difference is one
-    return sharpness(signals), differentiate(by_signals / signs.size)
+    # the transpose of a second difference is the second difference of the padded array
+    grad_signals = np.diff(np.pad(signs, ((0, 0), (2, 2))), n=2, axis=1)
+    return sharpness(signals), differentiate(grad_signals / signs.size)
 
 
 def _in_mm(scored: ScoredPad, values: list[float]) -> dict[object, float]:
@@ -144,23 +162,23 @@ TERMS = (
 
 
 def terms_of(contact: Contact) -> list[str]:
-    """Return the names of the rows of TERMS for pads designed for a contact: published ones are of a shape alone."""
+    """Return the names of the rows of TERMS for pads designed for a contact; published ones need a shape."""
     return [term.name for term in TERMS if contact.model == "shape" or not term.is_published]
 
 
 def weighted_terms(search: SearchSettings) -> Iterator[tuple[float, Term]]:
-    """Yield the terms that a search minimises beside the expected error, with their weights above 0."""
+    """Yield the terms that a search minimises in addition to the expected error, with their weights above 0."""
     for term in TERMS:
         if term.weight is not None and (weight := getattr(search, term.weight)) > 0:
             yield weight, term
 
 
 def describe_terms(names: Iterable[str]) -> dict[str, str]:
-    """Return the descriptions of values by their names, as `ScoredPad.terms` has them."""
-    rows = {term.name: term.description for term in TERMS}
-    # the longest row name that a value's name begins with is its own
-    owners = {name: max((row for row in rows if name.startswith(row)), key=len, default="") for name in names}
-    return {name: rows[row].format(name[len(row) + 1 :]) for name, row in owners.items() if row}
+    """Return the descriptions of the values of `ScoredPad.terms` by their names."""
+    descriptions = {term.name: term.description for term in TERMS}
+    # a value belongs to the row with the longest name that is a prefix of its name
+    rows = {name: max((row for row in descriptions if name.startswith(row)), key=len, default="") for name in names}
+    return {name: descriptions[row].format(name[len(row) + 1 :]) for name, row in rows.items() if row}
 
 
 def score(
@@ -172,32 +190,32 @@ def score(
     size: PadSettings | None = None,
     scatter: Scatter | None = None,
 ) -> dict[str, float]:
-    """Compute every term of a pad, by name; TERMS describes them.
+    """Compute every term of a pad; TERMS describes them.
 
-    Presses are where `size` says; those of the information and of the published terms lie between the outermost fibres,
-    as published. The published terms are of the published contact where `contact` is no shape.
+    The presses of the information and of the published terms lie between the outermost fibres, as published; all others
+    cover the pressed rectangle. If `contact` is no shape, the published terms are those of the published contact.
 
     Args:
         pad: the fibres.
-        contact: what a press does to them; the default layer if None.
-        max_failures: most failed fibres, or weights of 0, 1, ... failed.
-        noise: of a signal in the ambiguity, share of full scale.
+        contact: contact model of the presses; the default layer if None.
+        max_failures: maximum number of failed fibres, or weights of 0, 1, ... failed fibres.
+        noise: noise of the signals in the ambiguity, relative to full scale.
         rules: limits of the penalties; the default ones if None.
-        size: says what is pressed; its layout is the pad's.
-        scatter: of responses in the expected error; that of a default search if None.
+        size: settings of the pad, with the rectangle that is pressed.
+        scatter: scatter of the responses in the expected error; that of a default search if None.
 
     Returns:
-        Values by name. Expected errors and ambiguities are in mm and end in the number of failed fibres.
+        Values by name. Expected errors and ambiguities are in mm; their names end in the number of failed fibres.
 
     Raises:
         InputError: arguments out of range, or a pad of too many fibres or knots.
     """
     contact, rules = or_default("contact", contact, Contact), or_default("rules", rules, RulesSettings)
     size = or_default("size", size, PadSettings).for_layout(check_type("pad", pad, Morphology).layout)
-    noise, stated = SearchSettings(noise=noise).noise, {"max_failures": max_failures}
+    noise, keys = SearchSettings(noise=noise).noise, {"max_failures": max_failures}
     if scatter is not None:
         check_type("scatter", scatter, Scatter)
-        stated |= {"noise": scatter.floor, "scatter": scatter.share, "scatter_common": scatter.common}
-    search = SearchSettings(**stated)
+        keys |= {"noise": scatter.floor, "scatter": scatter.share, "scatter_common": scatter.common}
+    search = SearchSettings(**keys)
     check_comparisons(len(pad.knots), PER_SPAN * (pad.knots.shape[1] - 1) + 1)
     return ScoredPad(pad, contact, search, rules, size, noise).terms()

@@ -18,21 +18,23 @@ from padforge.design.optimize.problem import SearchProblem
 from padforge.design.paths.curves import refine
 from padforge.design.published.objective import published_presses, published_terms
 
-LEVEL_STD, ORIGIN_STD = 1.0, 0.3
-"""Standard deviations of the first knots about a fibre's own level, and about those of an origin; grid units."""
+LEVEL_STD = 1.0
+"""Standard deviation of initial knots about the level of their fibre, grid units."""
+ORIGIN_STD = 0.3
+"""Standard deviation of initial knots about those of an origin, grid units."""
 
 
 class GeneticSearch:
-    """Minimise the published objective, a generation of `search.population` pads at a time.
+    """Minimise the published objective by generations of `search.population` pads.
 
-    The same problem gives the same pads, whether or not the search was interrupted and resumed from its state. An
-    origin and mutated copies of it make up half of the first generation; knots of it within MARGIN of the pad's edge
-    are moved to MARGIN, the bound of the search.
+    A problem gives the same pads whether or not the search was interrupted and resumed from its state. If the problem
+    has an origin, half of the first generation are the origin and copies of it with scattered knots.
     """
 
     def __init__(self, problem: SearchProblem, state: State | None = None) -> None:
         search, origin = problem.search, problem.origin
-        self.step, self.objective = 0, math.inf  # generations done, and the best objective so far
+        self.step = 0  # generations done
+        self.objective = math.inf  # of the best pad so far
         self._history: list[tuple[int, float]] = []
         self._generations = search.generations
         self._problem = _PublishedProblem(problem)
@@ -56,14 +58,14 @@ class GeneticSearch:
         self._history.append((self.step, self.objective))
 
     def finish(self) -> None:
-        """Skip the remaining generations, but for the first; there is no repair."""
+        """Skip the remaining generations except the first; there is no repair."""
         if self.step == 0:
             self.advance()
         self._generations = self.step
 
     def morphology(self) -> Morphology:
-        """Return the best pad so far; there is one once the first generation is done."""
-        # Survivors are the best of parents and offspring, so the best pad ever is among them.
+        """Return the best pad so far, after the first generation at the earliest."""
+        # survivors are the best of parents and offspring, so the best pad ever is among them
         x, objective = self._algorithm.pop.get("X", "F")
         return Morphology.from_layout(self._problem.knots(x[objective.argmin()][None])[0], self._problem.layout)
 
@@ -91,7 +93,7 @@ class GeneticSearch:
 
 
 class _PublishedProblem(PymooProblem):
-    """2 F N free coordinates within the pad, one objective, evaluated a generation at a time."""
+    """The published objective of a generation of pads, as a function of the 2 F N coordinates of each pad's knots."""
 
     def __init__(self, problem: SearchProblem) -> None:
         self.layout = problem.pad.layout
@@ -107,18 +109,24 @@ class _PublishedProblem(PymooProblem):
         return assemble_knots(x.reshape(-1, *self.shape), self.layout)
 
     def _evaluate(self, x: Array, out: dict[str, Array], *args: object, **kwargs: object) -> None:
-        search = self.search
-        how = {"weights": search.weights, "levels": search.levels, "entropy": search.entropy}
-        terms = published_terms(self.knots(x), self.contact, self.presses, layout=self.layout, **how)
+        terms = published_terms(
+            self.knots(x),
+            self.contact,
+            self.presses,
+            layout=self.layout,
+            weights=self.search.weights,
+            levels=self.search.levels,
+            entropy=self.search.entropy,
+        )
         out["F"] = np.array([[pad.objective] for pad in terms])
 
 
 class _FirstGeneration(FloatRandomSampling):
-    """Half of the pads with knots anywhere, as in the published search, and half near an untangled pad.
+    """First generation: half uniformly random knots, as in the published search, and half near an untangled pad.
 
-    Where all knots lie anywhere, fibres of a family stand in the wrong order so often, the more the more knots they
-    have, that most generations go into setting that right (the C of formula (5)). The other half have knots scattered
-    about those of the origin (F, N, 2), or without one their coordinates across the fibres about their levels.
+    Among uniformly random knots, fibres of a family are so often in the wrong order that most generations would be
+    spent on sorting them (the C of formula (5)). Knots of the other half are scattered about those of the origin
+    (F, N, 2) or, without an origin, about the straight fibres.
     """
 
     def __init__(self, origin: Array | None) -> None:
@@ -144,8 +152,8 @@ class _FirstGeneration(FloatRandomSampling):
 class _SortKnots(Repair):
     """Sort the knots along every fibre, within the bounds.
 
-    A pad is the same whatever the order of its knots, but crossover exchanges knots of the same number: sorted,
-    these are at about the same position.
+    The order of its knots does not change a pad. But crossover exchanges knots of the same number, which are at about
+    the same position if knots are sorted.
     """
 
     def _do(self, problem: _PublishedProblem, X: Array, **kwargs: object) -> Array:

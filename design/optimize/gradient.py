@@ -1,7 +1,7 @@
 """Gradient search on the expected error under noise and fibre loss, within the rules.
 
-One start is a `GradientSearch`: it advances by any number of steps, returns its state as plain arrays and goes on from
-them to the same bits, so that it can run in slices on any thread or machine and survive being killed.
+One start is a `GradientSearch`. It advances by any number of steps and returns its state as plain arrays, from which it
+resumes bit for bit, so that it can run in slices on any thread or machine and survive being killed.
 """
 
 import json
@@ -24,90 +24,83 @@ from padforge.design.signal_gradients import Differentiate, FibreCurves
 
 
 class Schedule(NamedTuple):
-    """How the steps of a start change from the first to the last one."""
+    """Learning rate and penalty weight of a start as functions of its progress p, from 0 to 1."""
 
     rate: float  # learning rate of the first step
-    fall: int  # power of cos(pi p / 2), by which it falls after a share p of the steps
-    penalty_weights: tuple[float, float]  # weight of the rules at the first and at the last step
+    decay_power: int  # the rate decays as cos(pi p / 2) to this power, down to 2 % of its first value
+    penalty_weights: tuple[float, float]  # weight of the penalties at the first and at the last step
 
 
-GENTLE, STRICT = Schedule(0.02, 2, (1.6, 530.0)), Schedule(0.04, 4, (5.0, 1600.0))
-"""Most starts are gentle: large steps and strong rules shake fibres out of what locates with two and three failed, too.
-But zigzags may tangle so that some rules stay broken, as that on the angle of crossings.
+GENTLE = Schedule(0.02, 2, (1.6, 530.0))
+"""Schedule of most starts. Larger steps and stronger penalties move fibres away from layouts that still locate presses
+with two or three failures.
 """
-STRICT_START = 3
-"""Of four starts the strict one, which is nearly straight at first."""
-MIN_RATE = 0.02
-"""Learning rate of the last step, as a share of that of the first one."""
-BETAS = 0.9, 0.999
-"""By which a step of Adam multiplies its means of gradients and of their squares."""
-INITIAL_NOISE = 2.0
-"""Scatter of the first step as a multiple of the last one's."""
+STRICT = Schedule(0.04, 4, (5.0, 1600.0))
+"""Schedule of every fourth start, which begins nearly straight. Zigzags may tangle so that some rules stay broken, such
+as the one on crossing angles.
+"""
 COMMON_TRACKS_FROM = 0.7
-"""Share of the steps after which the rule on common tracks counts: before, it hinders crossings from moving, and what
-it asks for in the end is a small change.
+"""Progress from which the rule on common tracks counts. Earlier it hinders crossings from moving, and in the end it
+takes only small changes to keep it.
 """
 RULE_MARGIN = 1.05
-"""On the limits of the rules."""
-FORGETTING = 0.03
-"""Weight of a step in the running means of errors."""
+"""Safety factor on the limits of the rules during the search."""
 HISTORY_STEPS = 10
 """Steps between entries of the history, each the geometric mean of the objectives since the last one."""
-MAX_GRADIENT = 1e150
-"""Whose square is finite."""
-REPAIR_STEPS, REPAIR_CHECKS, FINE_STEPS = 800, 20, 200
-"""Most steps of repair after the last step, steps between two exact checks, and the first ones, which are fine."""
-REPAIR_MARGIN = 0.01
-"""Added to the margin at each failed check."""
-FINE_REPAIR, FIRM_REPAIR, MAX_REPAIR_RATE = (0.003, 1.1), (0.002, 1.15), 0.01
-"""Learning rate of the repair, gentle at first, and its growth at each failed check."""
-FINE_MEMORY = 0.5
-"""By which a fine step of the repair multiplies its means of directions."""
+REPAIR_STEPS = 800
+"""Maximum steps of repair after the search."""
+FINE_STEPS = 200
+"""The first steps of repair, which move only the fibres that break rules."""
+REPAIR_CHECKS = 20
+"""Steps of repair between two exact checks of the rules."""
 KNOTS_PER_TURN = 3
-"""Before, at and after: a turn of given radius needs its shoulders."""
-KNOT_STD = 0.1
-"""Standard deviation by which knots are moved off straight paths or an origin, grid units."""
-MAX_BORDER = 0.45
-"""Of the pad's side: a wider border leaves no room, which the rule check then reports."""
+"""Knots of a rounded turn: one at its peak and a shoulder to either side."""
 
 
 class Parametrization:
-    """Free variables of a pad's fibres, mapped so that knots stay ascending, separate and off the border.
+    """Unconstrained variables of a pad's fibres, from which its knots follow ascending, separate and off the border.
 
-    Coordinates along a fibre are running sums of a softmax with a floor under every span, those across it a sigmoid.
+    Coordinates along a fibre are cumulative sums of spans, each a floor plus a softmax share of the remaining length.
+    Coordinates across it are sigmoids between the borders.
+
+    Attributes:
+        layout: number and spacing of the fibres.
+        ends: positions at which the fibres end.
+        spans: logits of the spans; shape (F, N + 1).
+        across: logits of the coordinates across; shape (F, N).
+        floor: minimum span, grid units.
+        border: minimum distance of a knot to the border, grid units.
     """
 
     def __init__(self, layout: Layout, spans: Array, across: Array, floor: float, border: float) -> None:
         self.layout, self.ends = layout, fibre_ends(layout)
-        self.floor, self.border = floor, border  # least span, and least distance of a knot to the border, grid units
-        self.spans, self.across = spans, across  # logits of the spans (F, N + 1), and of the coordinates across (F, N)
+        self.spans, self.across, self.floor, self.border = spans, across, floor, border
         self._length, self._width, self._level = (x[:, None] for x in (*_sides(layout), layout.levels))
-        self._free = self._length - spans.shape[1] * floor  # what the spans share; shape (F, 1)
+        self._free_length = self._length - spans.shape[1] * floor  # distributed by the softmax; shape (F, 1)
 
     @classmethod
     def from_knots(cls, knots: Array, layout: Layout, border: float) -> "Parametrization":
-        """Return the variables of fibres through knots (F, N + 2, 2); those nearer to the border are moved to it."""
+        """Return the variables of fibres through knots (F, N + 2, 2), moving knots beyond the border onto it."""
         along, across = (axis[0] for axis in split_axes(knots[None], layout.horizontals))
-        width = np.diff(along, axis=1)
-        floor = min(0.1 * min(layout.extent) / (knots.shape[1] - 1), 0.5 * float(width.min()))
+        spans = np.diff(along, axis=1)
+        floor = min(0.1 * min(layout.extent) / (knots.shape[1] - 1), 0.5 * float(spans.min()))
         unit = np.clip((across[:, 1:-1] - border) / (_sides(layout)[1][:, None] - 2 * border), 0.005, 0.995)
-        return cls(layout, np.log(width - floor), np.log(unit / (1 - unit)), floor, border)
+        return cls(layout, np.log(spans - floor), np.log(unit / (1 - unit)), floor, border)
 
     def axes(self) -> tuple[Array, Array]:
         """Return the coordinates of all knots along and across the fibres, ends included, both (F, N + 2)."""
-        width, unit = self.floor + self._free * self._shares(), 1 / (1 + np.exp(-self.across))
-        begin = np.zeros_like(self._length)
-        along = np.concatenate([begin, width.cumsum(axis=1)[:, :-1], self._length], axis=1)
-        across = self.border + (self._width - 2 * self.border) * unit
+        spans = self.floor + self._free_length * self._softmax()
+        along = np.concatenate([np.zeros_like(self._length), spans.cumsum(axis=1)[:, :-1], self._length], axis=1)
+        across = self.border + (self._width - 2 * self.border) * self._sigmoid()
         return along, np.concatenate([self._level, across, self._level], axis=1)
 
-    def gradients(self, by_along: Array, by_across: Array) -> tuple[Array, Array]:
-        """Return the derivatives by the logits of a value that has these (F, N + 2) by the coordinates of the knots."""
-        shares, unit = self._shares(), 1 / (1 + np.exp(-self.across))
-        by_shares = np.zeros_like(shares)  # each moves the knots after it, but for the last, which is fixed
-        by_shares[:, :-1] = self._free * by_along[:, -2:0:-1].cumsum(axis=1)[:, ::-1]
-        by_spans = shares * (by_shares - (shares * by_shares).sum(axis=1, keepdims=True))
-        return by_spans, by_across[:, 1:-1] * (self._width - 2 * self.border) * unit * (1 - unit)
+    def gradients(self, grad_along: Array, grad_across: Array) -> tuple[Array, Array]:
+        """Return the gradients by `spans` and `across` of a value, from those by the knots' coordinates (F, N + 2)."""
+        shares, unit = self._softmax(), self._sigmoid()
+        grad_shares = np.zeros_like(shares)  # a span moves all later knots except the last, which is fixed
+        grad_shares[:, :-1] = self._free_length * grad_along[:, -2:0:-1].cumsum(axis=1)[:, ::-1]
+        grad_spans = shares * (grad_shares - (shares * grad_shares).sum(axis=1, keepdims=True))
+        return grad_spans, grad_across[:, 1:-1] * (self._width - 2 * self.border) * unit * (1 - unit)
 
     def knots(self) -> Array:
         """Return the knots (F, N + 2, 2) as `Morphology` holds them."""
@@ -115,16 +108,21 @@ class Parametrization:
         inner[self.layout.horizontals :] = inner[self.layout.horizontals :, :, ::-1]
         return assemble_knots(inner, self.layout)
 
-    def _shares(self) -> Array:
-        """Return the softmax (F, N + 1) of the spans' logits."""
+    def _softmax(self) -> Array:
         powers = np.exp(self.spans - self.spans.max(axis=1, keepdims=True))
         return powers / powers.sum(axis=1, keepdims=True)
 
+    def _sigmoid(self) -> Array:
+        return 1 / (1 + np.exp(-self.across))
+
 
 class Adam:
-    """Steps of variables in place along smoothed gradients (Kingma and Ba, ICLR 2015), with the usual constants.
+    """Adam (Kingma and Ba, ICLR 2015) on arrays, which it changes in place.
 
-    `moments` are the smoothed gradients of each variable and their squares, after `steps` steps.
+    Attributes:
+        variables: the arrays.
+        steps: steps so far.
+        moments: decaying means of the gradient and of its square, for each variable; shape (2, ...).
     """
 
     def __init__(self, variables: list[Array], steps: int = 0, moments: list[Array] | None = None) -> None:
@@ -132,19 +130,37 @@ class Adam:
         self.moments = [np.zeros((2, *x.shape)) for x in variables] if moments is None else moments
 
     def step(self, gradients: tuple[Array, ...], rate: float) -> None:
-        """Take a step of a learning rate; what is not finite of a gradient counts as 0."""
+        """Take one step; components of the gradients that are not finite count as 0."""
         self.steps += 1
+        beta1, beta2 = 0.9, 0.999
         for x, (mean, square), gradient in zip(self.variables, self.moments, gradients, strict=True):
             finite = _finite(gradient)
-            mean += (1 - BETAS[0]) * (finite - mean)
-            square += (1 - BETAS[1]) * (finite**2 - square)
-            unbiased = mean / (1 - BETAS[0] ** self.steps), square / (1 - BETAS[1] ** self.steps)
-            x -= rate * unbiased[0] / (np.sqrt(unbiased[1]) + 1e-8)
+            mean += (1 - beta1) * (finite - mean)
+            square += (1 - beta2) * (finite**2 - square)
+            unbiased_mean, unbiased_square = mean / (1 - beta1**self.steps), square / (1 - beta2**self.steps)
+            x -= rate * unbiased_mean / (np.sqrt(unbiased_square) + 1e-8)
+
+
+class SignedRootDescent(Adam):
+    """Descent along the signed square root of the gradient, averaged over steps; its state has the arrays of Adam's.
+
+    Unlike a step along the gradient, this moves knots of small gradients too; unlike a step of Adam, it leaves knots of
+    zero gradient in place. The step has the length `rate` where a fibre's gradient is largest.
+    """
+
+    def step(self, gradients: tuple[Array, ...], rate: float) -> None:
+        """Take one step; components of the gradients that are not finite count as 0."""
+        finite = [_finite(gradient) for gradient in gradients]
+        largest = np.maximum(*(np.abs(gradient).max(axis=1, keepdims=True) for gradient in finite))
+        for x, (mean, _), gradient in zip(self.variables, self.moments, finite, strict=True):
+            direction = np.sign(gradient) * np.sqrt(np.abs(gradient) / np.where(largest > 0, largest, 1))
+            mean += 0.5 * (direction - mean)
+            x -= rate * mean
 
 
 def _finite(gradient: Array) -> Array:
-    """Return a gradient whose squares are finite; what is not finite of it counts as 0."""
-    return np.nan_to_num(gradient, nan=0.0, posinf=0.0, neginf=0.0).clip(-MAX_GRADIENT, MAX_GRADIENT)
+    """Set components that are not finite to 0, and clip the others so that their squares do not overflow."""
+    return np.nan_to_num(gradient, nan=0.0, posinf=0.0, neginf=0.0).clip(-1e150, 1e150)
 
 
 def _sides(layout: Layout) -> tuple[Array, Array]:
@@ -153,39 +169,40 @@ def _sides(layout: Layout) -> tuple[Array, Array]:
 
 
 def border_width(pad: PadSettings, rules: RulesSettings) -> float:
-    """Return the least distance of a knot to the border, grid units."""
+    """Return the minimum distance of a knot to the border, grid units."""
     limit = rules.border_mm / pad.layout.unit_mm if rules.enforce else 0.0
-    return min(max(MARGIN, limit), MAX_BORDER * min(pad.layout.extent))
+    # a border of half the side would leave no room; if the rule asks for that, its exact check fails
+    return min(max(MARGIN, limit), 0.45 * min(pad.layout.extent))
 
 
 def is_strict(start: int) -> bool:
-    """Return whether a start takes large steps under strong rules."""
-    return start % 4 == STRICT_START
+    """Return whether a start follows the schedule STRICT."""
+    return start % 4 == 3
 
 
 def initial_paths(
     pad: PadSettings, rules: RulesSettings, knots: int, origin: Morphology | None, start: int, rng: np.random.Generator
 ) -> Array:
-    """Draw the knots (F, N + 2, 2) that a start of the search begins with; they pass keep-outs.
+    """Draw the initial knots (F, N + 2, 2) of a start; its paths pass keep-outs.
 
-    Without an origin, each start has a zigzag of its own, but for strict ones, which have straight fibres with knots
-    moved by a tenth of a grid unit or so: where slopes are 0 to both sides of a knot, PCHIP keeps them there and has no
-    gradient. With an origin, start 0 has its very paths, later ones have them with knots moved.
+    Without an origin, gentle starts begin with random zigzags and strict ones with straight fibres. With an origin, all
+    begin with its paths. Knots of straight fibres, and of the origin except in start 0, are moved by a tenth of a grid
+    unit or so: where slopes are 0 on both sides of a knot, PCHIP has slope 0 and no gradient there.
     """
     if origin is None and not is_strict(start):
         return pass_keep_outs(_zigzag(pad.layout, rules, knots, rng), pad, rules)
     paths = straight_paths(pad, rules, knots) if origin is None else refine(origin.knots, knots, pad.layout)
     if origin is not None and start == 0 and len(origin.knots[0]) > 2:
         return paths
-    inner = paths[:, 1:-1] + KNOT_STD * rng.standard_normal(paths[:, 1:-1].shape)
+    inner = paths[:, 1:-1] + 0.1 * rng.standard_normal(paths[:, 1:-1].shape)
     return assemble_knots(np.clip(inner, MARGIN, np.array(pad.layout.extent) - MARGIN), pad.layout)
 
 
 def _zigzag(layout: Layout, rules: RulesSettings, knots: int, rng: np.random.Generator) -> Array:
-    """Draw a random zigzag that each family runs side by side: no crossings within a family, and round turns.
+    """Draw random zigzags, in parallel within each family, so that fibres of a family do not cross.
 
-    PCHIP has slope 0 at a turn, so that one knot alone bends sharper the higher the flanks; with shoulders
-    beside it the flanks may be as steep as they like.
+    PCHIP has slope 0 at a turn. A turn of one knot bends the sharper the steeper its flanks are; one with a knot on
+    either shoulder keeps its radius however steep they are.
     """
     radius = rules.min_mean_bend_radius_mm / layout.unit_mm if rules.enforce else 0.0
     per_turn = KNOTS_PER_TURN if radius > 0 and knots >= 2 * KNOTS_PER_TURN else 1
@@ -198,17 +215,17 @@ def _zigzag(layout: Layout, rules: RulesSettings, knots: int, rng: np.random.Gen
         position = pitch * (np.arange(1, turns + 1) + 0.12 * rng.standard_normal(turns))
         side = np.where(np.arange(turns) % 2 == 0, 1, -1) * rng.choice([-1, 1])
         swing = 0.6 * side * rng.uniform(0.5, 1.2, turns)
-        short = min(1.0, layout.extent[axis] / width)  # fibres shorter than the pad is wide have less room to turn
-        centre = width / 2 + (1 - 0.3 * short) * (level - width / 2)
-        peak = np.sort(centre + short * swing + 0.1 * rng.standard_normal((len(level), turns)), axis=0)
+        aspect = min(1.0, layout.extent[axis] / width)  # fibres shorter than the pad is wide have less room to turn
+        centre = width / 2 + (1 - 0.3 * aspect) * (level - width / 2)
+        peak = np.sort(centre + aspect * swing + 0.1 * rng.standard_normal((len(level), turns)), axis=0)
         turn = np.sort(position + 0.02 * rng.standard_normal((len(level), turns)), axis=1)
         path = np.concatenate([level, peak, level], axis=1)
         drop = np.clip(0.12 * np.stack([peak - path[:, :-2], peak - path[:, 2:]]), -0.1, 0.1)
-        parts = [(turn, peak)]
+        turn_knots = [(turn, peak)]
         if per_turn == KNOTS_PER_TURN:
-            parts = [(turn - shoulder, peak - drop[0]), *parts, (turn + shoulder, peak - drop[1])]
-        points = np.moveaxis(np.array(parts), 1, -1)  # (parts, F, turns, 2), along and across
-        points = np.moveaxis(points, 0, 2).reshape(len(level), turns * len(parts), 2)
+            turn_knots = [(turn - shoulder, peak - drop[0]), *turn_knots, (turn + shoulder, peak - drop[1])]
+        points = np.array(turn_knots).transpose(2, 3, 0, 1)  # (F, turns, knots of a turn, 2), along and across
+        points = points.reshape(len(level), turns * len(turn_knots), 2)
         fibres.append(points if axis == 0 else points[..., ::-1])
     inner = np.clip(np.concatenate(fibres), 0.02, np.array(layout.extent) - 0.02)
     return refine(assemble_knots(inner, layout), knots, layout)
@@ -217,27 +234,29 @@ def _zigzag(layout: Layout, rules: RulesSettings, knots: int, rng: np.random.Gen
 class GradientSearch:
     """One start of the gradient search: Adam with annealed noise and rising penalties, then repair of broken rules.
 
-    The same start of the same problem gives the same fibres, whichever other starts run and however it is sliced.
+    A start gives the same fibres whichever other starts run and however it is sliced.
     """
 
     def __init__(self, problem: SearchProblem, start: int, state: State | None = None) -> None:
         self.problem, self.rng = problem, np.random.default_rng([problem.search.seed, start])
         self._schedule = STRICT if is_strict(start) else GENTLE
-        self.step, self.objective, self.done = 0, math.inf, False  # objective of the last step, without penalties
-        self._log_sum = 0.0  # of the objectives since the last entry of the history
+        self.step, self.done = 0, False
+        self.objective = math.inf  # of the last step, without penalties
         self._history: list[tuple[int, float]] = []
-        self._broken = np.zeros(problem.pad.layout.fibres, bool)  # fibres that broke rules at the last check
-        # running means of the errors by contact and number of failed fibres, from straight fibres' on
-        self._means = problem.straight_errors.copy()
+        self._log_sum = 0.0  # sum of log(objective) since the last entry of the history
+        self._breaks_rules = np.zeros(problem.pad.layout.fibres, bool)  # by fibre, at the last exact check
+        # running means of the errors by contact and number of failed fibres, which begin as those of straight fibres
+        self._mean_errors = problem.straight_errors.copy()
         if state is not None:
             self._restore(state)
             return
         pad, rules = problem.pad, problem.rules
-        # full scale of straight fibres under each contact
-        self.scales = [objective.straight_full_scale(pad.layout, c, pad.sensed_mm) for c in problem.contacts]
+        self.scales = [  # full scale of straight fibres under each contact
+            objective.straight_full_scale(pad.layout, contact, pad.sensed_mm) for contact in problem.contacts
+        ]
         paths = initial_paths(pad, rules, problem.search.knots, problem.origin, start, self.rng)
         self.fibres = Parametrization.from_knots(paths, pad.layout, border_width(pad, rules))
-        self._adam = Adam([self.fibres.spans, self.fibres.across])
+        self._optimizer = Adam([self.fibres.spans, self.fibres.across])
 
     def advance(self) -> None:
         """Take one step of the search, or of the repair after it."""
@@ -252,7 +271,7 @@ class GradientSearch:
             self._begin_repair()
 
     def morphology(self) -> Morphology:
-        """Return the fibres as they are."""
+        """Return the current fibres."""
         return Morphology.from_layout(self.fibres.knots(), self.fibres.layout)
 
     def state(self) -> State:
@@ -263,98 +282,87 @@ class GradientSearch:
             "across": self.fibres.across.copy(),
             "fixed": np.array([self.fibres.floor, self.fibres.border]),
             "scales": np.array(self.scales),
-            "means": self._means.copy(),
+            "means": self._mean_errors.copy(),
             "progress": np.array([self.step, self.objective, self._log_sum]),
             "done": np.array(self.done),
             "history": np.array(self._history).reshape(-1, 2),
             "generator": np.frombuffer(generator, np.uint8).copy(),
-            "adam_steps": np.array(self._adam.steps),
-            "adam_spans": self._adam.moments[0].copy(),
-            "adam_across": self._adam.moments[1].copy(),
-            "broken": self._broken.copy(),
+            "adam_steps": np.array(self._optimizer.steps),
+            "adam_spans": self._optimizer.moments[0].copy(),
+            "adam_across": self._optimizer.moments[1].copy(),
+            "broken": self._breaks_rules.copy(),
         }
 
     def _restore(self, state: State) -> None:
         variables = [state["spans"].copy(), state["across"].copy()]
-        self.scales, self._means = state["scales"].tolist(), state["means"].copy()
+        self.scales, self._mean_errors = state["scales"].tolist(), state["means"].copy()
         self.fibres = Parametrization(self.problem.pad.layout, *variables, *state["fixed"].tolist())
         step, self.objective, self._log_sum = state["progress"].tolist()
         self.step, self.done = int(step), bool(state["done"])
         self._history = [(int(step), objective) for step, objective in state["history"].tolist()]
         self.rng.bit_generator.state = json.loads(state["generator"].tobytes())
         moments = [state["adam_spans"].copy(), state["adam_across"].copy()]
-        self._adam = Adam(variables, int(state["adam_steps"]), moments)
-        self._broken = state["broken"].copy()
+        is_fine = 0 <= self.step - self.problem.steps < FINE_STEPS
+        self._optimizer = (SignedRootDescent if is_fine else Adam)(variables, int(state["adam_steps"]), moments)
+        self._breaks_rules = state["broken"].copy()
 
     def _descend(self) -> None:
-        """Take one step on the objective and the rules."""
-        rate, fall, (first, last) = self._schedule
+        """Take one step on the sum of objective and penalties."""
+        initial_rate, decay_power, (first_weight, last_weight) = self._schedule
         progress = self.step / max(1, self.problem.steps - 1)
-        rate *= MIN_RATE + (1 - MIN_RATE) * math.cos(math.pi / 2 * progress) ** fall
+        rate = initial_rate * (0.02 + 0.98 * math.cos(math.pi / 2 * progress) ** decay_power)
         curves = self._curves()
-        self.objective, by_curves = self._objective(curves, INITIAL_NOISE ** (1 - progress))
-        gradient = curves.by_knots(by_curves)
+        self.objective, grad_curves = self._objective(curves, noise_factor=2.0 ** (1 - progress))
+        gradient = curves.by_knots(grad_curves)
         if (rules := self.problem.rules).enforce:
             if progress < COMMON_TRACKS_FROM:
                 rules = rules.model_copy(update={"max_common_track_mm": None})
-            weight = first * (last / first) ** progress
+            weight = first_weight * (last_weight / first_weight) ** progress
             gradient = gradient + weight * self._penalty_gradient(curves, rules, RULE_MARGIN, all_bends=False)
-        self._adam.step(self.fibres.gradients(*gradient), rate)
+        self._optimizer.step(self.fibres.gradients(*gradient), rate)
         self.step += 1
         self._log_sum += math.log(self.objective)
         if self.step % HISTORY_STEPS == 0 or self.step == self.problem.steps:
-            steps = (self.step - 1) % HISTORY_STEPS + 1
-            self._history.append((self.step, math.exp(self._log_sum / steps)))
+            n_averaged = (self.step - 1) % HISTORY_STEPS + 1
+            self._history.append((self.step, math.exp(self._log_sum / n_averaged)))
             self._log_sum = 0.0
         if self.step == self.problem.steps:
             self._begin_repair()
 
     def _begin_repair(self) -> None:
-        """End the search; there is nothing to repair if the exact check passes."""
+        """End the search, and check whether there is anything to repair."""
         self.step = self.problem.steps
-        self._adam = Adam([self.fibres.spans, self.fibres.across])
-        self.done = self._check()
+        self._optimizer = SignedRootDescent([self.fibres.spans, self.fibres.across])
+        self.done = self._check_rules()
 
-    def _check(self) -> bool:
-        """Find the fibres that break rules, all of them where one concerns the pad as a whole; return if none does."""
+    def _check_rules(self) -> bool:
+        """Check the rules exactly, note which fibres break them, and return whether all are kept."""
         violations = self.problem.violations(self.morphology())
-        self._broken[:] = False
-        for violation in violations:
-            self._broken[[fibre - 1 for fibre in violation.fibres] or slice(None)] = True
+        self._breaks_rules[:] = False
+        for violation in violations:  # one without fibres concerns all of them
+            self._breaks_rules[[fibre - 1 for fibre in violation.fibres] or slice(None)] = True
         return not violations
 
     def _repair(self) -> None:
-        """Take one step on the rules alone; the margin grows until they hold.
+        """Take one step on the penalties alone, with a margin and a learning rate that grow at each failed check.
 
-        The first ones are fine, of fibres that break rules, and as the root of the gradient: as the gradient itself,
-        knots of small ones would stay. Where these do not suffice, all fibres take steps of Adam, which move all knots
-        nearly alike: that resolves more, but costs accuracy.
+        The first FINE_STEPS move only fibres that break rules. If these do not suffice, Adam moves all fibres, and all
+        knots by nearly the same step: that resolves more, but costs accuracy.
         """
-        repairs = self.step - self.problem.steps
-        fine = repairs < FINE_STEPS
-        if repairs == FINE_STEPS:
-            self._adam = Adam(self._adam.variables)
-        checks = (repairs if fine else repairs - FINE_STEPS) // REPAIR_CHECKS
-        rate, growth = FINE_REPAIR if fine else FIRM_REPAIR
-        rate = min(rate * growth**checks, MAX_REPAIR_RATE)
-        margin = RULE_MARGIN + REPAIR_MARGIN * checks
+        n_steps = self.step - self.problem.steps
+        is_fine = n_steps < FINE_STEPS
+        n_failed_checks = (n_steps if is_fine else n_steps - FINE_STEPS) // REPAIR_CHECKS
+        rate = 0.003 * 1.1**n_failed_checks if is_fine else 0.002 * 1.15**n_failed_checks
+        margin = RULE_MARGIN + 0.01 * n_failed_checks
         gradient = self._penalty_gradient(self._curves(), self.problem.rules, margin)
-        if fine:
-            self._step_finely(self.fibres.gradients(*gradient * self._broken[:, None]), rate)
-        else:
-            self._adam.step(self.fibres.gradients(*gradient), rate)
+        if is_fine:
+            gradient = gradient * self._breaks_rules[:, None]
+        elif n_steps == FINE_STEPS:
+            self._optimizer = Adam(self._optimizer.variables)
+        self._optimizer.step(self.fibres.gradients(*gradient), min(rate, 0.01))
         self.step += 1
-        if (repairs + 1) % REPAIR_CHECKS == 0:
-            self.done = repairs + 1 >= REPAIR_STEPS or self._check()
-
-    def _step_finely(self, gradients: tuple[Array, Array], rate: float) -> None:
-        """Take a step as the root of the gradients, of length `rate` where a fibre's gradient is greatest."""
-        gradients = _finite(gradients[0]), _finite(gradients[1])
-        largest = np.maximum(*(np.abs(by_x).max(axis=1, keepdims=True) for by_x in gradients))
-        for x, (mean, _), by_x in zip(self._adam.variables, self._adam.moments, gradients, strict=True):
-            direction = np.sign(by_x) * np.sqrt(np.abs(by_x) / np.where(largest > 0, largest, 1))
-            mean += (1 - FINE_MEMORY) * (direction - mean)
-            x -= rate * mean
+        if (n_steps + 1) % REPAIR_CHECKS == 0:
+            self.done = n_steps + 1 >= REPAIR_STEPS or self._check_rules()
 
     def _curves(self) -> FibreCurves:
         return FibreCurves(*self.fibres.axes(), self.fibres.ends, self.problem.pad.layout.unit_mm)
@@ -363,40 +371,42 @@ class GradientSearch:
         self, curves: FibreCurves, rules: RulesSettings, margin: float, all_bends: bool = True
     ) -> Array:
         """Return the gradient (2, F, n) of the sum of all penalties by the knots."""
-        total = penalties(curves.along, curves.across, self.problem.pad, rules, margin, all_bends)
-        return np.stack([total.by_along, total.by_across])
+        result = penalties(curves.along, curves.across, self.problem.pad, rules, margin, all_bends)
+        return np.stack([result.grad_along, result.grad_across])
 
     def _objective(self, curves: FibreCurves, noise_factor: float) -> tuple[float, Array]:
-        """Return the relative error on random presses and failures, and the weighted terms; and a gradient.
+        """Return the sum of the relative error and the weighted terms, and its gradient (3, F, n) by the curves.
 
-        A step looks at one contact, drawn by its part in the mean, and remembers what earlier steps have seen of the
-        others: so the gradient (3, F, n) by the curves is that of the mean on average, for the time of one contact.
+        Presses and failures are random. The error is computed under one contact, drawn with a probability equal to its
+        share of the mean; for the others, running means of earlier steps stand in. With the weight 1 / probability the
+        gradient is, on average, that of the mean over all contacts.
         """
         search, pad, shares = self.problem.search, self.problem.pad, failure_shares(self.problem.search.max_failures)
-        # 1. a random window, all of the pad unless it is large; another one if it lies in a keep-out; random failures
-        presses = None
-        while presses is None or not presses.free.any():
+        straight_errors = self.problem.straight_errors
+        # 1. a random window, all of the pad unless it is large, outside keep-outs; random failures
+        while True:
             window = objective.place_window(pad.sensed, self.rng.random(2))
             presses = objective.window_presses(pad, window, objective.SEARCH_SIDE, self.rng)
+            if presses.free.any():
+                break
         masks = sample_failures(pad.layout.fibres, shares, self.rng)
-        # 2. errors under one contact, and how straight fibres compare
-        straight = self.problem.straight_errors
-        value, by_means = objective.relative_error(self._means, straight, shares)
-        parts = (by_means * self._means).sum(axis=1) / value  # in the mean, of each contact; they add up to 1
-        which = int(self.rng.choice(len(parts), p=parts))
-        contact, scale = self.problem.contacts[which], self.scales[which]
-        stated = search.response_scatter.scaled(noise_factor)
-        scatter = objective.scatter_of_full_scale(stated, contact, scale)
+        # 2. a random contact
+        value, grad_means = objective.relative_error(self._mean_errors, straight_errors, shares)
+        probabilities = (grad_means * self._mean_errors).sum(axis=1) / value
+        index = int(self.rng.choice(len(probabilities), p=probabilities))
+        contact, scale = self.problem.contacts[index], self.scales[index]
+        scatter = objective.scatter_of_full_scale(search.response_scatter.scaled(noise_factor), contact, scale)
+        # 3. the errors under it, and the mean over all contacts
         errors, differentiate = self._errors(curves, presses, masks, contact, scale, scatter)
-        averages = objective.averages(masks, straight.shape[1])
-        self._means[which] += FORGETTING * (averages @ errors - self._means[which])
-        total, by_means = objective.relative_error(self._means, straight, shares)
-        gradient = differentiate(by_means[which] @ averages) / parts[which]
-        # 3. the terms that `[search]` weighs
+        averages = objective.averages(masks, straight_errors.shape[1])
+        self._mean_errors[index] += 0.03 * (averages @ errors - self._mean_errors[index])
+        total, grad_means = objective.relative_error(self._mean_errors, straight_errors, shares)
+        gradient = differentiate(grad_means[index] @ averages) / probabilities[index]
+        # 4. the terms that `[search]` weighs
         for weight, term in weighted_terms(search):
             if term.loss is not None:
-                value, by_curves = term.loss(curves, self.problem.contacts[0], pad)
-                total, gradient = total + weight * value, gradient + weight * by_curves
+                value, grad_curves = term.loss(curves, self.problem.contacts[0], pad)
+                total, gradient = total + weight * value, gradient + weight * grad_curves
         return total, gradient
 
     def _errors(
@@ -408,22 +418,25 @@ class GradientSearch:
         scale: float,
         scatter: Scatter,
     ) -> tuple[Array, Differentiate]:
-        """Return the expected errors (L,) under a contact, and what differentiates: from (L,) to (3, F, n)."""
-        (length, by_length), weights = curves.lengths(), objective.kernel_weights(self.problem.pad.layout)
+        """Return the expected errors (L,) under a contact, and the function from a gradient by them to (3, F, n)."""
+        (length, grad_length), weights = curves.lengths(), objective.kernel_weights(self.problem.pad.layout)
         per_signal, positions = 1 / (scale * length[:, None]), presses.positions
-        if len(presses.far):  # those whose responses resemble some of the window
+        if len(presses.far):
             near, far = (
                 weights[:, None] * per_signal * curves.signals(x, contact)[0] for x in (presses.positions, presses.far)
             )
             positions = presses.with_partners(objective.confusable(near, far, masks))
-        signals, by_signals = curves.signals(positions, contact)
+        signals, differentiate_signals = curves.signals(positions, contact)
         responses = per_signal * signals
-        where = positions, presses.step, presses.free
-        errors, by_responses = objective.expected_error(responses, *where, masks, scatter, weights)
+        errors, error_gradients = objective.expected_error(
+            responses, positions, presses.step, presses.free, masks, scatter, weights
+        )
 
-        def differentiate(by_errors: Array) -> Array:
-            by_response = np.tensordot(by_errors, by_responses, axes=1)
-            by_lengths = (by_response * responses).sum(axis=1) / length
-            return by_signals(by_response * per_signal) - by_lengths[:, None] * by_length
+        def differentiate(grad_errors: Array) -> Array:
+            grad_responses = np.tensordot(grad_errors, error_gradients, axes=1)
+            grad_lengths = (
+                -(grad_responses * responses).sum(axis=1) / length
+            )  # responses are proportional to 1 / length
+            return differentiate_signals(grad_responses * per_signal) + grad_lengths[:, None] * grad_length
 
         return errors, differentiate

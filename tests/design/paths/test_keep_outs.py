@@ -88,7 +88,7 @@ def test_keep_out_penalty_vanishes_with_clearance_and_has_its_gradient():
     step[:, [0, -1]] = 0
     ahead, behind = (sum(penalty(pad, size, cross + sign * step).values.values()) for sign in (1, -1))
     assert penalty(pad, size).values["keep_out_mm"] > 0.01
-    assert (ahead - behind) / 2 == pytest.approx((penalty(pad, size).by_across * step).sum(), rel=1e-3)
+    assert (ahead - behind) / 2 == pytest.approx((penalty(pad, size).grad_across * step).sum(), rel=1e-3)
 
 
 def test_straight_paths_pass_keep_outs_within_the_rules():
