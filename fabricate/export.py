@@ -1,7 +1,7 @@
-"""Building a mould and writing its files: meshes, CAD, drawings, programs, laying page and fabrication document.
+"""Building a mould and writing its files: meshes, CAD, drawings, G-code, laying page and fabrication document.
 
 The same inputs give the same bytes. Everything is built and checked before the first file is written, and the files
-appear together or not at all. A new export format is a line in `FORMATS`, and its writer.
+appear together or not at all. A new export format needs a writer and a line in `FORMATS`.
 """
 
 import logging
@@ -54,7 +54,7 @@ FORMAT = "padforge-fabrication/1"
 
 
 class PrintedBody(NamedTuple):
-    """A body to print, with its mesh: vertices (n, 3), mm, in the precision of an STL, and triangles (m, 3)."""
+    """A body to print, with its mesh: vertices (n, 3), mm, in single precision, and triangles (m, 3)."""
 
     name: str
     body: Body
@@ -65,12 +65,12 @@ class PrintedBody(NamedTuple):
 
 @dataclass(frozen=True)
 class Fabrication:
-    """All that the files of a mould are written from; toolpath and CAD models are built on first use.
+    """The contents of a mould's files; toolpath and CAD models are built on first use.
 
     Attributes:
-        plan: of the finished pad.
-        bodies: to print, the mould first.
-        findings: of all checks so far.
+        plan: plan of the finished pad.
+        bodies: bodies to print, the mould first.
+        findings: results of the checks so far.
     """
 
     plan: Plan
@@ -85,7 +85,7 @@ class Fabrication:
 
     @cached_property
     def cad_parts(self) -> "dict[str, list[CadPart]]":
-        """The CAD models of the bodies: their parts, by the name of the body."""
+        """The parts of the CAD models, by the name of the body."""
         from padforge.fabricate.cad.model import build_parts
 
         with profiling.stage("CAD solids"):
@@ -94,27 +94,27 @@ class Fabrication:
 
 @dataclass(frozen=True, kw_only=True)
 class Build:
-    """A mould that was written: all that a lab needs to print, cast, cut and place fibres.
+    """A mould that was written, with everything that a lab needs to print it, to cast, and to cut and place fibres.
 
     Attributes:
         files: names of the exported files.
-        size_mm: of the mould.
-        sizes: of tray, cavity and pad, mm.
-        mould_volume_ml: of plastic.
-        silicone_volume_ml: to fill the mould.
-        findings: of all checks.
-        silicone: to mix.
-        adhesive: volume of the tracks that it seals, by step of laying.
+        size_mm: size of the mould along x, y and z.
+        sizes: sizes of tray, cavity and pad, mm.
+        mould_volume_ml: volume of plastic.
+        silicone_volume_ml: volume of silicone that fills the mould.
+        findings: results of all checks.
+        silicone: material and amounts to mix.
+        adhesive: volume of adhesive that seals the tracks, by step of laying.
         order: amounts to order, and estimated hours of work.
         fibre: material of the fibres.
         fibres: one entry per fibre, in the order of their numbers.
         laying_order: numbers of the fibres laid in each step.
-        crossings: all of them, with the thickness of silicone between the fibres.
+        crossings: all crossings, with the thickness of silicone between the fibres.
         common_tracks: stretches of tracks over deeper ones.
-        exits: fibres along the side of their leads; None unless all leave the pad there.
-        frame: of the pad on the bed; None without a holder.
-        settings: that the files depend on.
-        provenance: of the files.
+        exits: fibres along the side of the leads; None unless all leads are on one side.
+        frame: frame of the pad on the bed; None without a holder.
+        settings: settings that the files depend on.
+        provenance: provenance of the files.
         sha256: digests of the files.
     """
 
@@ -145,7 +145,7 @@ class Build:
 
 
 def _write_utf8(path: Path, text: str) -> None:
-    path.write_bytes(text.encode("utf-8"))  # line ends as they are: the bytes do not depend on the system
+    path.write_bytes(text.encode("utf-8"))  # `write_text` would convert line ends on Windows
 
 
 def _write_body_3mf(fabrication: Fabrication, body: PrintedBody, path: Path) -> None:
@@ -168,7 +168,7 @@ def _write_cad(fabrication: Fabrication, path: Path) -> None:
 
 
 def _describe_cad(fabrication: Fabrication) -> Finding:
-    """Build all CAD solids and state how near they are to the mesh.
+    """Build all CAD solids and return the finding on their deviation from the mesh.
 
     Raises:
         InputError: a CAD solid is not valid, or differs from its mesh.
@@ -177,10 +177,10 @@ def _describe_cad(fabrication: Fabrication) -> Finding:
 
     parts = [part for parts in fabrication.cad_parts.values() for part in parts]
     deviation = max(part.deviation for part in parts)
+    n_solids, fit_um = sum(len(part.shape.solids()) for part in parts), 1000 * max(part.fit_mm for part in parts)
     message = (
-        f"{sum(len(part.shape.solids()) for part in parts)} solids, their volumes within {100 * deviation:.3f} % of the"
+        f"{n_solids} solids, their volumes within {100 * deviation:.3f} % of the mesh's, curves within {fit_um:g} µm"
     )
-    message += f" mesh's, curves within {1000 * max(part.fit_mm for part in parts):g} µm"
     return check_result("cad_solid", True, round(deviation, 6), MAX_DEVIATION, message)
 
 
@@ -188,7 +188,7 @@ FORMATS: dict[str, Mapping[str, Callable[..., None]]] = {
     "stl": {"*.stl": lambda _, body, path: write_stl(path, body.vertices, body.triangles)},
     "3mf": {"*.3mf": _write_body_3mf},
     "step": {"mould.step": _write_cad},
-    # drawings and pictures show the tray, compensated for shrinkage
+    # Drawings and pictures show the tray, which is compensated for shrinkage.
     "svg": {"tracks.svg": lambda f, path: _write_utf8(path, tracks_svg(f.plan.shrinkage_compensated))},
     "dxf": {"tracks.dxf": lambda f, path: _write_utf8(path, tracks_dxf(f.plan.shrinkage_compensated))},
     "png": {
@@ -200,11 +200,11 @@ FORMATS: dict[str, Mapping[str, Callable[..., None]]] = {
         "toolpath.svg": lambda f, path: draw_toolpath(f.plan, f.toolpath, path),
     },
 }
-"""Writers of the files of every format, called with the fabrication, the body where the name has "*", and the path."""
+"""Writers of the files of every format, called with the fabrication, the body if the name has "*", and the path."""
 
 
 def require_formats(formats: Sequence[str]) -> None:
-    """Raise InputError for a format that is none of `FORMATS`."""
+    """Raise InputError for a format that is not in `FORMATS`."""
     for name in check_type("formats", formats, Sequence):
         if not isinstance(name, str) or name not in FORMATS:
             raise InputError(f"formats: got {short_repr(name)}, allowed are {', '.join(FORMATS)}")
@@ -217,29 +217,29 @@ def build(
     settings: FabricationSettings = DEFAULTS,
     inputs: Sequence[Path] = (),
 ) -> Build:
-    """Build the mould of a pad and write it, with the further bodies that the settings ask for.
+    """Build the mould of a pad, and the further bodies of the settings, and write their files.
 
-    Files of an earlier mould in `out` that are not overwritten are deleted, unless they were changed since.
+    Files of an earlier mould in `out` that are not overwritten are deleted, unless they have changed since.
 
     Args:
-        pad: the fibres.
+        pad: morphology of the pad.
         out: folder for the files; created if missing.
-        formats: which of `FORMATS` to write; `fabrication.json` and `laying.md` always are.
+        formats: formats, of `FORMATS`, to write besides `fabrication.json` and `laying.md`.
         settings: tray, ridges, printer, fibre, rules and dispenser.
-        inputs: files the work came from, for the provenance.
+        inputs: input files, for the provenance.
 
     Returns:
-        What `fabrication.json` holds of the mould.
+        The contents of `fabrication.json`.
 
     Raises:
-        InputError: an unknown format, an input that is no file, settings that contradict each other or refuse this
-            pad, a mould that is no closed solid, or files that cannot be written; `out` is unchanged then.
+        InputError: a format is unknown, an input is not a file, settings contradict each other or do not allow this
+            pad, a body is not a closed solid, or files cannot be written; `out` is unchanged then.
     """
     out = check_path("out", out)
     require_formats(formats)
     inputs = [check_file(check_path("inputs", path)) for path in check_type("inputs", inputs, Sequence)]
     packages = ("shapely", "manifold3d", "trimesh", *(["build123d"] if "step" in formats else []))
-    origin = provenance("fabricate", inputs=inputs, packages=packages)  # now: the files may change within minutes
+    origin = provenance("fabricate", inputs=inputs, packages=packages)  # before inputs can change
     profiling.add_count("formats", len(set(formats)), len(FORMATS))
     with profiling.stage("mesh"):
         plan = Plan(pad, settings)
@@ -263,11 +263,7 @@ def build(
 
 
 def _check_bodies(plan: Plan, bodies: Sequence[PrintedBody]) -> list[Finding]:
-    """Check the mould, and that every body is a closed solid.
-
-    Raises:
-        InputError: a body is no closed solid.
-    """
+    """Check the mould; raise InputError if a body is not a closed solid."""
     mould, *others = bodies
     by_body = [check_triangles(mould.vertices, mould.triangles, plan.settings.printer, genus=0, has_plan=True)]
     for body in others:
@@ -282,7 +278,7 @@ def _check_bodies(plan: Plan, bodies: Sequence[PrintedBody]) -> list[Finding]:
 def _choose_writers(
     fabrication: Fabrication, formats: Sequence[Mapping[str, Callable[..., None]]]
 ) -> dict[str, Callable[[Path], None]]:
-    """Return the writer of each file, those of the bodies first."""
+    """Return the writers by the name of the file, those of the bodies first."""
     files = [item for export in formats for item in export.items()]
     by_body = {
         file.replace("*", body.name): partial(write, fabrication, body)
@@ -293,7 +289,7 @@ def _choose_writers(
 
 
 def _compile_build(fabrication: Fabrication, files: list[str], origin: Mapping[str, Any]) -> Build:
-    """Compile all that is said of a mould, but for the digests of its files."""
+    """Return the fabrication document, without the digests of its files."""
     plan, settings, mould = fabrication.plan, fabrication.plan.settings, fabrication.bodies[0]
     rim = settings.mould.floor_mm + plan.shrinkage_compensated.silicone_mm
     pins_mm3 = mould.mesh.trim_by_plane((0, 0, 1), rim).volume()
@@ -323,7 +319,7 @@ def _compile_build(fabrication: Fabrication, files: list[str], origin: Mapping[s
 
 
 def _write_files(out: Path, writers: Mapping[str, Callable[[Path], None]], result: Build) -> Build:
-    """Write the files of a mould and their digests at once, and delete those of an earlier one."""
+    """Write the files of a mould and their digests atomically, and delete those of an earlier mould."""
     try:
         earlier = read_json(out / "fabrication.json", FORMAT).get("sha256")
     except InputError:

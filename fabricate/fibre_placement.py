@@ -16,25 +16,22 @@ from padforge.fabricate.settings import DispenserSettings
 
 TOLERANCE_MM = 0.005
 """Maximum distance of a toolpath from its curve: a tenth of a fine gantry's repeatability."""
-_FLAT_SHARE, _SIMPLIFY_SHARE = 0.2, 0.8
-"""Shares of the tolerance for flattening and simplification, which removes most points."""
-_MAX_TURN = 0.02
-"""Maximum turn between two samples of the heading, radians."""
-_STRAIGHT = 1e-6
-"""Turn below which a stretch is straight, radians."""
-_FEED_STEPS = 10
-"""Feeds are multiples of a tenth of the maximum, rounded down, which keeps programs readable."""
+_FLAT_SHARE = 0.2  # fraction of the tolerance for flattening
+_SIMPLIFY_SHARE = 0.8  # fraction of the tolerance for simplification, which removes most points
+_MAX_TURN = 0.02  # between two samples of the heading, radians
+_STRAIGHT = 1e-6  # turn below which a segment is straight, radians
+_FEED_STEPS = 10  # feeds are rounded down to tenths of the maximum, which keeps programs readable
 _ROUNDING_MM = 1e-9
 
 
 @dataclass(frozen=True)
 class Stroke:
-    """The toolpath of one fibre, from the end of its first lead to that of the other.
+    """The toolpath of one fibre, from the end of its first lead to the end of the second.
 
     Attributes:
-        fibre: index among all, 0..F-1.
+        fibre: index of the fibre, 0..F-1.
         positions_mm: corners of the path in the frame of the pad turned over; shape (n, 2).
-        z_mm: height of the needle's mouth, negative within the track.
+        z_mm: height of the needle's tip, negative within the track.
         feeds_mm_s: speed from each corner to the next; shape (n - 1,).
     """
 
@@ -58,9 +55,12 @@ class Step:
 
 
 def plan_toolpath(plan: Plan, diameter_mm: float, max_strain: float = math.inf) -> list[Step]:
-    """Compute the toolpath of every fibre in the order of the laying page, the deepest layer first.
+    """Compute the toolpath of every fibre, layer by layer from the deepest.
 
-    `max_strain` is the elongation that the fibre bears, 1 for twice its length; inf if unknown.
+    Args:
+        plan: plan of the finished pad.
+        diameter_mm: diameter of the fibre.
+        max_strain: maximum strain of the fibre; inf if unknown.
     """
     lead_mm = plan.settings.mould.lead_mm
     paths, traces = plan.paths(_FLAT_SHARE * TOLERANCE_MM, lead_mm), plan.trace(_MAX_TURN, lead_mm)
@@ -74,9 +74,9 @@ def plan_toolpath(plan: Plan, diameter_mm: float, max_strain: float = math.inf) 
             positions, is_corner = _split_ends(shapely.get_coordinates(simplified), diameter_mm)
             radii = _min_bend_radii(*traces[fibre], positions, diameter_mm)
             feeds = _compute_feeds(plan.settings.dispenser, radii, diameter_mm, max_strain)
-            needed = is_corner | np.concatenate([[True], np.diff(feeds) != 0, [True]])
+            is_needed = is_corner | np.concatenate([[True], np.diff(feeds) != 0, [True]])
             z = round(diameter_mm - layer.depth_mm, 9)
-            strokes.append(Stroke(fibre, mirror_x(positions[needed]), z, feeds[needed[:-1]]))
+            strokes.append(Stroke(fibre, mirror_x(positions[is_needed]), z, feeds[is_needed[:-1]]))
         steps.append(Step(layer, tuple(strokes)))
     return steps
 
@@ -87,7 +87,10 @@ def mirror_x(positions_mm: Array) -> Array:
 
 
 def _split_ends(positions: Array, end_mm: float) -> tuple[Array, NDArray[np.bool_]]:
-    """Split the ends off long segments, so that these are slow only next to a bend; return which points are corners."""
+    """Split the ends off long segments, so that only the ends are slow next to a bend.
+
+    Returns the points (m, 2), and which of them (m,) are original corners.
+    """
     steps = np.diff(positions, axis=0)
     length = np.hypot(*steps.T)
     long = np.flatnonzero(length > 4 * end_mm)
@@ -101,8 +104,8 @@ def _split_ends(positions: Array, end_mm: float) -> tuple[Array, NDArray[np.bool
 def _min_bend_radii(points: Array, headings: Array, positions: Array, diameter_mm: float) -> Array:
     """Compute the minimum bend radius (n - 1,), mm, between successive positions (n, 2) along a trace.
 
-    A fibre bends over no less than its diameter: a radius is that length divided by the angle it turns there. A PCHIP
-    curve is only C1, and the slope of its ends is not that of the leads: pointwise curvature is meaningless.
+    The radius is the diameter of the fibre, as an arc length, divided by the turn of the heading over that length.
+    Pointwise curvature would be meaningless: a PCHIP curve is only C1, and its end slopes differ from the leads'.
     """
     arc = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
     turn = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(headings)))])
@@ -116,25 +119,25 @@ def _min_bend_radii(points: Array, headings: Array, positions: Array, diameter_m
 
 
 def _compute_feeds(dispenser: DispenserSettings, radii_mm: Array, diameter_mm: float, max_strain: float) -> Array:
-    """Compute the speed (n,) in bends of radii (n,), mm/s: the limit of the machine or of the fibre, the slower.
+    """Compute the speeds (n,), mm/s, in bends of radii (n,), limited by the machine and by the fibre.
 
-    In a bend of radius r the machine needs the acceleration v^2 / r; and the outside of a fibre is stretched by
-    d / 2r, which leaves less of its maximum strain for the pull of the feed, which grows with the speed.
+    In a bend of radius r the machine needs the acceleration v^2 / r. The outside of a fibre of diameter d is strained
+    by d / 2r there, which reduces the strain available for the pull of the feed, assumed proportional to the speed.
     """
     max_feed = dispenser.feed_mm_s
-    by_machine = np.sqrt(dispenser.acceleration_mm_s2 * radii_mm)
-    by_fibre = max_feed * (1 - diameter_mm / (2 * radii_mm * max_strain))
-    tenths = np.floor(np.minimum(by_machine, by_fibre) / max_feed * _FEED_STEPS + 1e-6)
+    machine_limit = np.sqrt(dispenser.acceleration_mm_s2 * radii_mm)
+    fibre_limit = max_feed * (1 - diameter_mm / (2 * radii_mm * max_strain))
+    tenths = np.floor(np.minimum(machine_limit, fibre_limit) / max_feed * _FEED_STEPS + 1e-6)
     return max_feed * np.clip(tenths, 1, _FEED_STEPS) / _FEED_STEPS
 
 
 def check_toolpath(plan: Plan, steps: Sequence[Step]) -> list[Finding]:
-    """Check a toolpath against the dispenser's box and the width of the tracks, positions in the frame of the plan."""
+    """Check a toolpath against the dispenser's box and the width of the tracks; positions are in the plan's frame."""
     return [_check_box(plan, steps), _check_tip(plan, steps)]
 
 
 def _check_box(plan: Plan, steps: Sequence[Step]) -> Finding:
-    """Check all corners: paths are straight between them, and a box is convex."""
+    """Check that all corners lie in the dispenser's box; then so do the straight segments, since a box is convex."""
     dispenser = plan.settings.dispenser
     low, high = np.reshape(dispenser.box_mm, (3, 2)).T
     origin, height = (*dispenser.origin_mm, 0), dispenser.travel_height_mm
@@ -158,7 +161,7 @@ def _check_box(plan: Plan, steps: Sequence[Step]) -> Finding:
 
 
 def _check_tip(plan: Plan, steps: Sequence[Step]) -> Finding:
-    """Check that the needle fits between the walls of the track wherever it is below the surface."""
+    """Check that the needle, where it is below the surface, fits between the walls of the track."""
     tip = plan.settings.dispenser.tip_mm
     widths, positions = [], []
     for step in steps:
@@ -175,16 +178,17 @@ def _check_tip(plan: Plan, steps: Sequence[Step]) -> Finding:
 
 
 def gcode(plan: Plan, steps: Sequence[Step]) -> str:
-    """Write the program of a toolpath: every fibre is fastened, placed and cut, every layer sealed before the next.
+    """Return the G-code of a toolpath, for Marlin and GRBL.
 
-    Coordinates are the machine's, with the pad's middle at the dispenser's origin. Both Marlin and GRBL read it. M0
-    waits until all moves are done, then for the operator. There is no G0: GRBL moves at the machine's maximum speed
-    then, whatever the feed, and hands are near. Messages have no brackets, and no number after an s or a p: firmwares
-    read the former as the end of a comment, the latter as a time to wait.
+    The operator fastens and cuts every fibre, and seals every layer before the next, during M0, which waits until all
+    moves have ended. Coordinates are the machine's; the pad's middle is at the dispenser's origin. The program has no
+    G0, which GRBL executes at maximum speed while hands are near. Messages have no brackets, which would end the
+    comment, and no number after an s or a p, which firmwares read as a time to wait.
     """
     dispenser = plan.settings.dispenser
     (x, y), height = dispenser.origin_mm, dispenser.travel_height_mm
-    lines = [
+    program = _Program(dispenser.origin_mm)
+    program.lines += [
         *(f"; {line}" for line in _summary_lines(plan, steps)),
         f"; the pad's middle is at X{_format_mm(x)} Y{_format_mm(y)};"
         " set zero of z by G92 Z0 (Marlin), G10 L20 P1 Z0 (GRBL)",
@@ -193,34 +197,44 @@ def gcode(plan: Plan, steps: Sequence[Step]) -> str:
         "M0 (needle over the pad, zero of z is set)",
         f"G1 Z{_format_mm(height)} F{_format_feed(dispenser.travel_mm_s)}",
     ]
-    words: dict[str, str] = {}
-
-    def move_to(u: float, v: float, z: float, speed_mm_s: float) -> None:
-        axes = {"X": _format_mm(x + u), "Y": _format_mm(y + v), "Z": _format_mm(z)}
-        target = axes | {"F": _format_feed(speed_mm_s)}
-        changed = [letter + number for letter, number in target.items() if words.get(letter) != number]
-        if any(word[0] != "F" for word in changed):  # else the needle is there already
-            lines.append(" ".join(["G1", *changed]))
-            words.update(target)
-
     for number, step in enumerate(steps, 1):
         for stroke in step.strokes:
             name = f"fibre {stroke.fibre + 1}, {fibre_name(plan, stroke.fibre)}"
             (start_x, start_y), *corners = stroke.positions_mm.tolist()
             end_x, end_y = corners[-1]
-            move_to(start_x, start_y, height, dispenser.travel_mm_s)
-            move_to(start_x, start_y, stroke.z_mm, dispenser.feed_mm_s)
-            lines.append(f"M0 ({name}: fasten its end under the needle)")
+            program.move_to(start_x, start_y, height, dispenser.travel_mm_s)
+            program.move_to(start_x, start_y, stroke.z_mm, dispenser.feed_mm_s)
+            program.lines.append(f"M0 ({name}: fasten its end under the needle)")
             for (u, v), feed in zip(corners, stroke.feeds_mm_s.tolist(), strict=True):
-                move_to(u, v, stroke.z_mm, feed)
-            lines.append(f"M0 ({name}: cut it at the needle)")
-            move_to(end_x, end_y, height, dispenser.travel_mm_s)
-        lines.append(f"M0 (layer {number} of {len(steps)}, {step.layer.depth_mm:.3g} mm deep: seal it and let it cure)")
-    return "\n".join([*lines, ""])
+                program.move_to(u, v, stroke.z_mm, feed)
+            program.lines.append(f"M0 ({name}: cut it at the needle)")
+            program.move_to(end_x, end_y, height, dispenser.travel_mm_s)
+        depth = f"{step.layer.depth_mm:.3g} mm deep"
+        program.lines.append(f"M0 (layer {number} of {len(steps)}, {depth}: seal it and let it cure)")
+    return "\n".join([*program.lines, ""])
+
+
+class _Program:
+    """Lines of G-code; moves list only the coordinates and the feed that change."""
+
+    def __init__(self, origin_mm: tuple[float, float]) -> None:
+        self.lines: list[str] = []
+        self._origin_mm = origin_mm
+        self._words: dict[str, str] = {}  # of the last move
+
+    def move_to(self, x_mm: float, y_mm: float, z_mm: float, speed_mm_s: float) -> None:
+        """Add a straight move to a position in the pad's frame, unless the needle is there already."""
+        x0, y0 = self._origin_mm
+        axes = {"X": _format_mm(x0 + x_mm), "Y": _format_mm(y0 + y_mm), "Z": _format_mm(z_mm)}
+        target = axes | {"F": _format_feed(speed_mm_s)}
+        changed = [letter + number for letter, number in target.items() if self._words.get(letter) != number]
+        if any(word[0] != "F" for word in changed):
+            self.lines.append(" ".join(["G1", *changed]))
+            self._words = target
 
 
 def _summary_lines(plan: Plan, steps: Sequence[Step]) -> Iterator[str]:
-    """Return the comments at the head of a program, for the operator."""
+    """Yield the comments at the head of a program, for the operator."""
     strokes = [stroke for step in steps for stroke in step.strokes]
     length = sum(float(stroke.steps_mm.sum()) for stroke in strokes)
     seconds = sum(float((stroke.steps_mm / stroke.feeds_mm_s).sum()) for stroke in strokes)
@@ -239,7 +253,7 @@ def _summary_lines(plan: Plan, steps: Sequence[Step]) -> Iterator[str]:
 
 
 def _format_mm(value_mm: float) -> str:
-    """Format a coordinate to a micrometre and without -0."""
+    """Format a coordinate, rounded to a micrometre and never -0."""
     return f"{round(value_mm, 3) + 0.0:.10g}"
 
 

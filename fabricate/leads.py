@@ -1,9 +1,9 @@
 """Leads of fibres, from their ends to the edge of the silicone: straight on, or all to one side.
 
 A pad that is wired to one connector has both ends of every fibre on its lower edge. Horizontals turn down beside the
-pad, the lowest next to it. The upper ends of verticals turn to the left or the right above it, half of them each, and
-go down outside of the horizontals. So they are nested, and no two cross: a lead is its neighbour offset away from the
-pad, along every piece of its path, by the distance between leads or by a pitch.
+pad, the lowest next to it. The upper ends of verticals turn to the left or to the right above the pad, half of them
+each, and go down outside of the horizontals. The leads are nested and do not cross: each is offset from its neighbour
+by the distance between leads or by a pitch.
 """
 
 from collections.abc import Sequence
@@ -19,8 +19,7 @@ from padforge.design.paths.curves import cubic, quadratic
 from padforge.design.settings import Layout
 from padforge.fabricate.settings import WELL_SLOT_MM, FabricationSettings
 
-_HANDLE = 4 / 3 * np.tan(np.pi / 16)
-"""Handles of a cubic for an eighth of a circle of radius 1, which it is within 4.3e-6 of."""
+_HANDLE = 4 / 3 * np.tan(np.pi / 16)  # of a cubic Bezier for an eighth of the unit circle; its error is 4.3e-6
 _NO_SPANS = np.empty((0, 4, 2))
 
 
@@ -30,9 +29,9 @@ class Lead:
 
     Attributes:
         end_mm: the fibre's end; shape (2,).
-        spans: cubic Bezier curves from there on, mm, none for a straight lead; shape (n, 4, 2).
-        outward: unit vector along an axis, the direction of the straight rest; shape (2,).
-        run_mm: length of the straight rest up to the edge.
+        spans: cubic Bezier curves from the end, mm, none for a straight lead; shape (n, 4, 2).
+        outward: direction of the straight run to the edge, a unit vector along an axis; shape (2,).
+        run_mm: length of the straight run.
     """
 
     end_mm: Array
@@ -42,7 +41,7 @@ class Lead:
 
     @property
     def turned_mm(self) -> Array:
-        """Start of the straight rest; shape (2,)."""
+        """Start of the straight run; shape (2,)."""
         return self.spans[-1, -1] if len(self.spans) else self.end_mm
 
     @property
@@ -51,20 +50,20 @@ class Lead:
         return int(np.abs(self.outward).argmax())
 
     def point_past_edge(self, *past_mm: float) -> Array:
-        """Return the point (2,) on the lead's extension past the edge by the sum of the distances `past_mm`."""
+        """Return the point (2,) on the lead's extension, at the sum of the distances `past_mm` past the edge."""
         return self.turned_mm + sum(past_mm, self.run_mm) * self.outward
 
     def flatten_bends(self, tolerance_mm: float) -> Array:
         """Flatten the bends to corners (k, 2) after the fibre's end, within a tolerance."""
         points = [np.empty((0, 2))]
         for span in self.spans:
-            second = np.linalg.norm(np.diff(span, 2, axis=0), axis=1).max()
-            steps = max(1, int(np.ceil(np.sqrt(0.75 * second / tolerance_mm))))  # Wang's bound, as for the fibres
-            points.append(cubic(span, np.arange(1, steps + 1) / steps))
+            curvature = np.linalg.norm(np.diff(span, 2, axis=0), axis=1).max()
+            n_steps = max(1, int(np.ceil(np.sqrt(0.75 * curvature / tolerance_mm))))  # Wang's bound
+            points.append(cubic(span, np.arange(1, n_steps + 1) / n_steps))
         return np.vstack(points)
 
     def trace(self, step: float, past_mm: float) -> tuple[Array, Array]:
-        """Sample points (n, 2), mm, and headings (n,), radians, at most `step` apart, up to `past_mm` past the edge."""
+        """Sample points (n, 2), mm, and headings (n,), at most `step` radians apart, up to `past_mm` past the edge."""
         points, directions = [], []
         for span in self.spans:
             sides = np.diff(span, axis=0)
@@ -81,7 +80,7 @@ class Lead:
         """Length up to the edge, by Gauss-Legendre quadrature."""
         nodes, weights = np.polynomial.legendre.leggauss(8)
         u = ((nodes + 1) / 2)[:, None]
-        sides = 3 * np.diff(self.spans, axis=1)[:, :, None]
+        sides = 3 * np.diff(self.spans, axis=1)[:, :, None]  # control points of the derivatives
         speed = sides[:, 0] * (1 - u) ** 2 + 2 * sides[:, 1] * u * (1 - u) + sides[:, 2] * u**2
         return float((np.linalg.norm(speed, axis=-1) @ (weights / 2)).sum()) + self.run_mm
 
@@ -95,7 +94,7 @@ class Leads:
     """The leads of all fibres, and the rectangle of silicone around them.
 
     Attributes:
-        pairs: leads of the start and of the other end of each fibre.
+        pairs: leads of the start and of the end of each fibre.
         bounds_mm: x_min, y_min, x_max and y_max of the silicone.
     """
 
@@ -103,11 +102,11 @@ class Leads:
     bounds_mm: tuple[float, float, float, float]
 
     def edge_mm(self, lead: Lead) -> float:
-        """Return the coordinate, along the lead's axis, of the edge that it comes to."""
+        """Return the coordinate, along the lead's axis, of the edge that it reaches."""
         return self.bounds_mm[lead.axis + (2 if lead.outward[lead.axis] > 0 else 0)]
 
     def box_at_edge(self, lead: Lead, half_mm: float, start_mm: float, stop_mm: float) -> shapely.Polygon:
-        """Return a box about a lead, `half_mm` to either side, between two distances outwards from its edge."""
+        """Return a box around a lead, `half_mm` to either side, between two distances outwards from its edge."""
         corners, out, edge = np.empty((2, 2)), lead.outward[lead.axis], self.edge_mm(lead)
         corners[:, lead.axis] = edge + out * start_mm, edge + out * stop_mm
         corners[:, 1 - lead.axis] = lead.turned_mm[1 - lead.axis] + np.array([-half_mm, half_mm])
@@ -121,11 +120,11 @@ class Leads:
 
 
 def straight_leads(ends_mm: Array, layout: Layout, border_mm: float) -> Leads:
-    """Compute leads that go straight on to the pad's four edges; fibre ends of shape (F, 2, 2), mm."""
+    """Compute straight leads to the pad's four edges from fibre ends (F, 2, 2), mm."""
     pairs = []
     for fibre, (start, end) in enumerate(ends_mm):
-        along = np.eye(2)[layout.family(fibre)]
-        pairs.append((Lead(start, _NO_SPANS, -along, border_mm), Lead(end, _NO_SPANS, along, border_mm)))
+        direction = np.eye(2)[layout.family(fibre)]
+        pairs.append((Lead(start, _NO_SPANS, -direction, border_mm), Lead(end, _NO_SPANS, direction, border_mm)))
     x, y = (side / 2 + border_mm for side in layout.size_mm)
     return Leads(tuple(pairs), (-x, -y, x, y))
 
@@ -133,11 +132,16 @@ def straight_leads(ends_mm: Array, layout: Layout, border_mm: float) -> Leads:
 def lead_spacing(
     settings: FabricationSettings, max_height_mm: float, flare_mm: float
 ) -> tuple[float, float, float, float]:
-    """Compute the distances of leads to one side, from the tallest ridge's height and the walls' outward lean.
+    """Compute the dimensions of leads to one side.
+
+    Args:
+        settings: mould, rules, fibre and printer.
+        max_height_mm: height of the tallest ridge.
+        flare_mm: outward lean of the walls.
 
     Returns:
-        Width of the silicone around the pad in which leads are straight, distance between the centre lines of
-        neighbours, radius of their bends, and distance from the outermost centre line to the silicone's edge; mm.
+        Width of the border in which leads are straight, distance between neighbouring centre lines, radius of the
+        bends, and distance from the outermost centre line to the silicone's edge; mm.
     """
     mould, radius = settings.mould, settings.min_bend_radius_mm
     foot = mould.ridge_width_mm + 2 * max_height_mm * settings.ridge_slope
@@ -146,7 +150,7 @@ def lead_spacing(
         width = max(mould.exit_width_mm, WELL_SLOT_MM if mould.conductive else 0)
         pitch = max(pitch, width + 2 * flare_mm + 2 * settings.printer.line_mm)
     edge = max(pitch / 2, foot / 2 + mould.min_silicone_mm)
-    # a fibre may meet its lead at a corner, which the rule for bends allows only within a straight stretch
+    # A fibre may meet its lead at a corner, which the rule for bends allows only within a straight run.
     border = max(mould.border_mm, radius / 2)
     return border, pitch, max(radius, (foot + mould.min_silicone_mm) / 2), edge
 
@@ -170,9 +174,9 @@ def one_side_leads(ends_mm: Array, layout: Layout, spacing: tuple[float, float, 
     for fibre, (start, end) in enumerate(ends_mm):
         if layout.family(fibre):
             number = fibre - horizontals
-            negative_x = 2 * number < verticals
-            away = (number if negative_x else verticals - 1 - number) * gap
-            corners = [(end[0], top + away), ((-1 if negative_x else 1) * (outer + away), top + away)]
+            is_left = 2 * number < verticals
+            offset = (number if is_left else verticals - 1 - number) * gap
+            corners = [(end[0], top + offset), ((-1 if is_left else 1) * (outer + offset), top + offset)]
             pairs.append((_down(start, [], y_min, radius), _down(end, corners, y_min, radius)))
         else:
             x = inner + fibre * gap
@@ -184,28 +188,28 @@ def one_side_leads(ends_mm: Array, layout: Layout, spacing: tuple[float, float, 
 
 
 def _down(end_mm: Array, corners: Sequence[tuple[float, float]], y_min: float, radius: float) -> Lead:
-    """Return the lead from a fibre's end by way of rounded corners, and down from the last one to the edge."""
+    """Return the lead from a fibre's end along rounded corners, and down from the last one to the edge."""
     spans: list[Array] = []
     position = end_mm
     stops = [np.array(corner) for corner in corners]
     stops += [np.array([stops[-1][0], y_min])] if stops else []
-    for corner, after in pairwise(stops):
-        ahead, onward = (side / np.abs(side).max() for side in (corner - position, after - corner))
-        start = corner - radius * ahead
+    for corner, following in pairwise(stops):
+        incoming, outgoing = (side / np.abs(side).max() for side in (corner - position, following - corner))
+        start = corner - radius * incoming
         if np.abs(start - position).max() > 0:
             spans.append(position + np.arange(4)[:, None] / 3 * (start - position))
             spans[-1][-1] = start
-        spans += _quarter_circle(start, ahead, onward, radius)
+        spans += _quarter_circle(start, incoming, outgoing, radius)
         position = spans[-1][-1]
     return Lead(end_mm, np.array(spans) if spans else _NO_SPANS, np.array([0.0, -1.0]), float(position[1] - y_min))
 
 
-def _quarter_circle(start: Array, ahead: Array, onward: Array, radius: float) -> list[Array]:
-    """Return two cubics for the quarter of a circle from the direction `ahead` into `onward`."""
-    centre, half = start + radius * onward, np.sqrt(0.5)
-    middle, slanted = centre + radius * half * (ahead - onward), half * (ahead + onward)
-    end, handle = centre + radius * ahead, _HANDLE * radius
+def _quarter_circle(start: Array, incoming: Array, outgoing: Array, radius: float) -> list[Array]:
+    """Return two cubic Bezier curves for a quarter circle from one direction (2,) to another."""
+    centre, half = start + radius * outgoing, np.sqrt(0.5)
+    middle, diagonal = centre + radius * half * (incoming - outgoing), half * (incoming + outgoing)
+    end, handle = centre + radius * incoming, _HANDLE * radius
     return [
-        np.array([start, start + handle * ahead, middle - handle * slanted, middle]),
-        np.array([middle, middle + handle * slanted, end - handle * onward, end]),
+        np.array([start, start + handle * incoming, middle - handle * diagonal, middle]),
+        np.array([middle, middle + handle * diagonal, end - handle * outgoing, end]),
     ]

@@ -1,7 +1,7 @@
-"""Materials: `[silicone]`, which a pad is cast of, `[fibre]`, which is placed in it, and the plastics of its mould.
+"""Materials: the silicone of a pad (`[silicone]`), its fibres (`[fibre]`), and the plastics of its mould.
 
-Data of silicones are from the maker's technical bulletins, at room temperature; those of the published pads from the
-paper. None is unknown, and what follows from it is omitted. A new material is one line in its table.
+Data of silicones are from the maker's technical bulletins, at room temperature; those of the published pads are from
+the paper. None means unknown. A new material is one line in its table.
 
 - Smooth-On, Ecoflex Series, technical bulletin, https://www.smooth-on.com/tb/files/ECOFLEX_SERIES_TB.pdf
 - Smooth-On, Dragon Skin Series, technical bulletin, https://www.smooth-on.com/tb/files/DRAGON_SKIN_SERIES_TB.pdf
@@ -23,16 +23,16 @@ PUBLISHED = "published"
 
 @dataclass(frozen=True)
 class Silicone:
-    """A silicone of two parts that cure once they are mixed.
+    """A two-part silicone.
 
     Attributes:
-        name: of the product.
-        density_g_per_ml: of the mix.
-        parts: A and B by mass.
-        pot_life_min: time in which the mix can be poured.
+        name: name of the product.
+        density_g_per_ml: density of the mix.
+        parts: parts A and B by mass.
+        pot_life_min: time for which the mix can be poured.
         cure_h: time until the casting can be demoulded.
         shrinkage: relative difference in length between the mould and the cured casting.
-        modulus_kpa: stress over strain at 100 % strain; None is unknown.
+        modulus_kpa: stress over strain at 100 % strain; None if unknown.
     """
 
     name: str
@@ -49,11 +49,11 @@ class Fibre:
     """A fibre for the tracks; None is unknown.
 
     Attributes:
-        name: of the material.
-        diameter_mm: of the fibre.
+        name: name of the material.
+        diameter_mm: diameter of the fibre.
         ohm_per_mm: resistance per length at rest.
         min_bend_radius_mm: minimum bend radius.
-        max_strain: maximum elongation, relative to the length.
+        max_strain: maximum strain.
     """
 
     name: str
@@ -64,9 +64,8 @@ class Fibre:
 
 
 _EQUAL = (1.0, 1.0)
-_SHRINKAGE = 0.001
-"""The bulletins say "< .001 in./in." for every grade here: the maximum."""
-_GRADES = (  # moduli are 8, 8, 10 and 12 psi, then 22, 49 and 86 psi in the bulletins
+_SHRINKAGE = 0.001  # the bulletins state "< .001 in./in." for all of these grades
+_GRADES = (  # the bulletins state moduli of 8, 8, 10 and 12 psi, then 22, 49 and 86 psi
     Silicone("Ecoflex 00-10", 1.04, _EQUAL, 30, 4, _SHRINKAGE, 55),
     Silicone("Ecoflex 00-20", 1.07, _EQUAL, 30, 4, _SHRINKAGE, 55),
     Silicone("Ecoflex 00-30", 1.07, _EQUAL, 45, 4, _SHRINKAGE, 69),
@@ -78,11 +77,11 @@ _GRADES = (  # moduli are 8, 8, 10 and 12 psi, then 22, 49 and 86 psi in the bul
     Silicone("Dragon Skin 30", 1.08, _EQUAL, 45, 16, _SHRINKAGE, 593),
 )
 SILICONES = {PUBLISHED: replace(_GRADES[1], shrinkage=0.0), **{grade.name: grade for grade in _GRADES}}
-"""Presets by name; "published": Ecoflex 00-20 in moulds of the pad's size, as the published pads were cast."""
+"""Presets by name; "published": Ecoflex 00-20 without shrinkage, as the moulds of the published pads had their size."""
 
 _CORD = Fibre("conductive rubber cord 2 mm", 2.0, ohm_per_mm=350 / 25.4, max_strain=0.5)
 FIBRES = {PUBLISHED: Fibre("carbon-black TPE", 0.3, max_strain=0.8), _CORD.name: _CORD}
-"""Presets by name; "published": from the paper, without a resistance. The cord's data are its seller's (Adafruit)."""
+"""Presets by name; "published" is from the paper, which states no resistance. The cord's data are from Adafruit."""
 
 PLASTICS = {False: ("PLA", 1.24), True: ("resin", 1.1)}
 """Common material of a filament (False) and a resin printer (True), and its density, g/ml."""
@@ -104,21 +103,20 @@ PRODUCTS = {
         "Arduino Due (12 fibres); Teensy 4.1 or ESP32 with a 74HC4067 multiplexer (16)",
     ),
 }
-"""What to order, by kind: properties, and products that have them."""
+"""Items to order, by kind: properties, and example products."""
 
 Name = Annotated[str, Field(min_length=1, max_length=100, pattern=r"^[^|\x00-\x1f]*$")]
-"""One line, and a cell of a table."""
+"""One line, which fits into a cell of a table."""
 Positive = Annotated[float, Field(gt=0, le=1e6)]
-_or_preset = BeforeValidator(as_tuple), *null_as("preset")
-"""Annotates a key that is "preset" by default, None in the model."""
+_or_preset = BeforeValidator(as_tuple), *null_as("preset")  # a key whose default is "preset", None in the model
 AnyOrPreset = Annotated[float | None, *_or_preset]
 PositiveOrPreset = Annotated[Positive | None, *_or_preset]
 
 
 class _MaterialSettings(Settings):
-    """A preset by `name`, with every other key that is set in place of the preset's.
+    """A preset by `name`; other keys override its properties.
 
-    Another name is valid if all properties that cannot be unknown are set.
+    A name without a preset is valid if all properties that cannot be unknown are set.
     """
 
     PRESETS: ClassVar[Mapping[str, Any]]
@@ -128,7 +126,7 @@ class _MaterialSettings(Settings):
     @field_validator("name")
     @classmethod
     def _normalise_name(cls, name: str) -> str:
-        """Return the preset's spelling of a name, whatever its case, spaces and hyphens."""
+        """Return the preset's spelling of a name; case, spaces and hyphens are ignored."""
         return {_simplify(preset): preset for preset in cls.PRESETS}.get(_simplify(name), name)
 
     @model_validator(mode="after")
@@ -158,7 +156,7 @@ class SiliconeSettings(_MaterialSettings):
     """`[silicone]`: the silicone of the pad, a preset of `SILICONES` with the properties that differ from it.
 
     Attributes:
-        shrinkage: the mould is larger than the pad by 1 / (1 - shrinkage), so that the pad comes out as designed.
+        shrinkage: the mould is larger than the pad by 1 / (1 - shrinkage), so that the pad has its design size.
     """
 
     PRESETS = SILICONES
@@ -219,16 +217,15 @@ class FibreSettings(_MaterialSettings):
         return self._material()
 
 
-_E24 = (10, 11, 12, 13, 15, 16, 18, 20, 22, 24, 27, 30, 33, 36, 39, 43, 47, 51, 56, 62, 68, 75, 82, 91)
-"""Resistor values of a decade at 5 % tolerance (IEC 60063)."""
+_E24 = (10, 11, 12, 13, 15, 16, 18, 20, 22, 24, 27, 30, 33, 36, 39, 43, 47, 51, 56, 62, 68, 75, 82, 91)  # IEC 60063
 
 
 def divider_ohm(fibre_ohm: float) -> float:
     """Return the fixed resistor of the E24 series for the most sensitive voltage divider with a fibre.
 
-    The divider gives U = Us F / (F + R) for a fibre R and a fixed F. A small relative change e of R changes it by
-    Us e F R / (F + R)^2, which has its maximum, Us e / 4, at F = R, and is equal for F = x R and F = R / x: the best
-    value has the ratio to R nearest to 1.
+    With a fibre R and a fixed resistor F the divider outputs U = Us F / (F + R). A small relative change e of R changes
+    U by Us e F R / (F + R)^2, which has its maximum, Us e / 4, at F = R, and is equal for F = x R and F = R / x. The
+    best value is therefore the one with the smallest |log(F / R)|.
     """
     decade = 10.0 ** (math.floor(math.log10(fibre_ohm)) - 1)
     candidates = [*(value * decade for value in _E24), 100 * decade]

@@ -25,8 +25,7 @@ _log = logging.getLogger(__name__)
 _STL_HEADER = b"padforge, mm".ljust(80)
 _STL_RECORD = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
 
-_STL_HEAD_BYTES = 84
-"""Header of a binary STL, and the number of its triangles."""
+_STL_HEAD_BYTES = 84  # header of a binary STL, and its number of triangles
 SEPARATION_MM = 1e-4
 """Distance by which coincident vertices are separated: far below what prints, far above the resolution of a float."""
 
@@ -60,11 +59,10 @@ def _extrude(prism: Prism) -> Manifold:
 
 
 def mesh_arrays(solid: Manifold) -> tuple[NDArray[np.float32], NDArray[np.uint32]]:
-    """Return vertices (n, 3), mm, in the precision of an STL, and triangles (m, 3) of vertex indices.
+    """Return vertices (n, 3), mm, in single precision, and triangles (m, 3) of vertex indices.
 
-    No two vertices are equal. Where the solid touches itself in a point or an upright line, by chance or by rounding,
-    its corners are drawn back by `SEPARATION_MM`: a reader that merges equal vertices still gets two faces at every
-    edge.
+    No two vertices are equal. If the solid touches itself in a point or a vertical line, by chance or by rounding, the
+    vertices there are moved inwards by `SEPARATION_MM`, so that a reader that merges equal vertices gets a manifold.
     """
     mesh = solid.to_mesh()
     vertices, triangles = np.array(mesh.vert_properties), np.asarray(mesh.tri_verts)
@@ -104,9 +102,15 @@ def write_stl(path: Path, vertices: np.ndarray, triangles: np.ndarray) -> None:
 
 
 def write_3mf(path: Path, vertices: np.ndarray, triangles: np.ndarray, *, name: str, title: str, material: str) -> None:
-    """Write a 3MF, mm, of one object of one material in the colour of its body: vertices (n, 3), triangles (m, 3).
+    """Write a 3MF, mm, of one object.
 
-    Coordinates have the same digits as the STL's floats; `name` is one of `BODY_COLOURS`, `title` for people.
+    Args:
+        path: file to write.
+        vertices: vertices (n, 3), written with the precision of an STL.
+        triangles: vertex indices (m, 3).
+        name: name of the body, of `BODY_COLOURS`, which states its colour.
+        title: title for people.
+        material: name of the material.
     """
     points = "".join(f'<vertex x="{x:.9g}" y="{y:.9g}" z="{z:.9g}"/>' for x, y, z in vertices.tolist())
     faces = "".join(f'<triangle v1="{a}" v2="{b}" v3="{c}"/>' for a, b, c in triangles.tolist())
@@ -127,18 +131,16 @@ def write_3mf(path: Path, vertices: np.ndarray, triangles: np.ndarray, *, name: 
         '</resources><build><item objectid="2"/></build></model>',
     }
     content = BytesIO()
-    archive = zipfile.ZipFile(content, "w")  # no `with`: closing after a Ctrl-C in mid-entry would raise ValueError
+    archive = zipfile.ZipFile(content, "w")  # without `with`, whose exit would raise ValueError after Ctrl-C
     for part, text in parts.items():
-        entry = zipfile.ZipInfo(part)  # with a fixed date, unlike one that `writestr` makes of a name
+        entry = zipfile.ZipInfo(part)  # has a fixed date
         archive.writestr(entry, '<?xml version="1.0" encoding="UTF-8"?>\n' + text, zipfile.ZIP_DEFLATED)
     archive.close()
     path.write_bytes(content.getvalue())
 
 
 def read_mesh(path: Path) -> tuple[Array, Numbers]:
-    """Read vertices (n, 3), mm, and triangles (m, 3), m > 0, of a .stl or .3mf, all that is printed of a 3MF together.
-
-    An STL counts as mm; a 3MF states its unit.
+    """Read vertices (n, 3), mm, and triangles (m, 3), m > 0, of a .stl, in mm, or of all printed objects of a .3mf.
 
     Raises:
         InputError: the file is missing, or not a mesh with triangles.
@@ -153,7 +155,7 @@ def read_mesh(path: Path) -> tuple[Array, Numbers]:
 
 
 def _without_tail(path: Path) -> bytes:
-    """Return a file without the stray bytes at the end of a binary STL, for which trimesh takes it for text."""
+    """Return a file without stray bytes at the end of a binary STL, which would make trimesh read it as text."""
     content = path.read_bytes()
     n_bytes = _STL_HEAD_BYTES + _STL_RECORD.itemsize * int.from_bytes(content[80:_STL_HEAD_BYTES], "little")
     stray = len(content) - n_bytes
@@ -164,17 +166,14 @@ def _without_tail(path: Path) -> bytes:
 
 
 def _is_printed(part: ElementTree.Element) -> bool:
-    """Return whether a slicer prints an object, or an item of the build; true for all else that a 3MF has."""
+    """Return whether a slicer prints an object or a build item of a 3MF; True for other elements."""
     if part.tag.endswith("}object"):
         return part.get("type", "model") == "model"
     return not (part.tag.endswith("}item") and part.get("printable", "1") in ("0", "false"))
 
 
 def _without_unprinted(path: Path) -> bytes:
-    """Return a 3MF without what slicers do not print: items set so, supports, modifiers and all else that is no model.
-
-    trimesh reads the objects of all build items, whatever their kind.
-    """
+    """Return a 3MF without objects that slicers do not print, such as supports; trimesh would read them."""
     content, count = BytesIO(), 0
     with zipfile.ZipFile(path) as package, zipfile.ZipFile(content, "w") as printed:
         for name in package.namelist():
@@ -197,18 +196,17 @@ def _read_by_trimesh(path: Path) -> tuple[Array, Numbers]:
     """Read vertices and triangles of a file by trimesh."""
     import trimesh
 
-    logging.getLogger("trimesh").setLevel(logging.CRITICAL)  # what it logs on top of raising
+    logging.getLogger("trimesh").setLevel(logging.CRITICAL)  # its errors are raised as well
     try:
         with np.errstate(all="ignore"):
-            # processing would drop triangles with NaN
             kind = path.suffix[1:].lower()
             content = {"stl": _without_tail, "3mf": _without_unprinted}.get(kind, Path.read_bytes)(path)
-            scene = trimesh.load_scene(BytesIO(content), file_type=kind, process=False)
+            scene = trimesh.load_scene(BytesIO(content), file_type=kind, process=False)  # keeps triangles with NaN
             if scene.units:
                 scene = scene.convert_units("millimeters")
             mesh = scene.to_mesh()
         return np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
-    except Exception as error:  # readers of broken files raise whatever comes
-        missing = isinstance(error, KeyError)
-        reason = f"{error} is missing in it" if missing else " ".join(str(error).split()) or type(error).__name__
+    except Exception as error:  # broken files can raise any exception
+        is_missing = isinstance(error, KeyError)
+        reason = f"{error} is missing in it" if is_missing else " ".join(str(error).split()) or type(error).__name__
         raise InputError(f"{path}: not a mesh that can be read ({reason})") from error

@@ -1,7 +1,6 @@
 """Printed bodies as unions and differences of prisms: mould, lid, mould for conductive material, and holder.
 
-z = 0 is the underside of a body, which lies on the print bed; the tray's floor has its top at `floor_mm`. Lengths
-are mm.
+z = 0 is the underside of a body, on the print bed; the top of the tray's floor is at `floor_mm`. Lengths are mm.
 """
 
 import math
@@ -21,21 +20,19 @@ from padforge.fabricate.settings import WELL_MM, WELL_RIM_MM, WELL_SLOT_MM
 BODY_COLOURS = {"mould": "#8FA3B8", "lid": "#D9C27E", "conductive": "#6F8F72", "holder": "#B0886E"}
 """The printed bodies, and their colours in CAD programs and slicers."""
 INTO_FLOOR_MM = 0.2
-"""Overlap of a part with what it stands on, so that no two faces coincide."""
+"""Overlap of a part with the solid below it, so that no two faces coincide."""
 LID_MM = 3.0
 """Thickness of the lid."""
-_VENT_MM, _VENT_INSET_MM = 1.5, 3.0
-"""Diameter of the lid's vents, and their distance from the cavity's rim."""
-_BORE_MM, _FUNNEL_MM, _FUNNEL_WALL_MM = 6.0, 6.0, 2.0
-"""Spout: diameter of its bore, height and wall of its funnel."""
-_FUNNEL_FLARE_MM = _FUNNEL_MM * math.tan(math.radians(30.0))
-"""Widening of the funnel up to its top."""
-_PIN_CLEARANCE_MM = 0.3
-"""Difference in diameter between the lid's holes and the pins."""
-_PILLAR_GAP_MM, _N_POSITIONS = 0.5, 101
-"""Minimum distance between a bore of the lid and a pillar, and the number of candidate positions along each side."""
+_VENT_MM = 1.5  # diameter of the lid's vents
+_VENT_INSET_MM = 3.0  # distance of the vents from the cavity's rim
+_BORE_MM = 6.0  # diameter of the spout's bore
+_FUNNEL_MM = 6.0  # height of the spout's funnel
+_FUNNEL_WALL_MM = 2.0
+_FUNNEL_FLARE_MM = _FUNNEL_MM * math.tan(math.radians(30.0))  # increase of the funnel's radius up to its top
+_PIN_CLEARANCE_MM = 0.3  # difference in diameter between the lid's holes and the pins
+_PILLAR_GAP_MM = 0.5  # minimum distance between a bore of the lid and a pillar
 HOLDER_WALL_MM = 1.0
-"""Height of the holder's walls above its floor: far below the pad's surface, so that no probe meets them."""
+"""Height of the holder's walls above its floor, far below the pad's surface, so that no probe touches them."""
 HOLDER_PLAY_MM = 0.2
 """Clearance on every side of the pad in its holder."""
 
@@ -44,13 +41,13 @@ Position = tuple[float, float]
 
 @dataclass(frozen=True)
 class Prism:
-    """An upright solid from `bottom_mm` to `top_mm`.
+    """A vertical prism, or a frustum.
 
     Attributes:
-        area: its outline at the bottom, mm.
-        bottom_mm: height of its bottom.
-        top_mm: height of its top.
-        flare_mm: outward offset of the outline at the top; for rectangles and regular polygons.
+        area: outline at the bottom, mm.
+        bottom_mm: height of the bottom.
+        top_mm: height of the top.
+        flare_mm: outward offset of the outline at the top; only for rectangles and regular polygons.
     """
 
     area: BaseGeometry
@@ -69,14 +66,15 @@ class Body:
 
 
 def cylinder(x: float, y: float, diameter_mm: float, sides: int = 64) -> shapely.Polygon:
-    """Return the outline of an upright cylinder around (x, y), mm; with 64 sides within 0.13 % of the diameter."""
+    """Return a regular polygon for a vertical cylinder around (x, y), mm; with 64 sides its error is 0.13 %."""
     return shapely.Point(x, y).buffer(diameter_mm / 2, quad_segs=sides // 4)
 
 
 def _tray(outline: BaseGeometry, hollows: Iterable[BaseGeometry], floor: float, depth: float, flare: float = 0) -> Body:
-    """Build an open tray with rectangular hollows of a depth, whose walls lean outwards by `flare` over it."""
-    top, past = floor + depth, flare / depth  # a cut goes on 1 mm past the top at the same lean
-    return Body((Prism(outline, 0, top),), tuple(Prism(hollow, floor, top + 1, flare + past) for hollow in hollows))
+    """Build an open tray with rectangular hollows of a depth, whose walls lean outwards by `flare` in all."""
+    top, flare_per_mm = floor + depth, flare / depth
+    cuts = tuple(Prism(hollow, floor, top + 1, flare + flare_per_mm) for hollow in hollows)  # to 1 mm above the top
+    return Body((Prism(outline, 0, top),), cuts)
 
 
 def terraces(height_mm: float, terrace_mm: float) -> list[float]:
@@ -116,10 +114,10 @@ def ridge_prisms(
     """Build the terraces of the ridges of some fibres of a layer, the upper first; a ridge without taper has one.
 
     Args:
-        plan: of the mould.
-        fibres: their indices.
+        plan: plan of the mould.
+        fibres: indices of the fibres.
         top: outline of the uppermost terrace.
-        tolerance_mm: greatest deviation of the outlines of the others; None for that of the settings.
+        tolerance_mm: maximum deviation of the other outlines; None for that of the settings.
     """
     floor, height = plan.settings.mould.floor_mm, plan.heights_mm[plan.layer_indices[fibres[0]]]
     prisms = []
@@ -130,7 +128,7 @@ def ridge_prisms(
 
 
 def number_prisms(plan: Plan) -> list[Prism | None]:
-    """Build the number of every fibre; None without room, an empty list if unwanted."""
+    """Build the number of every fibre; None if it does not fit; [] if numbers are disabled."""
     floor = plan.settings.mould.floor_mm
     top = floor + plan.settings.mould.shallow_ridge_height_mm
     return [number and Prism(number, floor - INTO_FLOOR_MM, top) for number in plan.numbers]
@@ -147,7 +145,7 @@ def registration_pins(plan: Plan) -> list[Prism]:
 
 
 def _pin_mm(plan: Plan) -> float:
-    """Return the diameter of the pins: half of the corner they stand on, in tenths of a millimetre."""
+    """Return the diameter of the pins: half the width of their corner, rounded down to 0.1 mm."""
     diameter = int(5 * plan.corner_mm + 1e-9) / 10
     if diameter < 1:
         raise InputError(
@@ -158,23 +156,23 @@ def _pin_mm(plan: Plan) -> float:
 
 
 def _pin_positions(plan: Plan) -> list[Position]:
-    """Return the middles of three corners of the tray, so that a lid fits one way only."""
+    """Return the middles of three corners of the tray, so that a lid fits in one orientation only."""
     x_min, y_min, x_max, y_max = offset_box(plan.tray, -plan.corner_mm / 2).bounds
     return [(x_min, y_min), (x_max, y_min), (x_min, y_max)]
 
 
 def conductive_plan(plan: Plan) -> Plan:
-    """Return the plan of the mould for conductive material: exits large enough for wells, all else equal.
+    """Return the plan of the mould for conductive material, with exits large enough for wells.
 
     Raises:
-        InputError: exits that large do not fit the pitch.
+        InputError: such exits do not fit the pitch.
     """
     mould = plan.settings.mould.model_copy(update={"exit_mm": WELL_SLOT_MM, "exit_width_mm": WELL_SLOT_MM})
     return replace(plan, settings=replace(plan.settings, mould=mould))
 
 
 def conductive_body(plan: Plan) -> Body:
-    """Build the mould whose casting has a well at both ends of every track, of a `conductive_plan`."""
+    """Build the mould of a `conductive_plan`, whose casting has a well at both ends of every track."""
     return mould_body(plan, well_outlines(plan))
 
 
@@ -196,10 +194,10 @@ def fibre_wells(plan: Plan, fibre: int, sides: int) -> BaseGeometry:
 
 
 def lid_body(plan: Plan) -> Body:
-    """Build the lid that lies on the tray's walls: a plate with vents, holes for the pins, and a spout if wanted.
+    """Build the lid that lies on the tray's walls: a plate with vents, and, if enabled, holes for pins and a spout.
 
     Raises:
-        InputError: a pad too small for vents beside the spout, or keep-outs that obstruct them.
+        InputError: the pad is too small for vents beside the spout, or keep-outs obstruct them.
     """
     mould, (low, high) = plan.settings.mould, np.reshape(plan.cavity.bounds, (2, 2))
     insets = [min(_VENT_INSET_MM, side / 4) for side in high - low]
@@ -217,9 +215,9 @@ def lid_body(plan: Plan) -> Body:
     base, cuts = [Prism(plan.tray, 0, LID_MM)], [Prism(hole, -1, LID_MM + 1) for hole in holes]
     if spout:  # printed as it lies, without supports
         foot, bore = cylinder(*spout, _BORE_MM + 2 * _FUNNEL_WALL_MM), cylinder(*spout, _BORE_MM)
-        top, past = LID_MM + _FUNNEL_MM, _FUNNEL_FLARE_MM * (1 + 1 / _FUNNEL_MM)
+        top, flare = LID_MM + _FUNNEL_MM, _FUNNEL_FLARE_MM * (1 + 1 / _FUNNEL_MM)  # of the cut, to 1 mm above the top
         base.append(Prism(foot, LID_MM - INTO_FLOOR_MM, top, _FUNNEL_FLARE_MM))
-        cuts += [Prism(bore, -1, LID_MM + INTO_FLOOR_MM), Prism(bore, LID_MM, top + 1, past)]
+        cuts += [Prism(bore, -1, LID_MM + INTO_FLOOR_MM), Prism(bore, LID_MM, top + 1, flare)]
     return Body(tuple(base), tuple(cuts))
 
 
@@ -229,12 +227,12 @@ def lid_holes(plan: Plan) -> int:
 
 
 def _free_position(plan: Plan, wanted: Position, diameter_mm: float) -> Position:
-    """Return the position nearest to `wanted` where a bore of the lid comes out over silicone, clear of pillars."""
+    """Return the position nearest to `wanted` where a bore of the lid is clear of pillars."""
     reach = diameter_mm / 2 + _PILLAR_GAP_MM
     if not plan.pillars.area or plan.pillars.distance(shapely.Point(wanted)) >= reach:
         return wanted
     bounds = np.reshape(offset_box(plan.cavity, -reach).bounds, (2, 2))
-    positions = np.stack(np.meshgrid(*np.linspace(*bounds, _N_POSITIONS, axis=1)), axis=-1).reshape(-1, 2)
+    positions = np.stack(np.meshgrid(*np.linspace(*bounds, 101, axis=1)), axis=-1).reshape(-1, 2)
     positions = positions[shapely.distance(plan.pillars, shapely.points(positions)) >= reach]
     if not len(positions):
         room = f"allowed only where keep-outs leave room for bores of {diameter_mm:g} mm"
@@ -244,12 +242,12 @@ def _free_position(plan: Plan, wanted: Position, diameter_mm: float) -> Position
 
 
 def holder_body(plan: Plan) -> Body:
-    """Build the tray that holds the finished pad for pressing: tracks up, turned over left to right.
+    """Build the tray that holds the finished pad for pressing: turned over left to right, with its tracks up.
 
-    The leads leave it through slots. The corner where the first horizontal and vertical fibres start is cut.
+    The leads leave through slots. A cut corner marks where the first horizontal and vertical fibres start.
     """
     mould, cut = plan.settings.mould, plan.corner_mm
-    play = plan.flare_mm + HOLDER_PLAY_MM  # the pad's underside was the rim of the casting, wider than the tracks' side
+    play = plan.flare_mm + HOLDER_PLAY_MM  # the pad's underside is the rim of the casting, its widest part
     half = mould.exit_width_mm / 2 + play
     through = mould.wall_mm + mould.exit_mm + plan.flare_mm + 1
     slots = []
@@ -264,10 +262,10 @@ def holder_body(plan: Plan) -> Body:
 
 
 def printed_bodies(plan: Plan) -> dict[str, Body]:
-    """Build all bodies to print for the plan of a pad, the mould first: all but the holder compensated for shrinkage.
+    """Build all bodies to print for a pad, the mould first; all except the holder are compensated for shrinkage.
 
     Raises:
-        InputError: settings that do not fit the pad.
+        InputError: settings do not fit the pad.
     """
     mould, printed = plan.settings.mould, plan.shrinkage_compensated
     bodies = {"mould": mould_body(printed)}
@@ -275,19 +273,22 @@ def printed_bodies(plan: Plan) -> dict[str, Body]:
         bodies["lid"] = lid_body(printed)
     if mould.conductive:
         bodies["conductive"] = conductive_body(conductive_plan(plan).shrinkage_compensated)
-    if mould.holder:  # with conductive, wide enough for either pad
+    if mould.holder:  # with `conductive`, wide enough for both pads
         bodies["holder"] = holder_body(conductive_plan(plan) if mould.conductive else plan)
     return bodies
 
 
 def bed_frame(plan: Plan) -> dict[str, Any]:
-    """Compute the pose of the pad in its holder, which a slicer puts in the middle of the bed; mm and degrees.
+    """Compute the pose of the pad in its holder, which a slicer puts in the middle of the bed.
 
     Returns:
-        "bed_mm": width, depth and height of the printer. "centre_mm": x and y of the pad's centre. "angle_deg": from
-        the bed's y axis to the pad's. "mirrored": that the tracks lie up, and the pad's x axis against the bed's.
-        "pad_mm": side of the pad, or its width and height. "surface_mm", "walls_mm": heights of the pad and of the
-        holder's walls above the bed.
+        "bed_mm": width, depth and height of the printer.
+        "centre_mm": x and y of the pad's centre.
+        "angle_deg": angle from the bed's y axis to the pad's.
+        "mirrored": whether the tracks lie up, which inverts the pad's x axis.
+        "pad_mm": side of the pad, or width and height.
+        "surface_mm": height of the pad's surface above the bed.
+        "walls_mm": height of the holder's walls above the bed.
     """
     floor_mm, bed_mm = plan.settings.mould.floor_mm, plan.settings.printer.bed_mm
     _, y_min, _, y_max = plan.tray.bounds
@@ -303,10 +304,7 @@ def bed_frame(plan: Plan) -> dict[str, Any]:
 
 
 def sizes(plan: Plan) -> dict[str, Any]:
-    """Compute the resulting sizes of pad and mould, mm, width and height where they differ.
-
-    They are those that the settings do not fix, or that the pad needs larger than set.
-    """
+    """Compute the sizes of pad and mould that the settings do not fix, mm; width and height if these differ."""
     printed = plan.shrinkage_compensated
     mould = printed.settings.mould
     result = {

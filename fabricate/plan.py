@@ -1,8 +1,9 @@
 """Plan of a mould: centre lines, ridge outlines, fibre layers, numbers, pillars and tray, in mm.
 
-The frame is the pad's: x and y from its centre (`Morphology.to_mm`), as it lies in the tray with its tracks down.
-Turned over for fibre placement and use, the tracks are the mirror image of the plan. Lengths are the nominal ones of
-the finished pad; where the silicone shrinks, the mould has a plan of its own (`Plan.shrinkage_compensated`)."""
+The frame is the pad's: x and y from its centre (`Morphology.to_mm`), as it lies in the tray with its tracks down. When
+the pad is turned over for fibre placement and use, the tracks are the mirror image of the plan. Lengths are the nominal
+ones of the finished pad; if the silicone shrinks, the mould has another plan (`Plan.shrinkage_compensated`).
+"""
 
 import math
 from collections.abc import Sequence
@@ -43,24 +44,23 @@ SNAP_MM = 1e-4
 """Grid to which areas are snapped by Boolean operations, mm.
 
 No edge of the solid is shorter; and without a grid, outlines that almost coincide can defeat the operation."""
-_CENTRE_SHARE, _ARC_SHARE, _OUTLINE_SHARE = 0.2, 0.2, 0.6
-"""Shares of the tolerance: most of it simplifies the outline, which sets the size of every file."""
-_NUMBER_DISTANCE = 5
-"""Maximum distance of a number from its fibre's start, in heights: beyond it no longer seems to belong there."""
-_NUMBER_STEP_MM = 0.5
-"""Grid of candidate positions for a number."""
-_NUMBER_TRIES = 50
-"""Candidates that are looked at together: most numbers have room among the first."""
-_AT_WALL_MM = 1e-3
-"""Distance up to which a pillar touches a wall."""
-_MAX_WHITE = 0.7
-"""Share of white in a family's palest tint; more would be lost on paper."""
+_CENTRE_SHARE = 0.2  # fraction of the tolerance for centre lines
+_ARC_SHARE = 0.2  # fraction of the tolerance for arcs
+_OUTLINE_SHARE = 0.6  # fraction for simplifying outlines, the largest since it determines the size of all files
+_NUMBER_DISTANCE = 5  # maximum distance of a number from its fibre's start, in heights
+_NUMBER_STEP_MM = 0.5  # grid of candidate positions for a number
+_NUMBER_TRIES = 50  # candidates that are tested together; most numbers fit at one of the first
+_AT_WALL_MM = 1e-3  # distance up to which a pillar touches a wall
+_MAX_WHITE = 0.7  # fraction of white in a family's palest tint; paler lines are hard to see in print
 
 
 def assign_layers(counts: tuple[int, int], clashes: Sequence[Crossing], deep_horizontal: bool) -> tuple[int, ...]:
-    """Compute the layer index of every fibre, 0 the shallowest, by colouring the graph of crossings in a family.
+    """Compute the layer index of every fibre, 0 the shallowest, by colouring the graph of crossings within a family.
 
-    Horizontals, counted first, or else verticals are the deep family, which has the upper indices.
+    Args:
+        counts: numbers of horizontal and of vertical fibres.
+        clashes: crossings within a family.
+        deep_horizontal: whether horizontals are the deep family, which gets the higher indices.
     """
     horizontal, vertical = range(counts[0]), range(counts[0], sum(counts))
     layers: dict[int, int] = {}
@@ -91,18 +91,18 @@ _DIGITS = (
     ((*_TOP, *_MIDDLE, *_BOTTOM, (0.0, 0.4), (0.14, 0.53), (0.0, 0.66), (0.0, 0.82)), ((0.14, 0.53), (0.36, 0.53))),
     (((0.5, 0.0), *_TOP[::-1], (0.0, 0.6), (0.13, 0.44), (0.35, 0.44), (0.43, 0.52)),),
 )
-"""Strokes of digits 1 high and 0.5 wide: turned over or upside down, none of them is another digit."""
+"""Strokes of digits, 1 high and 0.5 wide; no digit equals another one mirrored or upside down."""
 
 
 def draw_number(number: int, height_mm: float, width_mm: float) -> BaseGeometry:
-    """Draw a number, centred; mirrored, to be read on the casting.
+    """Return the outline of a number, centred, and mirrored so that it is legible on the casting.
 
-    Its digits stand on a bar, which tells a 6 from a 9 and makes one piece of them.
+    A bar under the digits distinguishes 6 from 9 and connects them.
 
     Args:
-        number: non-negative.
-        height_mm: between the middles of its uppermost strokes and of the bar.
-        width_mm: of its strokes.
+        number: number, >= 0.
+        height_mm: distance between the centre lines of the top strokes and of the bar.
+        width_mm: width of the strokes.
     """
     digit_mm = max(height_mm - width_mm, height_mm / 2)
     advance_mm = digit_mm / 2 + width_mm + max(width_mm, 0.25 * digit_mm)
@@ -122,10 +122,10 @@ def draw_number(number: int, height_mm: float, width_mm: float) -> BaseGeometry:
 
 
 def _position_numbers(plan: "Plan", numbers: Sequence[BaseGeometry]) -> list[BaseGeometry | None]:
-    """Move each centred number to the nearest free position beside its fibre's start; None without room.
+    """Move each centred number to the nearest free position beside its fibre's start; None if there is none.
 
-    Candidates lie in the cavity, up to a reach into it and half of that to either side of the start, clear of walls,
-    pillars, ridges and other numbers.
+    Candidates lie on a grid in the cavity, inwards from the start and half as far to either side of it. They are free
+    if clear of walls, pillars, ridges and other numbers.
     """
     mould, lines = plan.settings.mould, plan.lines
     clearance = mould.ridge_width_mm / 2 + plan.heights_mm[-1] * plan.settings.ridge_slope + mould.min_silicone_mm
@@ -157,13 +157,13 @@ def _position_numbers(plan: "Plan", numbers: Sequence[BaseGeometry]) -> list[Bas
 
 
 class CommonTrack(NamedTuple):
-    """A stretch of a track that lies over a deeper one: it has no floor of silicone there.
+    """A stretch of a track that lies over a deeper one, so that it has no floor of silicone.
 
     Attributes:
-        shallow: index of the fibre of the stretch.
+        shallow: index of the upper fibre.
         deep: index of the fibre below it.
-        length_mm: length over which the centre lines are nearer than a track's width.
-        position_mm: its middle.
+        length_mm: length over which the centre lines are closer than a track's width.
+        position_mm: middle of the stretch.
     """
 
     shallow: int
@@ -174,15 +174,15 @@ class CommonTrack(NamedTuple):
 
 @dataclass(frozen=True)
 class Plan:
-    """A morphology with the settings of its mould; what derives from them is computed on first use.
+    """A morphology with the settings of its mould; derived quantities are computed on first use.
 
     Attributes:
-        pad: the fibres.
+        pad: morphology of the pad.
         settings: tray, ridges, printer and materials.
-        nominal: the plan of the finished pad, in a plan that is compensated for shrinkage.
+        nominal: plan of the finished pad, if this one is compensated for shrinkage.
 
     Raises:
-        InputError: settings that contradict each other or the pitch, or keep-outs that do not fit the pad.
+        InputError: settings contradict each other or the pitch, or keep-outs do not fit the pad.
     """
 
     pad: Morphology
@@ -197,9 +197,9 @@ class Plan:
 
     @cached_property
     def shrinkage_compensated(self) -> "Plan":
-        """The plan of what is printed, larger by the silicone's shrinkage; this one without shrinkage.
+        """The plan of the printed mould, enlarged by the silicone's shrinkage; this plan if there is none.
 
-        Heights are whole layers, see `FabricationSettings.shrinkage_compensated`.
+        Heights are whole layers; see `FabricationSettings.shrinkage_compensated`.
         """
         factor = self.settings.shrinkage_factor
         if factor == 1:
@@ -231,7 +231,7 @@ class Plan:
 
         Args:
             tolerance_mm: tolerance against the curves.
-            past_mm: length by which paths go on past the ends of their tongues.
+            past_mm: length of the paths past the ends of their tongues.
         """
         past = self.settings.mould.exit_mm, past_mm
         curves = flatten(self.pad, tolerance_mm / self.pad.unit_mm)
@@ -248,17 +248,17 @@ class Plan:
         A point at which a fibre turns abruptly, where it meets a lead, occurs twice.
 
         Args:
-            step: greatest turn between successive points, radians.
-            past_mm: distance past the ends of its tongues.
+            step: maximum turn between successive points, radians.
+            past_mm: length of the traces past the ends of their tongues.
         """
         past = self.settings.mould.exit_mm + past_mm
         traces = []
         for fibre, (spans, slopes) in enumerate(zip(beziers(self.pad), slope_beziers(self.pad), strict=True)):
             points, headings = trace_curve(spans, slopes, step)
-            (before, coming), (after, going) = (lead.trace(step, past) for lead in self.leads.pairs[fibre])
+            (start, start_headings), (end, end_headings) = (lead.trace(step, past) for lead in self.leads.pairs[fibre])
             headings = np.pi / 2 - headings if self.family(fibre) else headings
-            headings = np.concatenate([coming[::-1] + np.pi, headings, going])
-            traces.append((np.vstack([before[::-1], self.pad.to_mm(points), after]), np.unwrap(headings)))
+            headings = np.concatenate([start_headings[::-1] + np.pi, headings, end_headings])
+            traces.append((np.vstack([start[::-1], self.pad.to_mm(points), end]), np.unwrap(headings)))
         return traces
 
     @cached_property
@@ -273,11 +273,7 @@ class Plan:
         return one_side_leads(ends, pad.layout, lead_spacing(self.settings, self.heights_mm[-1], self.flare_mm))
 
     def ends(self, end: int) -> list[Lead]:
-        """Return the leads at one end of all fibres.
-
-        Args:
-            end: 0 for the starts, 1 for the other ends.
-        """
+        """Return the leads at the starts (`end` = 0) or at the ends (1) of all fibres."""
         return [pair[end] for pair in self.leads.pairs]
 
     @cached_property
@@ -292,21 +288,17 @@ class Plan:
         return min(self.pad.layout.pitch_x_mm, self.pad.layout.pitch_y_mm)
 
     def family(self, fibre: int) -> int:
-        """Return 0 for a horizontal fibre, 1 for a vertical one.
-
-        Args:
-            fibre: index among all fibres.
-        """
+        """Return the family of a fibre: 0 horizontal, 1 vertical."""
         return self.pad.layout.family(fibre)
 
     @cached_property
     def crossings(self) -> list[Crossing]:
-        """Crossings of all fibres; positions in grid units."""
+        """Crossings of all fibres, with positions in grid units."""
         return crossings(self.pad, self.settings.mould.tolerance_mm / self.pad.unit_mm)
 
     @cached_property
     def clashes(self) -> list[Crossing]:
-        """The crossings of fibres of one family."""
+        """The crossings within a family."""
         return [c for c in self.crossings if self.family(c.first) == self.family(c.second)]
 
     @property
@@ -332,13 +324,13 @@ class Plan:
 
     @cached_property
     def layer_indices(self) -> tuple[int, ...]:
-        """Layer of every fibre, 0 the shallowest; different for fibres that cross, if the settings allow for it."""
+        """Layer of every fibre, 0 the shallowest; different for fibres that cross, if the settings allow that."""
         clashes = self.clashes if self.settings.mould.levels == "as_needed" else []
         return assign_layers(self.pad.layout.counts, clashes, self.settings.pad.deep_family == "horizontal")
 
     @cached_property
     def common_tracks(self) -> list[CommonTrack]:
-        """Stretches where tracks of different depths lie over each other, leads included."""
+        """Stretches in which tracks of different depths lie over each other, leads included."""
         stretches = []
         for layer in range(max(self.layer_indices)):
             shallow = self.layer_fibres(layer)
@@ -354,8 +346,8 @@ class Plan:
     def heights_mm(self) -> tuple[float, ...]:
         """Ridge height of every layer, ascending, mm above the tray's floor.
 
-        The lowest is that of the shallow family, or of the deep one where the pad has no other: a pad is designed for
-        the depth of each family, whether there is another one or not.
+        The lowest is that of the shallow family, or of the deep one if the pad has no other: designs assume the depth
+        of each family, whether the other one exists or not.
         """
         mould = self.settings.mould
         has_shallow = self.pad.layout.counts[self.settings.pad.deep_family == "horizontal"] > 0
@@ -365,17 +357,17 @@ class Plan:
 
     @cached_property
     def silicone_mm(self) -> float:
-        """Thickness of the cast silicone, mm: as set, or more where many layers need it."""
+        """Thickness of the cast silicone, mm: as set, or more if many layers need it."""
         mould, highest_mm = self.settings.mould, self.heights_mm[-1]
         return max(mould.silicone_mm, highest_mm + COVER_MM if highest_mm > mould.deep_ridge_height_mm else 0)
 
     def outline(self, fibres: Sequence[int], below_mm: float = 0.0, tolerance_mm: float | None = None) -> BaseGeometry:
-        """Draw the outline of the ridges of some fibres, mm, their ends inside the walls.
+        """Return the outline of the ridges of some fibres, mm, with their ends inside the walls.
 
         Args:
-            fibres: their indices.
-            below_mm: distance below the ridges' tops.
-            tolerance_mm: greatest deviation; None for that of the settings.
+            fibres: indices of the fibres.
+            below_mm: distance of the outline below the ridges' tops.
+            tolerance_mm: maximum deviation; None for that of the settings.
         """
         mould = self.settings.mould
         tolerance = mould.tolerance_mm if tolerance_mm is None else tolerance_mm
@@ -389,11 +381,7 @@ class Plan:
         return shapely.union_all(bands).simplify(_OUTLINE_SHARE * tolerance)
 
     def layer_fibres(self, layer: int) -> list[int]:
-        """Return the indices of the fibres of a layer, ascending.
-
-        Args:
-            layer: its index, from the lowest, 0.
-        """
+        """Return the indices of the fibres of a layer, ascending."""
         return [fibre for fibre, index in enumerate(self.layer_indices) if index == layer]
 
     @cached_property
@@ -403,7 +391,7 @@ class Plan:
 
     @cached_property
     def numbers(self) -> list[BaseGeometry | None]:
-        """Mirrored number of every fibre, from 1, beside its start; None without room, an empty list if unwanted."""
+        """Mirrored number of every fibre, from 1, beside its start; None if it does not fit; [] if disabled."""
         height, width = self.settings.mould.number_mm, self.settings.mould.ridge_width_mm
         numbers = range(1, self.pad.layout.fibres + 1)
         return _position_numbers(self, [draw_number(n, height, width) for n in numbers]) if height else []
@@ -417,7 +405,7 @@ class Plan:
     def exits(self) -> list[shapely.Polygon]:
         """Slots in the wall around both ends of every fibre, mm: in the order of the fibres, starts first.
 
-        They begin within the cavity, so that none of their faces coincides with one of the cavity.
+        They begin inside the cavity, so that no faces coincide.
         """
         mould = self.settings.mould
         half = mould.exit_width_mm / 2
@@ -426,9 +414,9 @@ class Plan:
 
     @cached_property
     def pillars(self) -> BaseGeometry:
-        """Outlines of the keep-outs' pillars, up to the rim, mm; they extend into a wall that they touch.
+        """Outlines of the keep-outs' pillars, up to the rim, mm, extended into the walls that they touch.
 
-        A wall leans outwards from there: silicone between it and a pillar that ends at its foot would be a mere film.
+        Since walls lean outwards, a film of silicone would remain between a wall and a pillar that ends at its foot.
         """
         if not self.settings.pad.keep_out_mm:
             return shapely.MultiPolygon()
@@ -441,13 +429,13 @@ class Plan:
         )
         outlines = outlines.intersection(self.cavity.buffer(into_mm, join_style="mitre"))
         low, high = np.reshape(self.cavity.bounds, (2, 2))
-        for axis in (0, 1):  # one after the other, so that corners are filled as well
+        for axis in (0, 1):  # in sequence, so that corners are filled as well
             extensions = []
             for edge, out in ((low[axis], -1), (high[axis], 1)):
                 strip = np.stack([low, high])
                 strip[:, axis] = sorted((edge - out * _AT_WALL_MM, edge))
-                for part in shapely.get_parts(outlines.intersection(shapely.box(*strip.ravel()))):
-                    box = np.reshape(part.bounds, (2, 2))
+                for contact in shapely.get_parts(outlines.intersection(shapely.box(*strip.ravel()))):
+                    box = np.reshape(contact.bounds, (2, 2))
                     box[:, axis] = sorted((edge - out * _AT_WALL_MM, edge + out * into_mm))
                     extensions.append(shapely.box(*box.ravel()))
             outlines = shapely.union_all([outlines, *extensions])
@@ -462,7 +450,7 @@ class Plan:
 
     @cached_property
     def heads(self) -> list[shapely.Polygon]:
-        """Outlines of the heads of screws, mm, which sink into the pad around their holes."""
+        """Outlines of the countersunk heads of screws, mm."""
         holes = [keep_out for keep_out in self.settings.pad.keep_out_mm if is_hole(keep_out)]
         return [self._disc(hole[0], hole[1], hole[3]) for hole in holes if len(hole) > 3]
 
@@ -473,7 +461,7 @@ class Plan:
 
     @cached_property
     def feet(self) -> BaseGeometry:
-        """Outlines of the pillars at the floor, mm, where those of screws with heads are wider."""
+        """Outlines of the pillars at the floor, mm, widened by the heads of screws."""
         return shapely.union_all([self.pillars, *self.heads])
 
     @cached_property
@@ -537,10 +525,10 @@ class FibreLayer:
 
     Attributes:
         family: 0 horizontal, 1 vertical.
-        index: as in `Plan.layer_indices`.
-        depth_mm: depth of their tracks in the casting.
-        fibres: their indices among all, 0..F-1.
-        colour: "#rrggbb", the family's for its deepest layer and paler the shallower.
+        index: index of the layer, as in `Plan.layer_indices`.
+        depth_mm: depth of the tracks in the casting.
+        fibres: indices of the fibres, 0..F-1.
+        colour: "#rrggbb", that of the family for its deepest layer, and paler for shallower ones.
     """
 
     family: int
@@ -551,7 +539,7 @@ class FibreLayer:
 
     @property
     def name(self) -> str:
-        """Its id in a drawing, such as "horizontal-1.2"."""
+        """Id of the layer in a drawing, such as "horizontal-1.2"."""
         return f"{FAMILIES[self.family]}-{self.depth_mm:g}"
 
 
@@ -563,8 +551,8 @@ def fibre_layers(plan: Plan) -> list[FibreLayer]:
     layers = []
     for index, family in enumerate(families):
         white = _MAX_WHITE * families[index + 1 :].count(family) / families.count(family)
-        tint = (round(part + white * (255 - part)) for part in bytes.fromhex(FAMILY_COLOURS[family][1:]))
-        colour = "#" + "".join(f"{part:02x}" for part in tint)
+        tint = bytes(round(value + white * (255 - value)) for value in bytes.fromhex(FAMILY_COLOURS[family][1:]))
+        colour = f"#{tint.hex()}"
         layers.append(FibreLayer(family, index, plan.depths_mm[index], fibres[index], colour))
     return layers[::-1]
 

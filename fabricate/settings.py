@@ -1,4 +1,4 @@
-"""Settings of a mould: `[mould]`, `[printer]` and `[dispenser]` of `pad.toml`, and all that it depends on together."""
+"""Settings of a mould: `[mould]`, `[printer]` and `[dispenser]` of `pad.toml`, and the sections it depends on."""
 
 import math
 from dataclasses import dataclass, field, fields, replace
@@ -27,16 +27,17 @@ from .materials import FibreSettings, SiliconeSettings
 class MouldSettings(Settings):
     """`[mould]`: the tray the silicone is cast in and the ridges that leave the tracks.
 
-    The pad is cast with its tracks down: a taller ridge leaves a track deeper in the silicone. The defaults keep
-    0.5 mm between two 0.3 mm fibres that cross, and are multiples of 0.1 mm and of 0.2 mm layers.
+    The pad is cast with its tracks down, so that a taller ridge makes a deeper track. The defaults leave 0.5 mm between
+    two crossing fibres of 0.3 mm, and are multiples of 0.1 mm and 0.2 mm layers.
 
     Attributes:
-        levels: "as_needed": one ridge height a family, and further ones where fibres of one family cross, spaced by the
-            difference of the families' heights; "two": a pad with such crossings is refused.
-        exit_mm, exit_width_mm: slots in the wall around every ridge end; they leave a tongue of silicone on the pad
-            that relieves the lead of strain.
-        holder: a shallow tray without ridges, printed last and left on the bed, which holds the finished pad in the
-            pose of casting while the printer presses it; `frame` in fabrication.json is that pose.
+        levels: "as_needed": one ridge height a family, and further ones if fibres of one family cross, spaced by the
+            difference of the families' heights; "two": pads with such crossings are refused.
+        exit_mm: length of the slots in the wall around the ridge ends; they form tongues of silicone on the pad, for
+            strain relief of the leads.
+        exit_width_mm: width of these slots.
+        holder: a shallow tray without ridges, printed last and left on the bed, which holds the finished pad while the
+            printer presses it; `frame` in fabrication.json is the pose of the pad.
         conductive: a second mould with a well at every ridge end, for casting a conductive material into the tracks
             in place of fibres.
     """
@@ -94,11 +95,7 @@ class PrinterSettings(Settings):
         return self.nozzle_mm * (2 if self.resin else 1)
 
     def is_whole_layers(self, height_mm: float) -> bool:
-        """Return whether a height is a whole number of layers.
-
-        Args:
-            height_mm: height.
-        """
+        """Return whether a height is a whole number of layers."""
         layers = height_mm / self.layer_mm
         return round(layers) > 0 and abs(layers - round(layers)) <= 1e-6
 
@@ -112,14 +109,14 @@ Box = Annotated[
 class DispenserSettings(Settings):
     """`[dispenser]`: the needle on a gantry that places the fibres by machine.
 
-    The pad lies turned over, tracks up; z is 0 at its upper face. By default the needle is a thin-walled tube for a
-    fibre of 0.3 mm which fits into a track of 0.4 mm; it is slow, since hands are near and it pulls on a spool.
+    The pad lies turned over, with its tracks up; z is 0 at its upper face. By default the needle is a thin-walled tube
+    for a fibre of 0.3 mm that fits into a track of 0.4 mm. It is slow, since hands are near and it pulls on a spool.
 
     Attributes:
-        travel_height_mm: above the pad, and anything that protrudes from it, between fibres.
-        acceleration_mm_s2: limits the speed in a bend of radius r to sqrt(acceleration r).
+        travel_height_mm: height of travel moves above the pad and anything that protrudes from it.
+        acceleration_mm_s2: maximum acceleration; it limits the speed in a bend of radius r to sqrt(acceleration r).
         origin_mm: position of the pad's middle on the machine.
-        box_mm: limits of x, y and z in the machine's coordinates, which the tip may not leave.
+        box_mm: limits of the tip in the machine's x, y and z.
     """
 
     tip_mm: float = Field(default=0.37, gt=0, le=20, description="outer diameter of the needle's tip, mm")
@@ -143,20 +140,18 @@ class DispenserSettings(Settings):
         return box_mm
 
 
-WELL_MM, WELL_RIM_MM = 3.0, 1.0
-"""Diameter of the wells for conductive material, and silicone around one."""
-WELL_SLOT_MM = WELL_MM + 2 * WELL_RIM_MM
-"""Length and width of the slots of a mould with wells."""
-_MAX_TERRACE_STEP_MM = 0.03
-"""Maximum width of the terraces of a tapered ridge: the positioning accuracy of printers."""
+WELL_MM = 3.0  # diameter of the wells for conductive material
+WELL_RIM_MM = 1.0  # silicone around a well
+WELL_SLOT_MM = WELL_MM + 2 * WELL_RIM_MM  # length and width of the slots of a mould with wells
+_MAX_TERRACE_STEP_MM = 0.03  # width of the terraces of a tapered ridge, the positioning accuracy of printers
 
 
 @dataclass(frozen=True)
 class FabricationSettings:
-    """All settings of a mould and of fibre placement; the pad's fibres are those of the morphology.
+    """All settings of a mould and of fibre placement, except the paths of the fibres, which the morphology has.
 
-    From `[pad]` come the deep family, keep-outs, leads and the radius that it is bent to; from `[contact]`, if it is
-    stated, what a press on a pad is believed to be that does not say so itself.
+    `pad` has the deep family, keep-outs, leads and bending radius; `contact`, if stated, is the contact assumed for a
+    pad that does not state the contact it is designed for.
     """
 
     mould: MouldSettings = field(default_factory=MouldSettings)
@@ -182,11 +177,8 @@ class FabricationSettings:
     def from_spec(cls, spec: Spec) -> "FabricationSettings":
         """Read the sections of a `pad.toml`.
 
-        Args:
-            spec: settings file.
-
         Raises:
-            InputError: an unknown key or a value out of range, or a mould that makes another pad than `[contact]` says.
+            InputError: a key is unknown or a value out of range, or the mould contradicts `[contact]`.
         """
         spec = fill_cast(check_type("spec", spec, Spec))
         sections = map(spec.section, cls._models().values())
@@ -199,7 +191,7 @@ class FabricationSettings:
 
     @property
     def terrace_mm(self) -> float:
-        """Height of a tapered ridge's terraces: as many layers as limit their steps, or one."""
+        """Height of a tapered ridge's terraces: as many layers as `_MAX_TERRACE_STEP_MM` allows, at least one."""
         layer = self.printer.layer_mm
         step = self.ridge_slope * layer
         return layer * max(1, int(_MAX_TERRACE_STEP_MM / step)) if step else math.inf
@@ -210,10 +202,10 @@ class FabricationSettings:
         return 1 - self.silicone.material.shrinkage
 
     def shrinkage_compensated(self) -> "FabricationSettings":
-        """Return the settings of the mould: lengths of the pad larger by 1 / `shrinkage_factor`, without shrinkage.
+        """Return the settings of the mould: lengths of the pad divided by `shrinkage_factor`, without shrinkage.
 
-        Floor and walls stay as set. Heights in whole layers, of the ridges or of the cavity, remain so, since slicers
-        treat fractions of a layer differently: the pad's come out within half a layer (`Plan.depths_mm`).
+        Floor and walls are unchanged. Heights of ridges or cavity that are whole layers remain so, since slicers differ
+        in the treatment of fractions; the pad then deviates by up to half a layer (`Plan.depths_mm`).
         """
         ridges, depth = ("deep_ridge_height_mm", "shallow_ridge_height_mm"), ("silicone_mm",)
         horizontal = ("border_mm", "ridge_width_mm", "exit_mm", "exit_width_mm", "number_mm")
@@ -238,11 +230,8 @@ class FabricationSettings:
     def require_consistent(self, layout: Layout) -> None:
         """Check that settings do not contradict each other or the pitch of the pad.
 
-        Args:
-            layout: fibres and pitch.
-
         Raises:
-            InputError: names the key, its value and what is allowed.
+            InputError: settings contradict each other.
         """
         mould = self.mould
         pitches = (layout.pitch_y_mm, layout.horizontals), (layout.pitch_x_mm, layout.verticals)
@@ -258,7 +247,7 @@ class FabricationSettings:
             if mould.exit_width_mm <= mould.ridge_width_mm:
                 allowed = f"more than ridge_width_mm, {mould.ridge_width_mm:g} mm"
                 raise InputError(f"[mould] exit_width_mm: got {mould.exit_width_mm:g}, allowed is {allowed}")
-            flare_mm = 2 * mould.silicone_mm * math.tan(math.radians(mould.wall_draft_deg))  # of both sides together
+            flare_mm = 2 * mould.silicone_mm * math.tan(math.radians(mould.wall_draft_deg))  # of both walls
             if pitch_mm - flare_mm <= mould.ridge_width_mm:
                 lean = f"the walls lean outwards by {flare_mm:.3g} mm, the pitch is {pitch_mm:g} mm"
                 raise InputError(f"[mould] exit_mm: got {mould.exit_mm:g}, allowed is 0 only: {lean}")

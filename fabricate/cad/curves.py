@@ -1,7 +1,8 @@
-"""Outlines as exact curves: a finely drawn ring becomes straight lines, arcs and cubic splines that follow it.
+"""Outlines as exact curves: a finely drawn ring is converted to straight lines, arcs and cubic splines.
 
 A ring is cut at corners, at the ends of straight edges and where the curvature jumps. Each smooth run between two cuts
-is an arc if one fits, else a cubic spline whose ends are exact and tangent to what follows smoothly. Lengths are mm.
+becomes an arc if one fits, otherwise a cubic spline; its ends are exact, and tangent to a smooth neighbour. Lengths are
+mm.
 """
 
 from collections.abc import Iterator, Sequence
@@ -24,24 +25,18 @@ Joints = dict[tuple[float, float], Array]
 """Direction (2,) of the fibre at every joint, by x and y in mm."""
 
 FINE_MM = 3e-4
-"""Tolerance of the drawn rings against the exact outlines; their vertices are far nearer."""
+"""Tolerance of the drawn rings against the exact outlines; their vertices are much closer."""
 MAX_SPANS = 8
 """Longer splines are cut: the CAD kernel's default integration is inexact on edges of many spans (1.4e-4 at twelve)."""
-_JOINT_MM = 1e-3
-"""A joint farther from an outline lies inside it, where walls of two fibres, or of one that folds, merge."""
-_CORNER_RAD = 0.2
-"""A sharper turn at a vertex is a corner; finely drawn curves turn less unless they hardly have a radius."""
-_STRAIGHT_MM = 1e-3
-"""An edge with a larger sagitta is straight: chords of drawn curves have a several times smaller one."""
-_ARC_TOLERANCE_MM = 1e-4
-"""Tolerance of arcs and straight runs."""
-_KNOT_DECIMALS, _LEAST_SPAN_MM = 4, 1e-3
-"""Decimals of knots, mm, and their least distance from the ends: more decimals would only lengthen a STEP file, and
-their last ones depend on where arrays lie in memory."""
-_SAMPLES, _SAMPLE_MM = 4, 0.1
-"""A fit is checked at as many places of every edge, and at least as densely: between far vertices it might stray."""
-_ALONG = 20
-"""Tolerances by which a parameter may lie off the arc length: that changes no shape."""
+_JOINT_MM = 1e-3  # maximum distance of a joint from its outline; others lie inside, where walls merge
+_CORNER_RAD = 0.2  # turn at a vertex above which it is a corner; vertices of drawn curves turn less
+_STRAIGHT_MM = 1e-3  # sagitta above which an edge is straight; chords of drawn curves have several times less
+_ARC_TOLERANCE_MM = 1e-4  # of arcs and straight runs
+_KNOT_DECIMALS = 4  # of knots, mm; further decimals lengthen STEP files and depend on memory alignment
+_MIN_SPAN_MM = 1e-3  # minimum distance of inner knots from the ends
+_MIN_SAMPLES = 4  # samples of every edge at which a fit is checked
+_SAMPLE_MM = 0.1  # maximum distance between samples
+_ALONG_FACTOR = 20  # tolerance of the parameter against the arc length over that of the shape, which it hardly changes
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,7 +44,7 @@ class OutlineCurve:
     """A smooth run of an outline: a straight line unless it has an arc or a spline.
 
     Attributes:
-        points: vertices, of a straight run and a spline its two ends; shape (n, 2).
+        points: vertices of an arc, the two ends of a line or a spline; shape (n, 2).
         spline: cubic spline over about its arc length; None for lines and arcs.
         arc: arc; None for lines and splines.
     """
@@ -60,7 +55,7 @@ class OutlineCurve:
 
 
 def find_joints(plan: Plan, fibre: int, half_mm: float) -> Joints:
-    """Return the joints of the walls `half_mm` beside a fibre: its curvature jumps at its knots, and so does theirs."""
+    """Return the joints of the walls `half_mm` beside a fibre, where the curvature jumps: those beside its knots."""
     knots, slope = plan.pad.to_mm(plan.pad.knots[fibre]), slopes(plan.pad)[fibre]
     along = np.stack([np.ones_like(slope), slope], axis=1)[:, :: -1 if plan.family(fibre) else 1]
     along /= np.linalg.norm(along, axis=1, keepdims=True)
@@ -95,11 +90,11 @@ def ring_curves(ring: Array, joints: Joints, fit_mm: float) -> Iterator[OutlineC
     straight = _is_straight(length, turn, corner)
     joint = np.array([vertex in joints for vertex in map(tuple, ring.tolist())])
     cuts = np.flatnonzero(corner | straight | np.roll(straight, 1) | joint)
-    if not len(cuts):  # smooth all round: two halves
+    if not len(cuts):  # a smooth closed curve is cut into halves
         cuts = np.array([0, len(ring) // 2])
 
     def tangent(vertex: int) -> Array | None:
-        """Direction of the ring at a vertex; None at corners and where it is unknown."""
+        """Return the direction of the ring at a vertex; None at corners and where it is unknown."""
         if corner[vertex]:
             return None
         if straight[vertex]:
@@ -119,7 +114,7 @@ def ring_curves(ring: Array, joints: Joints, fit_mm: float) -> Iterator[OutlineC
 
 
 def _is_straight(length: Array, turn: Array, corner: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Tell which edges are straight lines rather than chords of a curve, by their sagitta length * turn / 8."""
+    """Return which edges are straight lines rather than chords of a curve, by their sagitta, length * turn / 8."""
     smooth = np.where(corner, 0.0, turn)
     ends = (~corner).astype(int) + np.roll(~corner, -1)
     mean = (smooth + np.roll(smooth, -1)) / np.maximum(ends, 1)
@@ -127,7 +122,7 @@ def _is_straight(length: Array, turn: Array, corner: NDArray[np.bool_]) -> NDArr
 
 
 def _smooth_curves(points: Array, tangents: Sequence[Array | None], fit_mm: float) -> Iterator[OutlineCurve]:
-    """Yield the curves of a smooth run of vertices (n, 2), n > 2, with the tangents at its ends where known."""
+    """Yield the curves of a smooth run of vertices (n, 2), n > 2, with the tangents at its ends, None if unknown."""
     chord = points[-1] - points[0]
     offsets = points - points[0]
     if np.abs(chord[0] * offsets[:, 1] - chord[1] * offsets[:, 0]).max() < _ARC_TOLERANCE_MM * np.linalg.norm(chord):
@@ -140,14 +135,14 @@ def _smooth_curves(points: Array, tangents: Sequence[Array | None], fit_mm: floa
     start, end = tangents
     start = _end_tangent(s, points) if start is None else start
     end = -_end_tangent(s[-1] - s[::-1], points[::-1]) if end is None else end
-    for part in cut_spline(fit_spline(points, (start, end), fit_mm)):
-        yield OutlineCurve(part.c[[0, -1]], spline=part)
+    for spline in cut_spline(fit_spline(points, (start, end), fit_mm)):
+        yield OutlineCurve(spline.c[[0, -1]], spline=spline)
 
 
 def _end_tangent(s: Array, points: Array) -> Array:
-    """Direction at the first vertex, of the parabola through the first three, limited by the first edge.
+    """Return the direction at the first vertex of the parabola through the first three.
 
-    An edge is a chord that its curve stays within `FINE_MM` of, so directions differ by 4 `FINE_MM` / length at most.
+    It is limited to 4 `FINE_MM` / length from that of the first edge, a chord with a sagitta of at most `FINE_MM`.
     """
     a, b = s[1], s[2]
     chord = (points[1] - points[0]) / a
@@ -158,7 +153,7 @@ def _end_tangent(s: Array, points: Array) -> Array:
 
 
 def fit_arc(points: Array) -> Arc | None:
-    """Fit an arc to vertices (n, 2) by linear least squares; None if it is off by more than `_ARC_TOLERANCE_MM`."""
+    """Fit an arc to vertices (n, 2) by linear least squares (Kasa); None if the error exceeds `_ARC_TOLERANCE_MM`."""
     if len(points) < 5:
         return None
     mean = points.mean(axis=0)
@@ -174,10 +169,10 @@ def fit_arc(points: Array) -> Arc | None:
 
 
 def fit_spline(points: Array, tangents: Sequence[Array], fit_mm: float) -> BSpline:
-    """Fit a cubic spline of few spans that follows a polyline, over its arc length.
+    """Fit a cubic spline of few spans to a polyline, parametrised by its arc length.
 
-    Interpolation through sites, halved where it strays, shows how densely knots are needed. The inner poles are then
-    least-squares fits, and every knot without which the spline does not stray is left out.
+    1. Interpolate sites of the polyline, and add sites where the error exceeds the tolerance.
+    2. Use the sites as knots of a least-squares fit, and remove every knot that the tolerance does not need.
 
     Args:
         points: vertices; shape (n, 2), n > 2; the ends are exact.
@@ -185,39 +180,45 @@ def fit_spline(points: Array, tangents: Sequence[Array], fit_mm: float) -> BSpli
         fit_mm: tolerance against the whole polyline.
     """
     s, samples, normals, vertices = _sample_edges(points)
-    s *= max(np.round(s[-1], _KNOT_DECIMALS), _LEAST_SPAN_MM) / s[-1]
+    s *= max(np.round(s[-1], _KNOT_DECIMALS), _MIN_SPAN_MM) / s[-1]
 
     def fit(knots: Array, rows: NDArray[np.intp] | slice) -> tuple[BSpline, NDArray[np.bool_]]:
-        """Fit a spline to some samples; tell at which of all it is within the tolerance."""
+        """Fit a spline to some samples; return it, and which of all samples are within the tolerance."""
         padded = np.concatenate([[knots[0]] * 3, knots, [knots[-1]] * 3])
         basis = BSpline.design_matrix(s, padded, 3).toarray()
         poles = _fit_poles(knots, basis[rows], samples[rows], tangents)
         error = basis @ poles - samples
         across = np.abs((error * normals).sum(axis=1))
-        return BSpline.construct_fast(padded, poles, 3), (across <= fit_mm) & (
-            (error**2).sum(axis=1) <= (fit_mm * _ALONG) ** 2
-        )
+        is_close = (across <= fit_mm) & ((error**2).sum(axis=1) <= (fit_mm * _ALONG_FACTOR) ** 2)
+        return BSpline.construct_fast(padded, poles, 3), is_close
 
     sites = np.unique(vertices[[0, len(vertices) // 2, -1]])
     while True:
-        best, near = fit(s[sites], sites)
-        bad = [(a, b) for a, b in pairwise(sites.tolist()) if b > a + 1 and not near[a:b].all()]
-        if not bad:
+        best, is_close = fit(s[sites], sites)
+        gaps = [(a, b) for a, b in pairwise(sites.tolist()) if b > a + 1 and not is_close[a:b].all()]
+        if not gaps:
             break
-        sites = np.union1d(sites, [_next_site(a, b, vertices) for a, b in bad])
+        sites = np.union1d(sites, [_next_site(a, b, vertices) for a, b in gaps])
     inner = np.unique(np.round(s[sites], _KNOT_DECIMALS))
-    inner = inner[(inner > _LEAST_SPAN_MM) & (inner < s[-1] - _LEAST_SPAN_MM)]
+    inner = inner[(inner > _MIN_SPAN_MM) & (inner < s[-1] - _MIN_SPAN_MM)]
     knots = np.concatenate([s[:1], inner, s[-1:]])
-    for knot in (np.nan, *knots[1:-1]):  # none, then one after the other
+    for knot in (np.nan, *knots[1:-1]):  # the first fit removes none
         fewer = knots[knots != knot]
-        curve, near = fit(fewer, slice(None))
-        if near.all():
+        curve, is_close = fit(fewer, slice(None))
+        if is_close.all():
             best, knots = curve, fewer
     return best
 
 
 def _fit_poles(knots: Array, basis: Array, samples: Array, tangents: Sequence[Array]) -> Array:
-    """Poles of the spline nearest to samples (n, 2) with exact ends and tangents; `basis` is (n, poles)."""
+    """Return the poles of the least-squares spline with given ends and tangents.
+
+    Args:
+        knots: knots without their multiplicity.
+        basis: basis functions at the samples; shape (n, poles).
+        samples: points to fit, the first and the last exactly; shape (n, 2).
+        tangents: unit directions (2,) at the ends.
+    """
     poles = np.zeros((basis.shape[1], 2))
     poles[0], poles[-1] = samples[0], samples[-1]
     poles[1] = poles[0] + (knots[1] - knots[0]) / 3 * tangents[0]
@@ -229,16 +230,16 @@ def _fit_poles(knots: Array, basis: Array, samples: Array, tangents: Sequence[Ar
 
 
 def _next_site(a: int, b: int, vertices: NDArray[np.intp]) -> int:
-    """Sample between two sites to interpolate next: the middle vertex, or the middle of an edge without one."""
+    """Return the next site between two others: the middle vertex, or the middle sample if there is no vertex."""
     inside = vertices[np.searchsorted(vertices, a, side="right") : np.searchsorted(vertices, b)]
     return int(inside[np.abs(inside - (a + b) / 2).argmin()]) if len(inside) else (a + b) // 2
 
 
 def _sample_edges(points: Array) -> tuple[Array, Array, Array, NDArray[np.intp]]:
-    """Sample every edge of a polyline: arc lengths (m,), points (m, 2), unit normals (m, 2), indices of vertices."""
+    """Sample a polyline; return arc lengths (m,), points (m, 2), unit normals (m, 2), and the indices of vertices."""
     s = arc_lengths(points)
     length = np.diff(s)
-    counts = np.maximum(_SAMPLES, np.ceil(length / _SAMPLE_MM)).astype(int)
+    counts = np.maximum(_MIN_SAMPLES, np.ceil(length / _SAMPLE_MM)).astype(int)
     vertices = np.concatenate([[0], np.cumsum(counts)])
     edge = np.append(np.repeat(np.arange(len(counts)), counts), len(counts) - 1)
     fraction = (np.arange(vertices[-1] + 1) - vertices[edge]) / counts[edge]
@@ -248,10 +249,10 @@ def _sample_edges(points: Array) -> tuple[Array, Array, Array, NDArray[np.intp]]
 
 
 def cut_spline(curve: BSpline) -> Iterator[BSpline]:
-    """Yield the parts of a cubic spline, each from 0, cut at knots so that none has more than `MAX_SPANS` spans."""
+    """Yield the pieces of a cubic spline, each from 0, cut at knots so that none has more than `MAX_SPANS` spans."""
     knots = np.unique(curve.t)
-    parts = -(-(len(knots) - 1) // MAX_SPANS)
-    cuts = knots[np.linspace(0, len(knots) - 1, parts + 1).round().astype(int)]
+    n_pieces = -(-(len(knots) - 1) // MAX_SPANS)
+    cuts = knots[np.linspace(0, len(knots) - 1, n_pieces + 1).round().astype(int)]
     for knot in cuts[1:-1]:
         curve = curve.insert_knot(knot, 3)
     for start, end in pairwise(cuts):
@@ -260,5 +261,5 @@ def cut_spline(curve: BSpline) -> Iterator[BSpline]:
 
 
 def arc_lengths(points: Array) -> Array:
-    """Return the length along a polyline (n, 2) up to each vertex; shape (n,)."""
+    """Return the arc length (n,) of a polyline (n, 2) up to each vertex."""
     return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])

@@ -1,7 +1,7 @@
-"""CAD models of what is printed, by build123d: one named and coloured solid for the tray, every ridge and number.
+"""CAD models of the printed bodies, by build123d: a named and coloured solid for the tray, every ridge and number.
 
 A ridge is the extrusion of its exact outline. It reaches into the floor and the walls, and ridges overlap where they
-cross, so that every solid can be filleted, shelled or moved by itself, and their union is the mould.
+cross: every solid can be filleted, shelled or moved on its own, and their union is the mould.
 """
 
 # pyright: reportAttributeAccessIssue=false
@@ -60,12 +60,12 @@ from padforge.fabricate.settings import DEFAULTS, FabricationSettings
 from .curves import FINE_MM, OutlineCurve, find_joints, fit_arc, insert_joints, ring_curves
 
 FIT_TOLERANCES_MM = (2e-3, 1.5e-3, 5e-4, 1e-4)
-"""Tolerances of curves against the finely drawn outlines; the next is tried where the kernel finds a solid invalid.
+"""Tolerances of curves against the finely drawn outlines, tried in order until the kernel finds a solid valid.
 
-Curves that hardly meet may cross where the outlines that they replace do not; finer ones do not.
+Fitted curves may cross where the outlines only come close; closer fits do not.
 """
 FUSE_S = 60.0
-"""Time limit for one solid of all."""
+"""Time limit for the union of all parts."""
 _FUSE = """\
 import sys, build123d
 first, *others = map(build123d.import_brep, sys.argv[2:])
@@ -73,26 +73,19 @@ build123d.export_brep(first.fuse(*others), sys.argv[1])
 """
 """Program that writes the union of files to its first argument."""
 _NUMBER_COLOUR = "#5D6B7A"
-_WELL_SIDES = 512
-"""Sides of the polygons that stand for the round wells until these become arcs."""
-_MIN_CIRCLE_CORNERS = 32
-"""Polygons of fewer corners are no circles."""
+_WELL_SIDES = 512  # of the polygons to which arcs of the round wells are fitted
+_MIN_CIRCLE_CORNERS = 32  # of a polygon that stands for a circle
 MAX_DEVIATION = 2e-4
 """Maximum relative deviation of a ridge's volume from that of its mesh."""
 MAX_BODY_DEVIATION = 5e-4
-"""The same for a lid with its round holes, which are polygons in the mesh, and all else of few prisms."""
+"""The same for other parts, such as a lid, whose round holes are polygons in the mesh."""
 KERNEL_ERRORS = Standard_Failure, Standard_NullObject, RuntimeError, ValueError
-"""What the CAD kernel raises, and build123d about what it was given."""
-_DECIMALS = 5
-"""Decimals of points, mm: a hundredth of a micrometre. More would only lengthen a STEP file."""
-_LEAST_EDGE_MM = 2e-5
-"""Of an outline: two points remain two when they are rounded."""
-_AREA_TOLERANCE = 1e-2
-"""Relative error asked for of areas; it selects an adaptive integration, which is far more accurate."""
-_INTO_TERRACE_MM = 0.005
-"""Overlap of a terrace with the one below, so that no two faces coincide."""
-_SPACING_MM = 10.0
-"""Distance between bodies that stand side by side."""
+"""Errors of the CAD kernel and of build123d."""
+_DECIMALS = 5  # of points, mm; more would only lengthen a STEP file
+_MIN_EDGE_MM = 2e-5  # of an outline, so that rounding does not merge two points
+_AREA_TOLERANCE = 1e-2  # relative, of areas; it selects adaptive integration, whose error is far smaller
+_INTO_TERRACE_MM = 0.005  # overlap of a terrace with the one below, so that no two faces coincide
+_SPACING_MM = 10.0  # between bodies that stand side by side
 
 
 @dataclass(frozen=True)
@@ -122,8 +115,8 @@ def build_mould(pad: Morphology, settings: FabricationSettings = DEFAULTS, *, fu
         Assembly of closed solids, mm. Ridges reach into the floor and overlap where they cross.
 
     Raises:
-        InputError: settings that contradict each other or refuse this pad, or no valid solid comes out; for one solid,
-            not within `FUSE_S`.
+        InputError: settings contradict each other or do not allow this pad, the kernel makes no valid solid, or, if
+            `fused`, not within `FUSE_S`.
     """
     plan = Plan(pad, settings)
     plan.require_levels()
@@ -132,7 +125,7 @@ def build_mould(pad: Morphology, settings: FabricationSettings = DEFAULTS, *, fu
 
 
 def mould_parts(plan: Plan, name: str) -> list[CadPart]:
-    """Build the parts of the mould of a plan of what is printed; one with wells if it is called "conductive".
+    """Build the parts of a mould from its shrinkage-compensated plan; it has wells if `name` is "conductive".
 
     Raises:
         InputError: the CAD kernel finds a solid invalid at every tolerance.
@@ -150,15 +143,16 @@ def mould_parts(plan: Plan, name: str) -> list[CadPart]:
     return parts
 
 
-def _build_part(name: str, colour: str, body: Body, of: str) -> CadPart:
-    """Build a part by Boolean operations of its prisms; `of` is the printed body that it belongs to."""
+def _build_part(name: str, colour: str, body: Body, printed: str) -> CadPart:
+    """Build a part by Boolean operations of its prisms; `printed` is the name of its printed body."""
     solid = body_solid(body)
     if not (isinstance(solid, Solid) and solid.is_valid):
-        raise InputError(f"{of}: the CAD kernel finds its {name} invalid; leave step out of the formats")
+        raise InputError(f"{printed}: the CAD kernel finds its {name} invalid; leave step out of the formats")
     deviation = abs(solid.volume / build_mesh(body).volume() - 1)
     if not deviation <= MAX_BODY_DEVIATION:  # NaN fails as well
-        share = f"volume {100 * deviation:.3g} % off"
-        raise InputError(f"{of}: the CAD solid of its {name} does not match its mesh ({share}); nothing was written")
+        error = f"volume {100 * deviation:.3g} % off"
+        message = f"{printed}: the CAD solid of its {name} does not match its mesh ({error}); nothing was written"
+        raise InputError(message)
     return CadPart(_label(solid, name, colour), deviation)
 
 
@@ -167,15 +161,15 @@ def _label(shape: Solid, name: str, colour: str) -> Solid:
     return shape
 
 
-def _ridge_part(plan: Plan, fibre: int, of: str) -> CadPart:
-    """Build the ridge of a fibre at the first tolerance that gives a valid solid of its mesh's volume.
+def _ridge_part(plan: Plan, fibre: int, printed: str) -> CadPart:
+    """Build the ridge of a fibre at the first tolerance that gives a valid solid with the volume of its mesh.
 
-    The mesh is that of the finely drawn outlines: those that are printed are drawn within the mould's tolerance, which
-    leaves a thousandth of a narrow ridge's volume open.
+    That mesh has finely drawn outlines. The outlines of the printed mesh are drawn within the mould's tolerance, which
+    would change the volume of a narrow ridge by a thousandth.
     """
     name, colour = fibre_name(plan, fibre), (HORIZONTAL, VERTICAL)[plan.family(fibre)]
     top = plan.outline([fibre], 0.0, FINE_MM)
-    top = top | fibre_wells(plan, fibre, _WELL_SIDES) if of == "conductive" else top
+    top = top | fibre_wells(plan, fibre, _WELL_SIDES) if printed == "conductive" else top
     prisms = ridge_prisms(plan, [fibre], top, FINE_MM)
     volume_mm3 = build_mesh(Body(tuple(prisms))).volume()
     for fit_mm in FIT_TOLERANCES_MM:
@@ -187,14 +181,14 @@ def _ridge_part(plan: Plan, fibre: int, of: str) -> CadPart:
         if isinstance(solid, Solid) and solid.is_valid and deviation <= MAX_DEVIATION:
             has_curves = any(face.geom_type == GeomType.EXTRUSION for face in solid.faces())
             return CadPart(_label(solid, name, colour), deviation, fit_mm if has_curves else 0.0)
-    raise InputError(f"{of}: the CAD kernel finds the ridge of {name} invalid; leave step out of the formats")
+    raise InputError(f"{printed}: the CAD kernel finds the ridge of {name} invalid; leave step out of the formats")
 
 
 def _upright_volume(solid: Solid) -> float:
-    """Return the volume of a solid whose faces are horizontal or upright, mm³.
+    """Return the volume, mm³, of a solid whose faces are horizontal or vertical.
 
-    By the divergence theorem it is the integral of z n_z over the surface. The kernel's own integral over the volume is
-    off by up to 3e-3 where outlines have hundreds of edges; its adaptive one over a face is not.
+    By the divergence theorem it is the integral of z n_z over the surface. The kernel's volume integral has an error of
+    up to 3e-3 if outlines have hundreds of edges; its adaptive integral over a face is accurate.
     """
     volume_mm3 = 0.0
     for face in solid.faces().filter_by(Plane.XY):
@@ -204,7 +198,7 @@ def _upright_volume(solid: Solid) -> float:
 
 
 def _ridge_solid(plan: Plan, fibre: int, prisms: Sequence[Prism], fit_mm: float) -> Solid:
-    """Build a ridge from its terraces, drawn within `FINE_MM`, the upper first; each stands on the one below."""
+    """Build a ridge from its terraces, the upper first, drawn within `FINE_MM`; each stands on the one below."""
     *upper, lowest = prisms
     solid, below = _extrude(plan, fibre, lowest, fit_mm), lowest
     for prism in reversed(upper):
@@ -214,11 +208,11 @@ def _ridge_solid(plan: Plan, fibre: int, prisms: Sequence[Prism], fit_mm: float)
 
 
 def _extrude(plan: Plan, fibre: int, prism: Prism, fit_mm: float) -> Solid:
-    """Extrude the face inside the exact outline of a terrace of a fibre's ridge, which is one polygon."""
+    """Extrude the exact outline of a terrace of a fibre's ridge, which is a single polygon."""
     mould = plan.settings.mould
     below_mm = mould.floor_mm + plan.heights_mm[plan.layer_indices[fibre]] - prism.top_mm
     joints = find_joints(plan, fibre, mould.ridge_width_mm / 2 + below_mm * plan.settings.ridge_slope)
-    outline = shapely.remove_repeated_points(insert_joints(prism.area, joints), _LEAST_EDGE_MM)
+    outline = shapely.remove_repeated_points(insert_joints(prism.area, joints), _MIN_EDGE_MM)
     (rings,) = polygon_rings(outline)
     curves = [ring_curves(ring, joints, fit_mm) for ring in rings]
     outer, *holes = [Wire([_edge(curve, prism.bottom_mm) for curve in ring]) for ring in curves]
@@ -227,24 +221,23 @@ def _extrude(plan: Plan, fibre: int, prism: Prism, fit_mm: float) -> Solid:
 
 
 def _edge(curve: OutlineCurve, z: float) -> Edge:
-    """Return the edge of an outline's curve at a height; it begins and ends exactly at the outline's vertices."""
+    """Return the edge of an outline's curve at a height; its ends are exactly the outline's vertices."""
     start, end = [(x, y, z) for x, y in np.round(curve.points[[0, -1]], _DECIMALS).tolist()]
     if curve.spline is not None:
         poles = np.round(curve.spline.c, _DECIMALS).tolist()
         return Edge.make_bspline([(x, y, z) for x, y in poles], curve.spline.t.tolist(), 3)
     if curve.arc is not None:
         x, y, radius, angle, sweep = curve.arc
-        middle = np.round(
-            [x + radius * np.cos(angle + sweep / 2), y + radius * np.sin(angle + sweep / 2)], _DECIMALS + 2
-        )
+        half = angle + sweep / 2
+        middle = np.round([x + radius * np.cos(half), y + radius * np.sin(half)], _DECIMALS + 2)
         first, second, third = gp_Pnt(*start), gp_Pnt(*middle.tolist(), z), gp_Pnt(*end)
         arc = GC_MakeArcOfCircle(first, second, third).Value()
-        return Edge(BRepBuilderAPI_MakeEdge(arc, first, third).Edge())  # which ends exactly there
+        return Edge(BRepBuilderAPI_MakeEdge(arc, first, third).Edge())  # with these ends, unlike the arc's own
     return Edge.make_line(start, end)
 
 
 def build_parts(plan: Plan, bodies: Mapping[str, Body]) -> dict[str, list[CadPart]]:
-    """Build the parts of all bodies of a pad, in their order; moulds are built from the plan of the pad as used.
+    """Build the parts of all printed bodies of a pad from the plan of the finished pad, in their order.
 
     Raises:
         InputError: the CAD kernel finds a solid invalid.
@@ -261,7 +254,7 @@ def build_parts(plan: Plan, bodies: Mapping[str, Body]) -> dict[str, list[CadPar
 
 
 def assemble(bodies: Mapping[str, Sequence[CadPart]], plan: Plan) -> Compound:
-    """Assemble all bodies, the mould first: the lid on the rim of the mould, the others side by side."""
+    """Assemble all bodies: the mould, which is the first, the lid on its rim, the others side by side."""
     shapes = [
         Compound(label=name, children=[part.shape for part in parts]) if len(parts) > 1 else parts[0].shape
         for name, parts in bodies.items()
@@ -280,7 +273,7 @@ def assemble(bodies: Mapping[str, Sequence[CadPart]], plan: Plan) -> Compound:
 
 
 def fuse(parts: Sequence[CadPart], name: str) -> Solid:
-    """Unite the parts of a body into one solid; the kernel does so in a process that can be ended.
+    """Unite the parts of a body into one solid, in a process that is killed after `FUSE_S`.
 
     Raises:
         InputError: the kernel does not make one valid solid within `FUSE_S`.
@@ -303,7 +296,7 @@ def fuse(parts: Sequence[CadPart], name: str) -> Solid:
 
 
 def body_solid(body: Body) -> Solid | Compound:
-    """Build the `Solid` of a body by Boolean operations of its prisms, or the `Compound` of several; mm."""
+    """Build a body by Boolean operations of its prisms, mm: a `Solid`, or a `Compound` of several."""
 
     def solids(prisms: Iterable[Prism]) -> Iterator[Solid]:
         return (solid for prism in prisms for solid in prism_solids(prism))
@@ -317,12 +310,12 @@ def body_solid(body: Body) -> Solid | Compound:
 
 
 def prism_solids(prism: Prism) -> list[Solid]:
-    """Build one `Solid` for every polygon of a prism; circles become cylinders and cones."""
+    """Build one `Solid` for every polygon of a prism; circles become cylinders or cones."""
 
     def wire(ring: np.ndarray, z: float) -> Wire:
         return Wire.make_polygon([Vector(x, y, z) for x, y in ring.tolist()], close=True)
 
-    polygons, height = polygon_rings(shapely.simplify(prism.area, _LEAST_EDGE_MM)), prism.top_mm - prism.bottom_mm
+    polygons, height = polygon_rings(shapely.simplify(prism.area, _MIN_EDGE_MM)), prism.top_mm - prism.bottom_mm
     arc = None
     if len(polygons) == 1 and len(polygons[0]) == 1 and len(polygons[0][0]) >= _MIN_CIRCLE_CORNERS:
         arc = fit_arc(polygons[0][0])
@@ -344,4 +337,4 @@ def prism_solids(prism: Prism) -> list[Solid]:
     )
     sides = [[low_points[k - 1], low_points[k], high_points[k], high_points[k - 1]] for k in range(len(bottom))]
     planes = [Face(Wire.make_polygon(points, close=True)) for points in (low_points, high_points, *sides)]
-    return [Solid(Shell(planes))]  # a loft would have splines for planes
+    return [Solid(Shell(planes))]  # a loft would make splines instead of planes

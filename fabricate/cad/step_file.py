@@ -1,7 +1,7 @@
-"""STEP files of CAD models: an assembly of named and coloured parts, mm, the same bytes for the same shapes.
+"""STEP files of CAD models: an assembly of named and coloured parts, mm, with the same bytes for the same shapes.
 
-The kernel's own way to write colours orders them by the addresses of shapes, which differ from run to run, and
-build123d's export writes every point as often as it is used, which makes files half as large again.
+The kernel's writer of colours orders them by the addresses of shapes, which differ from run to run. build123d's export
+repeats every point at each use, which makes files half as large again.
 """
 
 # pyright: reportAttributeAccessIssue=false
@@ -30,8 +30,7 @@ from OCP.XCAFApp import XCAFApp_Application
 from OCP.XCAFDoc import XCAFDoc_DocumentTool, XCAFDoc_ShapeTool
 from OCP.XSControl import XSControl_WorkSession
 
-_TIMESTAMP = "2000-01-01T00:00:00"
-"""STEP files must carry a time; this one makes their bytes reproducible."""
+_TIMESTAMP = "2000-01-01T00:00:00"  # a STEP file must have one; a constant makes its bytes reproducible
 
 
 def write_step(path: Path, shape: Compound | Solid) -> None:
@@ -99,7 +98,7 @@ def _add_colours(styles: STEPConstruct_Styles, model: Any, parts: list[tuple[Any
 
 
 def _number_components(model: Any) -> None:
-    """Number the components of assemblies from 1; the kernel counts on from file to file."""
+    """Number the components of assemblies from 1; the kernel continues the numbers of earlier files."""
     number = 0
     for index in range(1, model.NbEntities() + 1):
         if isinstance(entity := model.Value(index), StepRepr_NextAssemblyUsageOccurrence):

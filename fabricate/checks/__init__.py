@@ -19,7 +19,7 @@ class Finding:
         measured: measured value, in the unit of the message; mm unless it names another.
         limit: limit of the measured value, in the same unit.
         message: one sentence for the user.
-        positions_mm: (x, y) from the pad's centre, or in the frame of a mesh file; empty where none applies.
+        positions_mm: (x, y) from the pad's centre, or in the frame of a mesh file; empty if there is none.
     """
 
     name: str
@@ -37,12 +37,12 @@ class Finding:
 def check_result(
     name: str, status: Status | bool, measured: Number, limit: Number, message: str, positions: Iterable[Any] = ()
 ) -> Finding:
-    """Build a finding from its status, or from whether it passes, and from coordinates (n, 2), mm, of any kind."""
+    """Return a finding; `status` may also be whether the check passes, `positions` any sequence of (x, y), mm."""
     if not isinstance(status, str):
         status = "pass" if status else "fail"
     return Finding(name, status, measured, limit, message, tuple((float(x), float(y)) for x, y in positions))
 
 
 def grade(measured: float, limit: float) -> Status:
-    """Grade a thickness: pass from `limit` up, warn below it, fail where nothing remains."""
+    """Grade a thickness: pass from `limit` up, warn below it, fail at 0 and below."""
     return "pass" if measured >= limit - 1e-9 else "warn" if measured > 0 else "fail"

@@ -1,4 +1,4 @@
-"""Checks on a triangle mesh without its plan: whether it is a solid that prints and releases its casting."""
+"""Checks on a triangle mesh without its plan: whether it is a solid that can be printed and releases its casting."""
 
 import math
 from collections.abc import Sequence
@@ -32,10 +32,8 @@ from padforge.fabricate.settings import DEFAULTS, PrinterSettings
 
 SOLID_CHECKS = ("manifold", "watertight", "bodies", "volume", "genus")
 """The checks that any solid must pass."""
-_MIN_SIDE_MM = 5.0
-"""Longest side of a mesh that may be a mould: what is smaller is in another unit."""
-_MAX_METRES_MM = 0.5
-"""Longest side, read as mm, of a mesh that is in metres; a larger one that is too small is in inches."""
+_MIN_SIDE_MM = 5.0  # longest side of the smallest mould; smaller meshes are in another unit
+_MAX_METRES_MM = 0.5  # longest side, read as mm, of a mesh in metres; other meshes that are too small are in inches
 _POSES = {
     "down": np.diag([1, -1, -1]),
     "to the left": np.array([[0, 0, 1], [0, 1, 0], [-1, 0, 0]]),
@@ -43,9 +41,8 @@ _POSES = {
     "to the near side": np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]]),
     "to the far side": np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]]),
 }
-"""Ways that the open side of a mould may face by mistake, and the rotations that right it."""
-_MIN_CAST_SHARE = 0.3
-"""Share of a mould's footprint that is cast in; funnels and holes of other bodies have less."""
+"""Directions that the open side of a mould may face by mistake, and the rotations that correct it."""
+_MIN_CAST_SHARE = 0.3  # minimum fraction of a mould's footprint that is cast in; funnels and holes have less
 _MAX_SHELLS = 100  # shells that are classified as bodies or hollows; more are debris, and all count as bodies
 
 
@@ -57,7 +54,7 @@ def check_mesh(
     Args:
         path: STL or 3MF file.
         printer: nozzle, layer and bed.
-        min_silicone_mm: least thickness of the silicone between tracks.
+        min_silicone_mm: minimum thickness of the silicone between tracks.
         genus: required number of through holes; None if unknown.
 
     Returns:
@@ -80,25 +77,25 @@ def check_triangles(
     """Run all checks on a mesh that stands as it is printed, open side up.
 
     Args:
-        vertices: (n, 3) mm; equal ones are merged.
-        triangles: (m, 3) vertex indices, counter-clockwise seen from outside.
-        printer: as `check_mesh`.
-        min_silicone_mm: as `check_mesh`.
-        genus: as `check_mesh`.
-        has_plan: whether the mesh was built from a plan: that gives widths exactly and faster, and manifold3d builds
-            no surface that intersects itself.
+        vertices: vertices (n, 3), mm; equal ones are merged.
+        triangles: vertex indices (m, 3), counter-clockwise seen from outside.
+        printer: see `check_mesh`.
+        min_silicone_mm: see `check_mesh`.
+        genus: see `check_mesh`.
+        has_plan: whether the mesh was built from a plan, which is checked for widths faster and exactly, and by
+            manifold3d, which builds no surface that intersects itself.
 
     Returns:
-        SOLID_CHECKS and bed; for a solid that can be cut, wall_thickness, floor_thickness, overhang and undercut; and
-        without a plan self_intersection, ridge_width, silicone_wall and tight. A mesh too small to be in mm has unit
-        alone, and a mould that is turned has pose in place of what cannot be judged.
+        `SOLID_CHECKS` and bed; for a solid that can be cut wall_thickness, floor_thickness, overhang and undercut, and
+        without a plan self_intersection, ridge_width, silicone_wall and tight. If the mesh is too small to be in mm,
+        only unit; if a mould faces the wrong way, pose in place of the checks that need its orientation.
     """
     check_type("printer", printer, PrinterSettings)
     min_silicone_mm = check_float("min_silicone_mm", min_silicone_mm, 0, 10)
     genus = None if genus is None else check_int("genus", genus, 0, 10**6)
     mesh = TriangleMesh.weld(vertices, triangles)
     if not has_plan and (unit := _check_unit(mesh)).status == "fail":
-        return [unit]  # nothing else can be judged
+        return [unit]
     findings = [*check_solid(mesh, genus), _check_bed(mesh, printer)]
     if any(finding.name in ("manifold", "volume") and finding.status == "fail" for finding in findings):
         return findings
@@ -106,7 +103,7 @@ def check_triangles(
     cast = [slab for slab in slabs if slab.void.area]
     if not has_plan and (side := _find_open_side(mesh, slabs, printer.layer_mm)):
         message = f"it lies with its open side {side}: turn it up"
-        return [*findings, check_result("pose", False, side, "up", message)]  # nothing else can be judged
+        return [*findings, check_result("pose", False, side, "up", message)]
     findings += [
         _check_wall_thickness(cast, printer, size),
         _check_floor_thickness(mesh, printer),
@@ -124,7 +121,7 @@ def check_triangles(
 
 
 def _check_unit(mesh: TriangleMesh) -> Finding:
-    """Check that a mesh is as large as a mould can be: most files do not state their unit."""
+    """Check that a mesh is large enough for a mould, since most files do not state their unit."""
     sides = np.ptp(mesh.bounds, axis=0)
     side = float(sides.max())
     unit, factor = ("metres", 1000) if side < _MAX_METRES_MM else ("inches", 25.4)
@@ -134,7 +131,7 @@ def _check_unit(mesh: TriangleMesh) -> Finding:
 
 
 def _find_open_side(mesh: TriangleMesh, slabs: Sequence[Slab], layer_mm: float) -> str:
-    """Return where the open side of a mould faces if it is turned; "" if it is not, and for other bodies."""
+    """Return where the open side of a mould faces if that is not up; "" for other meshes."""
 
     def is_tray(mesh: TriangleMesh, slabs: Sequence[Slab]) -> bool:
         width, depth, _ = np.ptp(mesh.bounds, axis=0)
@@ -150,7 +147,7 @@ def _find_open_side(mesh: TriangleMesh, slabs: Sequence[Slab], layer_mm: float) 
 
 
 def check_solid(mesh: TriangleMesh, genus: int | None = None) -> list[Finding]:
-    """Run the SOLID_CHECKS alone, in a fraction of the time of all; `genus` is the required number of through holes."""
+    """Run only the `SOLID_CHECKS`, which are fast; `genus` is the required number of through holes."""
     status, volume = mesh.solid.status().name, float(mesh.signed_volumes.sum())
     findings = [
         check_result("manifold", status == "NoError", int(status == "NoError"), 1, f"status of manifold3d: {status}"),
@@ -162,12 +159,12 @@ def check_solid(mesh: TriangleMesh, genus: int | None = None) -> list[Finding]:
 
 
 def _deduplicate(positions: Array) -> Array:
-    """Return the first of the positions (k, 2), mm, in every square millimetre."""
+    """Return the first of the positions (k, 2), mm, in every cell of 1 mm."""
     return positions[np.sort(np.unique(np.round(positions), axis=0, return_index=True)[1])]
 
 
 def _check_edges(mesh: TriangleMesh) -> Finding:
-    """Check that two faces pass every edge, once each way: a closed surface of one orientation."""
+    """Check that every edge has two faces, in opposite directions: a closed and consistently oriented surface."""
     half_edges, (first, edge) = mesh.half_edges, mesh.edges
     count = np.bincount(edge, minlength=len(first))
     forward = np.bincount(edge, half_edges[:, 0] < half_edges[:, 1], len(first))
@@ -182,9 +179,9 @@ def _check_edges(mesh: TriangleMesh) -> Finding:
 
 
 def _check_bodies(mesh: TriangleMesh) -> Finding:
-    """Check that there is one body and no hollow: a shell turned inwards around which the others wind.
+    """Check that there is one body and no hollow, which is a shell facing inwards and enclosed by another one.
 
-    The positions are of all shells but the largest body.
+    The positions are on all shells except the largest body.
     """
     labels, first = np.unique(mesh.shells, return_index=True)
     sizes, volumes = (np.bincount(mesh.shells, x, len(labels)) for x in (mesh.areas, mesh.signed_volumes))
@@ -202,7 +199,7 @@ def _check_bodies(mesh: TriangleMesh) -> Finding:
 
 
 def _winding_number(mesh: TriangleMesh, shell: int) -> float:
-    """Compute the winding number of the other shells around a corner of `shell`: their solid angle over 4 pi.
+    """Compute the winding number, solid angle over 4 pi, of the other shells around a corner of `shell`.
 
     A. van Oosterom and J. Strackee, The solid angle of a plane triangle, IEEE Trans. Biomed. Eng. 30 (1983) 125.
     """
@@ -215,7 +212,7 @@ def _winding_number(mesh: TriangleMesh, shell: int) -> float:
 
 
 def _check_genus(mesh: TriangleMesh, expected: int) -> Finding:
-    """Check the number of through holes by Euler's formula, which holds for closed surfaces."""
+    """Check the number of through holes by Euler's formula for closed surfaces."""
     corners, edges, faces = len(np.unique(mesh.triangles)), len(mesh.edges[0]), len(mesh.triangles)
     genus = len(np.unique(mesh.shells)) - (corners - edges + faces) / 2
     message = f"{genus:g} holes lead through the solid, expected are {expected}"
@@ -223,7 +220,7 @@ def _check_genus(mesh: TriangleMesh, expected: int) -> Finding:
 
 
 def _check_bed(mesh: TriangleMesh, printer: PrinterSettings) -> Finding:
-    """Check that the body fits the printer, turned by 90 degrees if need be."""
+    """Check that the body fits the printer, if necessary turned by 90 degrees."""
     size, bed = np.ptp(mesh.bounds, axis=0).tolist(), printer.bed_mm
     fits = all(a <= b for a, b in zip([*sorted(size[:2]), size[2]], [*sorted(bed[:2]), bed[2]], strict=True))
     body, room = (" x ".join(f"{math.ceil(x * 100 - 1e-3) / 100:g}" for x in sizes) for sizes in (size, bed))
@@ -231,7 +228,7 @@ def _check_bed(mesh: TriangleMesh, printer: PrinterSettings) -> Finding:
 
 
 def _check_self_intersection(mesh: TriangleMesh, slabs: Sequence[Slab]) -> Finding:
-    """Check that the solid overlaps itself in none of its slabs, half way up."""
+    """Check that no cross section half way up a slab overlaps itself."""
     overlaps = np.vstack([find_overlaps(mesh, slab.middle_mm) for slab in slabs])
     positions = _deduplicate(overlaps)
     count = len(positions)
@@ -241,18 +238,18 @@ def _check_self_intersection(mesh: TriangleMesh, slabs: Sequence[Slab]) -> Findi
 
 
 MIN_FLOOR_MM = 0.4  # thinner floors bend when the casting is pulled out
-MIN_SILICONE_MM = 0.1  # thinner silicone does not leave the mould in one piece
-_WALL_LINES = 2  # printed lines, side by side, of a wall that holds
-_FLOOR_LAYERS = 2  # printed layers of a tight floor
-_DEPTH_STEP = 1.5  # difference of heights, in least silicone walls, above which tracks of two depths may come close
-_MAX_WALL_SLOPE = math.tan(math.radians(10))  # lean of a wall outwards per mm of height, at most
-_MAX_RIDGE_SLOPE = math.tan(math.radians(20))  # widening of a ridge on either side per mm downwards, at most
-_MIN_FLOOR_COSINE = math.cos(math.radians(10))  # cosine of the slope of a floor, at least
-_NEAR_CORNER = 0.98  # positions, from a triangle's middle to its corners, at which thickness is measured too
+MIN_SILICONE_MM = 0.1  # thinner silicone tears in demoulding
+_WALL_LINES = 2  # minimum thickness of a stable wall, in printed lines
+_FLOOR_LAYERS = 2  # minimum thickness of a tight floor, in printed layers
+_DEPTH_STEP = 1.5  # difference of heights, in minimum silicone walls, above which tracks of two depths may come close
+_MAX_WALL_SLOPE = math.tan(math.radians(10))  # outward lean of a wall per mm of height
+_MAX_RIDGE_SLOPE = math.tan(math.radians(20))  # widening of a ridge on either side per mm downwards
+_MIN_FLOOR_COSINE = math.cos(math.radians(10))  # cosine of the slope of a floor
+_NEAR_CORNER = 0.98  # thickness is also measured at this fraction of the way from a triangle's middle to its corners
 
 
 def _check_ridge_width(slabs: Sequence[Slab], printer: PrinterSettings) -> Finding:
-    """Check that everything in a layer is as wide as the printer's line."""
+    """Check that all parts of a layer are at least as wide as the printer's line."""
     limit, name = printer.line_mm, "two pixels" if printer.resin else "the nozzle"
     width, positions = _find_narrowest([(slab.cross_section, None) for slab in slabs], limit)
     message = f"nothing is narrower than {name}, {limit:g} mm"
@@ -274,7 +271,7 @@ def _check_silicone_wall(cast: Sequence[Slab], limit: float, size: float) -> Fin
 
 
 def _silicone_area(slab: Slab, cast: Sequence[Slab], limit: float) -> BaseGeometry:
-    """Return the void of a slab with the ridges that rise far above it; those near the walls stay solid."""
+    """Return the void of a slab including the ridges that rise far above it, except those near the walls."""
     taller = [other for other in cast if other.top_mm > slab.top_mm + _DEPTH_STEP * limit]
     if not taller:
         return slab.void
@@ -288,14 +285,19 @@ def _silicone_area(slab: Slab, cast: Sequence[Slab], limit: float) -> BaseGeomet
 
 
 def _find_narrowest(sections: Sequence[tuple[BaseGeometry, BaseGeometry | None]], limit: float) -> tuple[float, Array]:
-    """Find the least width below `limit` of areas, clipped to others, and the positions of all narrow parts."""
+    """Return the minimum width of areas, at most `limit`, and the positions of all narrow parts.
+
+    Args:
+        sections: pairs of an area and of an area to which its narrow parts are clipped, or None.
+        limit: width below which parts are narrow, mm.
+    """
     parts, widths = zip(*(find_narrow_parts(area, limit, within) for area, within in sections), strict=True)
     merged = shapely.get_parts(shapely.union_all(np.concatenate(parts)))  # some lie in several slabs
     return min(widths), _deduplicate(shapely.get_coordinates(shapely.point_on_surface(merged)))
 
 
 def _check_wall_thickness(cast: Sequence[Slab], printer: PrinterSettings, size: float) -> Finding:
-    """Check that the walls around the casting are two lines thick just below their rim, where they are thinnest."""
+    """Check that the walls around the casting are two lines thick just below the rim, where they are thinnest."""
     limit = _WALL_LINES * printer.nozzle_mm
     if not cast:
         return Finding("wall_thickness", "pass", size, limit, "it has no walls around a casting")
@@ -310,10 +312,10 @@ def _check_wall_thickness(cast: Sequence[Slab], printer: PrinterSettings, size: 
 
 
 def _check_floor_thickness(mesh: TriangleMesh, printer: PrinterSettings) -> Finding:
-    """Check that horizontal faces have as much solid beneath them as a tight floor needs.
+    """Check that the solid between horizontal faces is thick enough for a tight floor.
 
-    Thickness is measured upright between horizontal faces, at their middles and near their corners: towards a sharp
-    edge between a horizontal and a leaning face it vanishes, and that is no floor.
+    Thickness is measured vertically, at the middles of faces and near their corners. It is not measured against
+    leaning faces, since it vanishes at any sharp edge.
     """
     limit = max(MIN_FLOOR_MM, _FLOOR_LAYERS * printer.layer_mm)
     up, down = mesh.normal_z > _MIN_FLOOR_COSINE, mesh.normal_z < -_MIN_FLOOR_COSINE
@@ -327,7 +329,7 @@ def _check_floor_thickness(mesh: TriangleMesh, printer: PrinterSettings) -> Find
 
 
 def _measure_thickness(mesh: TriangleMesh, start: FaceMask, end: FaceMask) -> tuple[Array, Array]:
-    """Measure the solid upright from triangles `start` (m,) to triangles `end`: (k,) mm, and positions (k, 2)."""
+    """Measure the solid vertically from triangles `start` (m,) to `end` (m,); return (k,), mm, and positions (k, 2)."""
     corners, middles = mesh.corners[start], mesh.centroids[start][:, None]
     points = np.concatenate([middles, middles + _NEAR_CORNER * (corners - middles)], axis=1).reshape(-1, 3)
     inward = np.repeat(-np.sign(mesh.normal_z[start]), 4)
@@ -340,17 +342,17 @@ def _measure_thickness(mesh: TriangleMesh, start: FaceMask, end: FaceMask) -> tu
     return gaps[gaps > 0], points[point[gaps > 0], :2]
 
 
-MAX_OVERHANG_DEG = 45.0  # faces that lean farther from upright need support
-_SPARE_DEG = 1.0  # further lean of a face that still prints: an STL rounds it
-_UPRIGHT_DEG = 0.1  # faces of less lean are upright but for the rounding of their corners
-_OFF_FACE_MM = 5e-3  # distance before a face at which silicone is looked for
-_MAX_HEIGHTS = 32  # heights at which it is looked for, those of the largest faces
+MAX_OVERHANG_DEG = 45.0  # faces that lean farther from vertical need support
+_OVERHANG_TOLERANCE_DEG = 1.0  # for the rounding of an STL
+_UPRIGHT_DEG = 0.1  # faces that lean less are vertical within the rounding of their corners
+_OFF_FACE_MM = 5e-3  # distance in front of a face at which silicone is detected
+_MAX_HEIGHTS = 32  # heights at which silicone is detected, those of the largest faces
 
 
 def _check_overhang(mesh: TriangleMesh, printer: PrinterSettings) -> Finding:
-    """Check that no face leans so far that it prints on air; the first layer lies on the bed."""
+    """Check that no face above the first layer leans so far that it needs support."""
     high = mesh.corners[:, :, 2].max(axis=1) > mesh.bounds[0, 2] + printer.layer_mm
-    leaning = _leaning(mesh, MAX_OVERHANG_DEG + _SPARE_DEG) & high
+    leaning = _leaning(mesh, MAX_OVERHANG_DEG + _OVERHANG_TOLERANCE_DEG) & high
     lean = _max_lean_deg(mesh, high)
     message = f"overhangs of up to {lean:.0f}°, {MAX_OVERHANG_DEG:g}° print without support"
     positions = _deduplicate(mesh.patch_positions(leaning))
@@ -358,7 +360,7 @@ def _check_overhang(mesh: TriangleMesh, printer: PrinterSettings) -> Finding:
 
 
 def _check_undercut(mesh: TriangleMesh, lowest: Slab) -> Finding:
-    """Check that no face leans over the casting, which could then not be pulled out upwards."""
+    """Check that no face leans over the casting, which would hold it back in demoulding."""
     holding = _before_void(mesh, _leaning(mesh, _UPRIGHT_DEG), lowest)
     lean = _max_lean_deg(mesh, holding)
     message = (
@@ -369,7 +371,7 @@ def _check_undercut(mesh: TriangleMesh, lowest: Slab) -> Finding:
 
 
 def _leaning(mesh: TriangleMesh, min_deg: float) -> FaceMask:
-    """Return the faces (m,) that lean over by more than an angle from upright, specks left out."""
+    """Return the mask (m,) of faces that overhang by more than an angle from vertical, without specks."""
     leaning = mesh.normal_z < -math.sin(math.radians(min_deg))
     patch = mesh.label_patches(leaning)
     leaning[leaning] = (np.bincount(patch, mesh.areas[leaning]) > SPECK_MM2)[patch]
@@ -377,12 +379,12 @@ def _leaning(mesh: TriangleMesh, min_deg: float) -> FaceMask:
 
 
 def _max_lean_deg(mesh: TriangleMesh, mask: FaceMask) -> float:
-    """Return the greatest lean of the faces `mask` (m,), degrees from upright; 0 if none leans over."""
+    """Return the maximum overhang of the faces in `mask` (m,), degrees from vertical; 0 if there is none."""
     return math.degrees(math.asin(np.maximum(-mesh.normal_z[mask], 0.0).max(initial=0.0)))
 
 
 def _before_void(mesh: TriangleMesh, mask: FaceMask, lowest: Slab) -> FaceMask:
-    """Return the faces of `mask` (m,) with silicone before their middles: enclosed by solid, a floor beneath."""
+    """Return the faces of `mask` (m,) with silicone in front: an area enclosed by the solid, with a floor beneath."""
     faces = np.flatnonzero(mask & (mesh.centroids[:, 2] > lowest.middle_mm + _OFF_FACE_MM))
     crosses = np.cross(*np.moveaxis(np.diff(mesh.corners[faces], axis=1), 1, 0))
     normals = crosses / np.linalg.norm(crosses, axis=1, keepdims=True)
@@ -399,14 +401,14 @@ def _before_void(mesh: TriangleMesh, mask: FaceMask, lowest: Slab) -> FaceMask:
     return before
 
 
-MAX_LEAK_MM = 10.0  # wider openings in a wall are no leaks but the shape of a part that is no tray
-_NEAR_MM = 1e-3  # distance up to which areas adjoin, as they are cut on a grid
-_MIN_BASIN = 0.25  # hollow of a tray as a share of its outline, at least: less is a funnel, or a hole
-_MIN_FLOOR = 0.5  # floor of a tray as a share of what its walls enclose, at least
+MAX_LEAK_MM = 10.0  # wider openings in a wall are not leaks, but the shape of a part that is not a tray
+_NEAR_MM = 1e-3  # distance up to which areas cut on a grid adjoin
+_MIN_BASIN = 0.25  # minimum fraction of a tray's outline that is hollow; funnels and holes have less
+_MIN_FLOOR = 0.5  # minimum fraction of a tray's hollow that has a floor
 
 
 def _check_leaks(slabs: Sequence[Slab]) -> Finding:
-    """Check that no opening in wall or floor lets silicone out of what the walls enclose."""
+    """Check that no opening in wall or floor lets silicone out of the tray."""
     leaks = [plug for slab in slabs[1:] for plug in _find_wall_leaks(slab.cross_section)] + _find_floor_leaks(slabs)
     leaks = [leak.representative_point() for leak in leaks if leak.area > SPECK_MM2]
     positions = dict.fromkeys((round(leak.x, 3), round(leak.y, 3)) for leak in leaks)  # one for several slabs
@@ -416,7 +418,7 @@ def _check_leaks(slabs: Sequence[Slab]) -> Finding:
 
 
 def _find_wall_leaks(section: BaseGeometry) -> list[BaseGeometry]:
-    """Find the gaps through which walls that would enclose an area, were they closed, let it out."""
+    """Return the gaps in walls that would enclose an area without them."""
     closed = section.buffer(MAX_LEAK_MM / 2, join_style="mitre").buffer(-MAX_LEAK_MM / 2, join_style="mitre")
     basins = [shapely.Polygon(ring) for part in shapely.get_parts(areas(closed)) for ring in part.interiors]
     if not basins:
@@ -431,7 +433,7 @@ def _find_wall_leaks(section: BaseGeometry) -> list[BaseGeometry]:
 
 
 def _find_floor_leaks(slabs: Sequence[Slab]) -> list[BaseGeometry]:
-    """Find the parts of the lowest area that walls enclose with nothing beneath them down to the bed."""
+    """Return the parts of the lowest area enclosed by walls that have no solid beneath them."""
     for index, slab in enumerate(slabs[1:], 1):
         rings = [ring for part in shapely.get_parts(slab.cross_section) for ring in part.interiors]
         hollow = shapely.union_all([shapely.Polygon(ring) for ring in rings])

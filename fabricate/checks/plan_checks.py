@@ -1,4 +1,4 @@
-"""Checks on the plan of a mould: whether it prints, releases its casting, and takes the fibres."""
+"""Checks on the plan of a mould: whether it can be printed, releases its casting, and fits the fibres."""
 
 from collections.abc import Iterable, Iterator, Sequence
 from itertools import chain
@@ -30,11 +30,11 @@ def check(pad: Morphology, settings: FabricationSettings = DEFAULTS) -> list[Fin
     """Run all checks on the mould of a pad.
 
     Args:
-        pad: the fibres.
+        pad: morphology of the pad.
         settings: settings of fabrication.
 
     Raises:
-        InputError: settings that contradict each other.
+        InputError: settings contradict each other.
     """
     return check_mould(Plan(pad, settings))[-1]
 
@@ -62,10 +62,10 @@ def check_mould(plan: Plan) -> CheckedMesh:
 
 
 def check_plan(plan: Plan) -> list[Finding]:
-    """Run the checks that need no mesh: on the mould as it is printed, and on the pad as it is used.
+    """Run the checks that need no mesh, on the printed mould and on the finished pad.
 
-    Common tracks, keep-outs and bending are only checked if the settings have any, and lengths that the design of the
-    pad believes only if it says so.
+    Common tracks, keep-outs and bending are checked only if the settings mention them; thickness and depths only if the
+    design of the pad assumes a layer.
     """
     mould = plan.shrinkage_compensated
     findings = [
@@ -89,12 +89,14 @@ def check_plan(plan: Plan) -> list[Finding]:
     return findings + _check_fibre_strain(plan)
 
 
-_SLENDER, _MAX_SLENDERNESS = 5.0, 10.0  # ratios of height and width above which ridges may break, and do not print
-_FINE_MM, _FOLD_TURN = 3e-4, 0.05  # tolerance of fibres, and turn between points, rad, at which folds are looked for
-_BEND_TURN, _BEND_SLACK = 2.5e-3, 1e-3  # turn between points of a bend, rad; leads bend as tightly as allowed
+_SLENDER = 5.0  # ratio of height to width above which ridges may break
+_MAX_SLENDERNESS = 10.0  # ratio above which they cannot be printed
+_FOLD_TURN = 0.05  # turn between the points at which folds are searched, rad
+_BEND_TURN = 2.5e-3  # turn between the points of a bend, rad
+_BEND_TOLERANCE = 1e-3  # relative, of bend radii, since leads bend as tightly as allowed
 _MAX_NAMES = 8  # more fibres are counted instead of named
-_PILLAR_LINES = 2  # printed lines, side by side, of a pillar that stands
-_STRAIN_SHARE = 0.5  # share of a fibre's greatest strain that bending may use: presses take the remainder
+_PILLAR_LINES = 2  # minimum width of a stable pillar, in printed lines
+_STRAIN_SHARE = 0.5  # fraction of a fibre's maximum strain that bending may use; presses need the remainder
 
 
 def _list_fibres(noun: str, numbers: Sequence[int]) -> str:
@@ -113,7 +115,7 @@ def _ridge_middles(plan: Plan, layer: int) -> list[tuple[float, ...]]:
 
 
 def _check_ridge_width(plan: Plan) -> Finding:
-    """Check that ridges are as wide as the nozzle, or as two pixels of a resin printer."""
+    """Check that ridges are at least as wide as the nozzle, or as two pixels of a resin printer."""
     width, limit = plan.settings.mould.ridge_width_mm, plan.settings.printer.line_mm
     name = "two pixels" if plan.settings.printer.resin else "the nozzle"
     passed = width >= limit - 1e-9
@@ -123,7 +125,7 @@ def _check_ridge_width(plan: Plan) -> Finding:
 
 
 def _check_track_size(plan: Plan) -> Finding:
-    """Check that a fibre lies within its track, neither pinched nor standing out."""
+    """Check that a fibre fits into its track."""
     size = min(plan.settings.mould.ridge_width_mm, plan.depths_mm[0])
     fibre = plan.settings.fibre.material.diameter_mm
     message = f"the tightest track is {size:g} mm, the fibre {fibre:g} mm"
@@ -131,7 +133,7 @@ def _check_track_size(plan: Plan) -> Finding:
 
 
 def _check_layers(plan: Plan) -> Finding:
-    """Check that steps are of two printed layers or more, and of whole ones: others come out rounded."""
+    """Check that steps have at least two printed layers, and a whole number; slicers round others."""
     printer, mould = plan.settings.printer, plan.settings.mould
     layer = printer.layer_mm
     steps = {key: getattr(mould, key) for key in ("floor_mm", "shallow_ridge_height_mm", "deep_ridge_height_mm")}
@@ -147,7 +149,7 @@ def _check_layers(plan: Plan) -> Finding:
 
 
 def _check_slenderness(plan: Plan) -> Finding:
-    """Check that ridges are not so tall that they bend in printing or break in demoulding."""
+    """Check that ridges are not so slender that they bend in printing or break in demoulding."""
     height = plan.heights_mm[-1]
     ratio = height / plan.settings.mould.ridge_width_mm
     status: Status = "pass" if ratio <= _SLENDER + 1e-9 else "warn" if ratio <= _MAX_SLENDERNESS + 1e-9 else "fail"
@@ -157,7 +159,7 @@ def _check_slenderness(plan: Plan) -> Finding:
 
 
 def _check_crossing_gap(plan: Plan) -> Finding:
-    """Check that silicone or adhesive between crossing fibres keeps them from shorting."""
+    """Check that silicone or adhesive insulates crossing fibres."""
     limit = plan.settings.mould.min_silicone_mm
     if len(plan.depths_mm) < 2:
         return Finding("crossing_gap", "pass", 0.0, limit, "no two fibres cross: all lie at one depth")
@@ -167,7 +169,7 @@ def _check_crossing_gap(plan: Plan) -> Finding:
 
 
 def _check_same_family_crossings(plan: Plan) -> Finding:
-    """Check crossings within a family: tracks of one depth merge and their fibres touch; more depths are more work."""
+    """Check crossings within a family: at one depth tracks merge and fibres touch; further depths are more work."""
     positions, two = plan.clash_positions_mm, plan.settings.mould.levels == "two"
     count = len(positions)
     message = f"{count} crossings of fibres of one family"
@@ -178,7 +180,7 @@ def _check_same_family_crossings(plan: Plan) -> Finding:
 
 
 def _check_common_tracks(plan: Plan) -> list[Finding]:
-    """Check the length of tracks over deeper ones: without a floor, adhesive alone separates the fibres there."""
+    """Check the length of tracks over deeper ones, where only adhesive separates the fibres."""
     limit, tracks = plan.settings.rules.max_common_track_mm, plan.common_tracks
     if limit is None:
         return []
@@ -196,8 +198,7 @@ def _check_common_tracks(plan: Plan) -> list[Finding]:
 def _check_silicone_wall(plan: Plan) -> Finding:
     """Check the silicone between tracks of one depth, of two fibres or one that turns back, and keep-outs.
 
-    Silicone beside the tray's walls is left to the check of those. The least width is found by bisection to 2 % or
-    10 µm.
+    `_check_tray_wall` checks the silicone beside the walls. The minimum width is found by bisection to 2 % or 10 µm.
     """
     layout, limit = plan.pad.layout, plan.settings.mould.min_silicone_mm
     pitch = max(layout.pitch_x_mm, layout.pitch_y_mm)
@@ -210,23 +211,23 @@ def _check_silicone_wall(plan: Plan) -> Finding:
     patches = [find_thin_patches(silicone, limit, plan.cavity) for silicone in silicones]
     positions = _points_in(chain(*patches))
     low, high, regions = limit, pitch, [plan.cavity] * len(silicones)
-    if positions:  # the least width is in one of the patches: look no further than their surroundings
+    if positions:  # the minimum width is in one of the patches: search their surroundings only
         low, high, regions = 0.0, limit, [shapely.union_all(thin) for thin in patches if len(thin)]
         silicones = [silicone for silicone, thin in zip(silicones, patches, strict=True) if len(thin)]
         silicones = [overlap(area, region.buffer(2 * limit)) for area, region in zip(silicones, regions, strict=True)]
     while high - low > max(0.01, 0.02 * low):
         middle = (low + high) / 2
         pairs = zip(silicones, regions, strict=True)
-        thin = any(len(find_thin_patches(silicone, middle, region)) for silicone, region in pairs)
-        low, high = (low, middle) if thin else (middle, high)
+        is_thin = any(len(find_thin_patches(silicone, middle, region)) for silicone, region in pairs)
+        low, high = (low, middle) if is_thin else (middle, high)
     message = f"the thinnest silicone between tracks of one depth is {high:.2f} mm"
     return check_result("silicone_wall", grade(low, limit) if positions else "pass", high, limit, message, positions)
 
 
 def _check_tray_wall(plan: Plan) -> Finding:
-    """Check that a fibre keeps its distance from the tray's wall, or its track opens to the pad's side.
+    """Check the distance of fibres from the tray's wall, since a track that meets the wall opens to the pad's side.
 
-    The first stretch at either end is left out: long enough for fibres that leave the wall at 30 degrees or more.
+    The ends are excluded, over a length that suffices for fibres that leave the wall at 30 degrees or more.
     """
     half, limit = plan.settings.mould.ridge_width_mm / 2, plan.settings.mould.min_silicone_mm
     reach, wall = half + limit, plan.cavity.boundary
@@ -241,7 +242,7 @@ def _check_tray_wall(plan: Plan) -> Finding:
 
 
 def _check_cover(plan: Plan) -> Finding:
-    """Check the silicone beyond the deepest tracks, which carries the pad."""
+    """Check the thickness of silicone over the deepest tracks, which holds the pad together."""
     thickness, nominal = plan.silicone_mm, plan.settings.mould.silicone_mm
     cover = thickness - plan.heights_mm[-1]
     message = f"{cover:g} mm of silicone lie beyond the deepest tracks"
@@ -252,18 +253,18 @@ def _check_cover(plan: Plan) -> Finding:
 
 
 def _check_believed_layer(plan: Plan) -> Iterator[Finding]:
-    """Check that the pad is as thick, and its fibres lie as deep, as its design believes.
+    """Check the thickness of the pad and the depths of its fibres against those assumed by its design.
 
-    Either face of the pad may be the one that is pressed, for all fibres.
+    The pressed face may be either one, but the same for all fibres.
     """
     contact = contact_designed_for(plan.pad.provenance) or plan.settings.contact
     if contact is None or contact.model != "layer":
         return
-    thickness, believed = plan.thickness_mm, contact.thickness_mm
-    slack = CAST_SHARE * believed
-    fits = abs(thickness - believed) <= slack
-    message = f"silicone is {thickness:.4g} mm thick, the design believes {believed:.4g}"
-    yield Finding("silicone_thickness", "pass" if fits else "warn", thickness, believed, message)
+    thickness, assumed = plan.thickness_mm, contact.thickness_mm
+    tolerance = CAST_SHARE * assumed
+    fits = abs(thickness - assumed) <= tolerance
+    message = f"silicone is {thickness:.4g} mm thick, the design believes {assumed:.4g}"
+    yield Finding("silicone_thickness", "pass" if fits else "warn", thickness, assumed, message)
 
     radius = plan.settings.fibre.material.diameter_mm / 2
     depths = np.array([plan.depths_mm[layer] - radius for layer in plan.layer_indices])
@@ -277,18 +278,18 @@ def _check_believed_layer(plan: Plan) -> Iterator[Finding]:
         f"{FAMILIES[plan.family(fibre)]} fibres lie {depth:.3g} mm deep, the design believes {limit:.3g}"
         for fibre, depth, limit in zip(worst, measured, limits, strict=True)
     ]
-    fits = errors.max() <= slack
+    fits = errors.max() <= tolerance
     yield Finding("fibre_depths", "pass" if fits else "warn", measured, limits, "; ".join(parts))
 
 
 def _check_fibre_bend(plan: Plan) -> Finding:
-    """Check the bend radii of fibres and leads, as the rules measure them: a tighter fibre lifts out or breaks.
+    """Check the bend radii of fibres and leads, as measured by the design rules; a tighter fibre lifts out or breaks.
 
-    A corner where a fibre meets its lead is a bend, too: up to half a radian passes.
+    A corner between a fibre and its lead counts as a bend; up to half a radian passes.
     """
     limit = plan.settings.min_bend_radius_mm
     bends = [bend_radius(*path, limit / 2) for path in plan.trace(_BEND_TURN, limit / 2)] if limit else []
-    tight = [(fibre, *bend) for fibre, bend in enumerate(bends, 1) if bend[0] < limit * (1 - _BEND_SLACK)]
+    tight = [(fibre, *bend) for fibre, bend in enumerate(bends, 1) if bend[0] < limit * (1 - _BEND_TOLERANCE)]
     radius = min((radius for _, radius, _ in tight), default=limit)
     names = _list_fibres("fibre", [fibre for fibre, _, _ in tight])
     bent = f"{names} bent as tightly as {radius:.2f} mm" if tight else f"no fibre bends below {limit:g} mm"
@@ -297,14 +298,14 @@ def _check_fibre_bend(plan: Plan) -> Finding:
 
 
 def _check_folds(plan: Plan) -> Finding:
-    """Check for bends tighter than half a track's width, where its inner wall would run back through itself.
+    """Check for bends tighter than half a track's width, whose inner wall would intersect itself and is cut.
 
-    The wall is cut there. Ends of fibres, where every track turns as it leaves the pad, are left out.
+    The ends of fibres, where tracks turn into their leads, are excluded.
     """
     pad, mould = plan.pad, plan.settings.mould
     folds: list[Array] = []
     max_cut = 0.0
-    curves = zip(beziers(pad), slope_beziers(pad), flatten(pad, _FINE_MM / pad.unit_mm), strict=True)
+    curves = zip(beziers(pad), slope_beziers(pad), flatten(pad, 3e-4 / pad.unit_mm), strict=True)  # tolerance 3e-4 mm
     for fibre, (spans, slopes, line) in enumerate(curves):
         half = mould.ridge_width_mm / 2 + plan.heights_mm[plan.layer_indices[fibre]] * plan.settings.ridge_slope
         points, headings = trace_curve(spans, slopes, _FOLD_TURN)
@@ -321,7 +322,7 @@ def _check_folds(plan: Plan) -> Finding:
 
 
 def _find_tight_bends(points: Array, headings: Array, half: float) -> Array:
-    """Find bends of a radius below `half`: their middles, and the points `half` inwards of those, (2, k, 2)."""
+    """Return the middles of bends with a radius below `half`, and the points `half` inwards of these; (2, k, 2)."""
     turns = np.diff(headings)
     tight = np.flatnonzero(np.abs(turns) * half > np.hypot(*np.diff(points, axis=0).T))
     starts = np.flatnonzero((np.diff(tight) > 1) | (np.diff(np.sign(turns[tight])) != 0)) + 1
@@ -335,7 +336,7 @@ def _find_tight_bends(points: Array, headings: Array, half: float) -> Array:
 
 
 def _check_numbers(plan: Plan) -> Finding:
-    """Check that every fibre has its number: a track without one is easily confused with another."""
+    """Check that every fibre has its number, without which tracks are easily confused."""
     missing = [fibre for fibre, number in enumerate(plan.numbers) if number is None]
     names = _list_fibres("number", [fibre + 1 for fibre in missing])
     message = f"no room beside the fibre's start for {names}" if missing else "every number has room"
@@ -345,7 +346,7 @@ def _check_numbers(plan: Plan) -> Finding:
 
 
 def _check_keep_outs(plan: Plan) -> Iterator[Finding]:
-    """Check that no track runs into a pillar, that pillars hold, and that they do not cut the pad in two."""
+    """Check that no track runs into a pillar, and that pillars are stable and leave the pad in one piece."""
     half = plan.settings.mould.ridge_width_mm / 2 + plan.heights_mm[-1] * plan.settings.ridge_slope
     shared = {fibre: line.buffer(half, cap_style="flat") & plan.feet for fibre, line in enumerate(plan.lines, 1)}
     blocked = [fibre for fibre, area in shared.items() if area.area > 0]
@@ -355,7 +356,7 @@ def _check_keep_outs(plan: Plan) -> Iterator[Finding]:
     parts = [part for fibre in blocked for part in shapely.get_parts(shared[fibre]) if part.area > 0]
     yield check_result("keep_out", not blocked, len(blocked), 0, message, _points_in(parts))
 
-    mould = plan.shrinkage_compensated  # a pillar of one printed line bends, and a thinner one does not print
+    mould = plan.shrinkage_compensated  # a pillar of one printed line bends; a thinner one cannot be printed
     line, region = mould.settings.printer.line_mm, overlap(mould.pillars, mould.cavity)
     thin, weak = (find_thin_patches(mould.pillars, lines * line, region) for lines in (1, _PILLAR_LINES))
     status: Status = "fail" if len(thin) else "warn" if len(weak) else "pass"
@@ -371,16 +372,16 @@ def _check_keep_outs(plan: Plan) -> Iterator[Finding]:
 
 
 def compute_bending_strains(plan: Plan) -> list[tuple[float, float, Position]]:
-    """Compute the greatest strain of the fibres at every depth of a pad bent to `[pad] bent_radius_mm`.
+    """Compute the maximum strain of the fibres at every depth of a pad bent to `[pad] bent_radius_mm`.
 
-    The axis of bending is y, and the pressed face, with the tracks, is outside. A plate of thickness t whose inner face
-    lies on radius R keeps its length at the neutral radius R + t / 2. At a distance z outside of it a length dx along x
-    becomes dx (1 + z / (R + t / 2)), and one along y stays. An element at angle a to x is (cos a, sin a) ds, and its
-    strain to first order cos(a)^2 z / (R + t / 2). A fibre lies on the bottom of its track, its axis half a diameter
-    above that.
+    The axis of bending is y, and the pressed face, with the tracks, is outside. The neutral surface of a plate of
+    thickness t with an inner radius R has the radius R + t / 2. At a distance z outside of it, lengths along x grow by
+    the factor 1 + z / (R + t / 2), and lengths along y are constant. To first order, the strain of an element at an
+    angle a to x is cos(a)^2 z / (R + t / 2). The axis of a fibre is half a diameter above the bottom of its track.
 
     Returns:
-        (depth, strain, position), the shallowest first, mm; strains below 0 are compressive; empty for a flat pad.
+        (depth, strain, position) of every layer, the shallowest first, mm; negative strains are compressive; [] for a
+        flat pad.
     """
     radius = plan.settings.pad.bent_radius_mm
     if radius is None:

@@ -20,7 +20,7 @@ from padforge.fabricate.plan import SNAP_MM, areas, overlap, without
 FaceMask = NDArray[np.bool_]
 Shapes = NDArray[np.object_]
 
-_NEEDLE_MM = 1e-3  # triangles of less height have a normal that rounding turns; their neighbours have a better one
+_NEEDLE_MM = 1e-3  # the normal of a triangle of less height is unreliable because of rounding
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,8 +28,8 @@ class TriangleMesh:
     """Triangle mesh; derived quantities are computed on first use.
 
     Attributes:
-        vertices: (n, 3) mm, all different.
-        triangles: (m, 3) vertex indices, three different ones in each row.
+        vertices: different vertices (n, 3), mm.
+        triangles: vertex indices (m, 3), three different ones in each row.
     """
 
     vertices: Array
@@ -77,7 +77,7 @@ class TriangleMesh:
 
     @cached_property
     def signed_volumes(self) -> Array:
-        """Signed volumes between triangles and the middle of the bounds, (m,) mm³; their sum is a closed shell's."""
+        """Signed volumes (m,), mm³, of the tetrahedra to the centre of the bounds; a closed shell has their sum."""
         return ((self.corners[:, 0] - self.bounds.sum(axis=0) / 2) * self._crosses).sum(axis=1) / 6
 
     @cached_property
@@ -88,7 +88,7 @@ class TriangleMesh:
 
     @cached_property
     def half_edges(self) -> Numbers:
-        """Vertex indices of the directed sides of the triangles, (3m, 2); side k is of triangle k // 3."""
+        """Vertex indices of the directed sides of the triangles, (3m, 2); side k belongs to triangle k // 3."""
         return np.stack([self.triangles, np.roll(self.triangles, -1, axis=1)], axis=2).reshape(-1, 2)
 
     @cached_property
@@ -100,7 +100,7 @@ class TriangleMesh:
 
     @cached_property
     def solid(self) -> Any:
-        """The mesh as a manifold3d `Manifold`, whatever its status."""
+        """The mesh as a manifold3d `Manifold`, which may be invalid (see its status)."""
         from manifold3d import Manifold, Mesh64
 
         return Manifold(Mesh64(np.ascontiguousarray(self.vertices), self.triangles.astype(np.uint64)))
@@ -111,17 +111,17 @@ class TriangleMesh:
         return self.label_patches(np.ones(len(self.triangles), dtype=bool))
 
     def label_patches(self, mask: FaceMask) -> Numbers:
-        """Label the patches, connected at edges, that the triangles of `mask` (m,) form; (k,), from 0."""
+        """Label the triangles of `mask` (m,) by the patch, connected at edges, that they belong to; (k,), from 0."""
         faces = np.flatnonzero(mask)
         edges = self.edges[1].reshape(-1, 3)[faces].ravel()
         order = np.argsort(edges, kind="stable")
-        same = np.flatnonzero(edges[order[1:]] == edges[order[:-1]])
-        pairs = order[same] // 3, order[same + 1] // 3
-        graph = coo_array((np.ones(len(same), dtype=np.int8), pairs), shape=(len(faces), len(faces)))
+        shared = np.flatnonzero(edges[order[1:]] == edges[order[:-1]])
+        pairs = order[shared] // 3, order[shared + 1] // 3
+        graph = coo_array((np.ones(len(shared), dtype=np.int8), pairs), shape=(len(faces), len(faces)))
         return connected_components(graph, directed=False)[1].astype(np.int64)
 
     def patch_positions(self, mask: FaceMask) -> Array:
-        """Return a position (k, 2), mm, on each patch of the triangles of `mask` (m,), in its largest triangle."""
+        """Return the centroid (k, 2), mm, of the largest triangle of each patch of the triangles of `mask` (m,)."""
         faces, labels = np.flatnonzero(mask), self.label_patches(mask)
         order = np.lexsort((-self.areas[faces], labels))
         _, first = np.unique(labels[order], return_index=True)
@@ -132,30 +132,31 @@ class TriangleMesh:
         above = self.corners[:, :, 2] > z
         next_above, ends = np.roll(above, -1, axis=1), np.roll(self.corners, -1, axis=1)
         points = []
-        for edges in (above & ~next_above, ~above & next_above):  # one of either in every triangle that is cut
+        for edges in (above & ~next_above, ~above & next_above):  # every cut triangle has one of each kind
             start, side = self.corners[edges], ends[edges] - self.corners[edges]
             points.append((start + ((z - start[:, 2]) / side[:, 2])[:, None] * side)[:, :2])
         return np.stack(points, axis=1)
 
 
-_MIN_SLABS, _MAX_SLABS = 8, 12  # moulds of up to ten layers are cut between all their horizontal faces
-_FLAT_MM = 1e-3  # faces of less rise are horizontal, and heights that differ by less are equal
-_SLOT_MM = 2.0  # narrower gaps in a wall do not open what it encloses
+_MIN_SLABS = 8
+_MAX_SLABS = 12  # moulds of up to ten layers are cut between all horizontal faces
+_FLAT_MM = 1e-3  # rise of a face below which it is horizontal, and difference of heights below which they are equal
+_SLOT_MM = 2.0  # width of a gap in a wall below which the wall counts as closed
 SPECK_MM2 = 0.01  # smaller areas are corners and the width of a line, not walls or faces
-_LINE_MM = 0.01  # narrower strips lie between two outlines of one curve, and are no walls
-_TIP = 2.0  # length of a tip, limits: what narrows to a point within it is a corner, as of strips at 29 degrees
-_PRECISION = 0.02  # relative precision of widths, or `_LINE_MM` if that is more
+_LINE_MM = 0.01  # narrower strips lie between two approximations of a curve, and are not walls
+_TIP = 2.0  # length, in limits, within which an area that narrows to a point is a corner, such as strips at 29 degrees
+_PRECISION = 0.02  # relative precision of widths, unless `_LINE_MM` is more
 
 
 @dataclass(frozen=True, eq=False)
 class Slab:
-    """Part of a solid between two heights, of nearly one cross section.
+    """Part of a solid between two heights, with a nearly constant cross section.
 
     Attributes:
-        bottom_mm: z of its lower end.
-        top_mm: z of its upper end.
-        solid: manifold3d solid that it is part of.
-        base: cross section of the solid half way up its lowest part.
+        bottom_mm: z of the lower end.
+        top_mm: z of the upper end.
+        solid: the manifold3d solid.
+        base: cross section half way up the lowest slab.
     """
 
     bottom_mm: float
@@ -165,17 +166,17 @@ class Slab:
 
     @property
     def middle_mm(self) -> float:
-        """z of its cross section."""
+        """z of the cross section."""
         return (self.bottom_mm + self.top_mm) / 2
 
     @cached_property
     def cross_section(self) -> BaseGeometry:
-        """Cross section of the solid half way up."""
+        """Cross section half way up the slab."""
         return cut_solid(self.solid, self.middle_mm)
 
     @cached_property
     def interior(self) -> BaseGeometry:
-        """Area within the outer edges of the cross section that has a floor beneath."""
+        """Area inside the outer edges of the cross section that has a floor beneath."""
         return overlap(fill_outline(self.cross_section), self.base)
 
     @cached_property
@@ -186,9 +187,9 @@ class Slab:
 
 
 def build_slabs(mesh: TriangleMesh, layer_mm: float) -> list[Slab]:
-    """Cut a solid at its largest horizontal faces, and high slabs in two until there are enough; from below.
+    """Cut a solid at its largest horizontal faces, and halve tall slabs until there are enough; from below.
 
-    Slabs of less than half a printed layer are not printed and left out, if others remain.
+    Slabs of less than half a printed layer are dropped, if others remain, since they are not printed.
     """
     (*_, low), (*_, high) = mesh.bounds.tolist()
     z = mesh.corners[:, :, 2]
@@ -214,10 +215,10 @@ def cut_solid(solid: Any, z: float) -> BaseGeometry:
 
 
 def find_overlaps(mesh: TriangleMesh, z: float) -> Array:
-    """Find where the solid overlaps itself at height `z`, mm: a position (k, 2), mm, in each such part.
+    """Return a position (k, 2), mm, in each area in which the solid overlaps itself at height `z`, mm.
 
-    The outlines of the triangles, solid on the left, wind once around every point of the solid and not at all around
-    others; where they wind twice or backwards, the surface intersects itself.
+    The winding number of the outlines, with the solid on their left, is 1 inside the solid and 0 outside; where it is
+    any other, the surface intersects itself.
     """
     segments = mesh.cut(z)
     noded = shapely.union_all(shapely.linestrings(segments), grid_size=SNAP_MM)
@@ -227,12 +228,12 @@ def find_overlaps(mesh: TriangleMesh, z: float) -> Array:
     x, y = np.moveaxis(points[:, None] - start, 2, 0)
     is_left = side[:, 0] * y > side[:, 1] * x
     rises, falls = (y >= 0) & (y < side[:, 1]), (y < 0) & (y >= side[:, 1])
-    winding = (rises & is_left).sum(axis=1) - (falls & ~is_left).sum(axis=1)
-    return points[(winding != 0) & (winding != 1)]
+    winding_number = (rises & is_left).sum(axis=1) - (falls & ~is_left).sum(axis=1)
+    return points[(winding_number != 0) & (winding_number != 1)]
 
 
 def fill_outline(area: BaseGeometry) -> BaseGeometry:
-    """Return the area within the outer edges of `area`, across slots of up to 2 mm in them."""
+    """Return the area inside the outer edges of `area`, closing slots of up to `_SLOT_MM`."""
 
     def fill(shape: BaseGeometry) -> BaseGeometry:
         return shapely.union_all(shapely.polygons(shapely.get_exterior_ring(shapely.get_parts(shape))))
@@ -242,9 +243,9 @@ def fill_outline(area: BaseGeometry) -> BaseGeometry:
 
 
 def _open(area: BaseGeometry, width: float) -> BaseGeometry:
-    """Compute the morphological opening of an area: erosion and dilation by half of `width`, corners kept sharp."""
+    """Compute the morphological opening of an area: erosion and dilation by half of `width`, with sharp corners."""
     opened = area.buffer(-width / 2, join_style="mitre").buffer(width / 2, join_style="mitre")
-    return opened if opened.is_valid else areas(shapely.make_valid(opened))  # sharp corners may grow past each other
+    return opened if opened.is_valid else areas(shapely.make_valid(opened))  # sharp corners may overlap
 
 
 def _drop_specks(area: BaseGeometry | Shapes) -> Shapes:
@@ -253,12 +254,12 @@ def _drop_specks(area: BaseGeometry | Shapes) -> Shapes:
 
 
 def find_thin_patches(area: BaseGeometry, width: float, within: BaseGeometry) -> Shapes:
-    """Find the patches (k,) that an opening of a width, mm, removes from an area, corners included, but specks."""
+    """Return the patches (k,) that an opening of a width, mm, removes from an area, with corners, without specks."""
     return _drop_specks(overlap(without(area, _open(area, width)), within))
 
 
 def _find_thin_walls(area: BaseGeometry, width: float, tip: float) -> Shapes:
-    """Find the patches narrower than `width` but tips: those that adjoin something wider once, `tip` long at most."""
+    """Return the patches narrower than `width`, except tips, which are up to `tip` long with one contact to others."""
     opened = _open(area, width)
     cores = shapely.get_parts(shapely.buffer(_drop_specks(without(area, opened)), -_LINE_MM, join_style="mitre"))
     patches = _drop_specks(np.asarray(shapely.buffer(cores, _LINE_MM, join_style="mitre")))
@@ -270,15 +271,15 @@ def _find_thin_walls(area: BaseGeometry, width: float, tip: float) -> Shapes:
 
 
 def tested_width(limit: float) -> float:
-    """Return the width below which a part fails: `limit` less the roughness of outlines and meshes, mm."""
+    """Return the width, mm, below which a part fails: `limit` minus the error of outlines and meshes."""
     return limit - min(max(0.02, 0.05 * limit), limit / 4)
 
 
 def find_narrow_parts(area: BaseGeometry, limit: float, within: BaseGeometry | None = None) -> tuple[Shapes, float]:
-    """Find the parts (k,) of an area narrower than `tested_width` of a limit, mm, clipped to another area, if any.
+    """Find the parts of an area narrower than `tested_width` of a limit, mm, clipped to another area, if any.
 
     Returns:
-        The parts, and the width of the narrowest by bisection, mm; `limit` without any.
+        The parts (k,), and the width of the narrowest, by bisection, mm; `limit` if there is none.
     """
     low, high, tip = 0.0, tested_width(limit), _TIP * limit
     parts = narrow = _find_thin_walls(area, high, tip)
@@ -296,7 +297,7 @@ def find_narrow_parts(area: BaseGeometry, limit: float, within: BaseGeometry | N
 
 
 def compute_min_width(area: BaseGeometry, limit: float) -> float:
-    """Compute the least width of an area without parts narrower than `limit`, by bisection, at most its size; mm."""
+    """Compute the minimum width, mm, of an area without parts narrower than `limit`, by bisection up to its size."""
     x_min, y_min, x_max, y_max = area.bounds
     low, high = limit, max(x_max - x_min, y_max - y_min, limit)
     while high - low > max(_LINE_MM, _PRECISION * low):

@@ -1,4 +1,4 @@
-"""Drawings of the tracks of a pad at true size, 1 unit = 1 mm, as SVG and DXF, and the words on its orientation."""
+"""Drawings of the tracks of a pad at true size, 1 unit = 1 mm, as SVG and DXF, and the sentence on its orientation."""
 
 # pyright: reportPrivateImportUsage=false
 # ezdxf does not mark what its manual imports as exported.
@@ -22,12 +22,12 @@ _NAMESPACES = {
     "xmlns": "http://www.w3.org/2000/svg",
     "xmlns:inkscape": "http://www.inkscape.org/namespaces/inkscape",
 }
-_EDGE, _NOTE = "#888", "#555555"
-"""Colours of outlines and of notes."""
+_EDGE = "#888"  # colour of outlines
+_NOTE = "#555555"  # colour of notes
 ORIENTATION_FILE = "orientation.svg"
 ORIENTATION_CAPTION = "The pad in its mould, turned over, and in use, from above and from the near side."
 ORIENTATION_LINK = f"![{ORIENTATION_CAPTION}]({ORIENTATION_FILE})"
-"""The drawing on a page that lies beside it."""
+"""Link to the drawing from a page in the same folder."""
 CROSSING_FILE = "crossing.svg"
 CROSSING_CAPTION = "The two fibres that cross nearest to each other, in section: the pad lies turned over, to scale."
 CROSSING_LINK = f"![{CROSSING_CAPTION}]({CROSSING_FILE})"
@@ -54,19 +54,15 @@ def orientation_sentence(counts: tuple[int, int], leads: str) -> str:
 
 SCALE_MM = 10.0
 """Length of the scale bar, which verifies the size of a print."""
-_TEXT_MM = 2.5
-"""Text height by drawing standards; less where the pitch is narrow."""
-_GAP_MM = 1.0
-"""Gap between the silicone and the text beside it."""
-_LETTER_MM = 0.6
-"""Width of a letter for a text height of 1, on average."""
+_TEXT_MM = 2.5  # maximum text height, by drawing standards; smaller for a narrow pitch
+_GAP_MM = 1.0  # between the silicone and the text beside it
+_LETTER_WIDTH = 0.6  # mean width of a letter, in text heights
 _VIEW = "as it lies in the tray, seen from above"
 _DESCRIPTION = (
     "True size, 1 unit = 1 mm. Seen from above as the pad lies in the tray, tracks down: the mould's ridges lie as"
     " drawn. {} Layers are in laying order, the deepest first."
 )
-_ACI = (5, 30)
-"""Blue and orange of the AutoCAD Color Index, for readers without true colour."""
+_ACI = (5, 30)  # blue and orange of the AutoCAD Color Index, for readers without true colour
 
 
 class _Label(NamedTuple):
@@ -84,12 +80,12 @@ class _TrackSheet:
 
     Attributes:
         text_mm: text height.
-        sentence: on the orientation.
+        sentence: sentence on the orientation.
         spans: Bezier control points of every fibre and its leads; shape (n, 4, 2).
         ends: start and end of every fibre at the silicone's edge; shape (F, 2, 2).
-        numbers: the fibres' numbers outside the silicone, at the starts, and at the ends of leads to one side.
+        numbers: the fibres' numbers outside the silicone, at the starts; with leads to one side, at both ends.
         scale_bar: segments of the scale bar; shape (4, 2, 2).
-        notes: text beside the scale bar and below it.
+        notes: lines of text beside the scale bar and below it.
         frame: x_min, y_min, x_max and y_max of the drawing.
     """
 
@@ -113,12 +109,12 @@ class _TrackSheet:
                 self.numbers.append(_Label(str(fibre + 1), *position, anchor, colour))
 
         bar_y = y_min - 4 * _GAP_MM - self.text_mm
-        ticks = [(x_min + share * SCALE_MM, bar_y + mm) for share, mm in ((0, 1.5), (0.5, 0.8), (1, 1.5))]
+        ticks = [(x_min + fraction * SCALE_MM, bar_y + mm) for fraction, mm in ((0, 1.5), (0.5, 0.8), (1, 1.5))]
         bar = [((x_min, bar_y), (x_min + SCALE_MM, bar_y)), *(((x, bar_y), (x, y)) for x, y in ticks)]
         self.scale_bar = np.array(bar)
         # The notes are as wide as the silicone, or as the scale bar with the two texts beside it.
-        width = max(x_max - x_min, SCALE_MM + _GAP_MM + (5 + _LETTER_MM * len(_VIEW)) * self.text_mm)
-        lines, line_mm = textwrap.wrap(self.sentence, int(width / (_LETTER_MM * self.text_mm))), 1.4 * self.text_mm
+        width = max(x_max - x_min, SCALE_MM + _GAP_MM + (5 + _LETTER_WIDTH * len(_VIEW)) * self.text_mm)
+        lines, line_mm = textwrap.wrap(self.sentence, int(width / (_LETTER_WIDTH * self.text_mm))), 1.4 * self.text_mm
         x, y, first_y = x_min + SCALE_MM + _GAP_MM, bar_y + self.text_mm / 4, bar_y - _GAP_MM - line_mm / 2
         texts = [(f"{SCALE_MM:g} mm", x, y), (_VIEW, x + 5 * self.text_mm, y)]
         texts += [(line, x_min, first_y - row * line_mm) for row, line in enumerate(lines)]
@@ -130,11 +126,11 @@ class _TrackSheet:
 
 
 def _number(value: float) -> str:
-    return f"{round(float(value), 4) + 0.0:.10g}"  # a tenth of a micrometre; + 0.0 turns -0.0 into 0.0
+    return f"{round(float(value), 4) + 0.0:.10g}"  # + 0.0 turns -0.0 into 0.0
 
 
 def _pair(point: Sequence[float] | Array) -> str:
-    """Return the coordinates of a point, y upwards, for an SVG, whose y runs downwards."""
+    """Return the coordinates of a point, y upwards, in SVG, where y points downwards."""
     return f"{_number(point[0])},{_number(-point[1])}"
 
 
@@ -144,10 +140,10 @@ def _path(points: Sequence[Array] | Array) -> str:
 
 
 def tracks_svg(plan: Plan) -> str:
-    """Draw the fibres as an SVG of true size, every PCHIP span as one cubic Bezier segment.
+    """Return an SVG of the fibres at true size, every PCHIP span as one cubic Bezier segment.
 
-    Every depth is a layer, every fibre a path that runs straight on from its ends through border and exit to the
-    silicone's edge. Further layers hold that edge, the sensor numbers beside the starts, and a scale bar.
+    Every depth is a layer, and every fibre a path with its leads, from edge to edge of the silicone. Further layers
+    contain that edge, the sensor numbers beside the starts, and a scale bar.
     """
     sheet = _TrackSheet(plan)
     x_min, y_min, x_max, y_max = sheet.frame
@@ -190,7 +186,7 @@ def tracks_svg(plan: Plan) -> str:
 
 
 def tracks_dxf(plan: Plan) -> str:
-    """Draw the fibres as a DXF R2010 in mm, every fibre as one cubic spline whose spans are the PCHIP's.
+    """Return a DXF R2010 of the fibres, mm, every fibre as one cubic spline whose spans are the PCHIP's.
 
     Layers are those of the SVG. The same plan gives the same bytes.
     """
@@ -200,7 +196,7 @@ def tracks_dxf(plan: Plan) -> str:
 
     anchors = {"start": Alignment.MIDDLE_LEFT, "middle": Alignment.MIDDLE_CENTER, "end": Alignment.MIDDLE_RIGHT}
     sheet, stream = _TrackSheet(plan), io.StringIO()
-    with ExitStack() as stack:  # keeps the time and random ids out of the file
+    with ExitStack() as stack:  # excludes the time and random ids from the file
         fixed = "write_fixed_meta_data_for_testing"
         stack.callback(setattr, ezdxf.options, fixed, getattr(ezdxf.options, fixed))
         setattr(ezdxf.options, fixed, True)
@@ -214,7 +210,7 @@ def tracks_dxf(plan: Plan) -> str:
             for fibre in layer.fibres:
                 points = _spline_points(sheet, fibre)
                 n_spans = len(points) // 3
-                # A step of 1 for every span, however short: some readers merge knots that nearly coincide.
+                # Knots at distances of 1, whatever the length of spans: some readers merge close knots.
                 knots = [0, *np.repeat(np.arange(n_spans + 1), 3).tolist(), n_spans]
                 space.add_open_spline(np.round(points, 6).tolist(), knots=knots, dxfattribs={"layer": layer.name})
         for name, labels in (("numbers", sheet.numbers), ("scale", sheet.notes)):
@@ -228,14 +224,14 @@ def tracks_dxf(plan: Plan) -> str:
         x_min, y_min, x_max, y_max = sheet.frame
         space.reset_extents((x_min, y_min, 0), (x_max, y_max, 0))
         document.set_modelspace_vport(height=y_max - y_min, center=((x_min + x_max) / 2, (y_min + y_max) / 2))
-        for kind in sorted(document.entitydb.dxf_types_in_use()):  # in the order of a set otherwise, which varies
+        for kind in sorted(document.entitydb.dxf_types_in_use()):  # a set, whose order varies
             document.classes.add_class(kind)
         document.write(stream)
     return stream.getvalue()
 
 
 def _spline_points(sheet: _TrackSheet, fibre: int) -> Array:
-    """Return the control points (3 n + 1, 2) of a fibre's n spans, with the straight ones at its ends, if any."""
+    """Return the control points (3 n + 1, 2) of a fibre's n spans, with straight ones to the silicone's edge."""
     spans, (start, end) = sheet.spans[fibre], sheet.ends[fibre]
     points = np.vstack([spans[0, :1], *spans[:, 1:]])
     if (start == points[0]).all():

@@ -1,6 +1,6 @@
-"""Sections of `fabrication.json` on casting and laying, and `laying.md`, the page for the bench that shows them.
+"""Sections of `fabrication.json` on casting and laying, and `laying.md`, the same as a page for the bench.
 
-Positions are those of the plan, on the page too.
+Positions are in the frame of the plan, also on the page.
 """
 
 import math
@@ -19,14 +19,12 @@ from padforge.fabricate.settings import MouldSettings, PrinterSettings
 
 Document = Mapping[str, Any]
 
-SURPLUS_PERCENT = 10
-"""Silicone that stays in the cup and on the stick."""
-WASTE_PERCENT = 20
-"""Fibre that breaks, or is cut too short."""
-PRINT_MM_S, RESIN_LAYER_S = 50.0, 12.0
-"""Speed along lines of filament, in the mean over a print, and time for a layer of resin: rules of thumb."""
-LAY_MIN_PER_M, LAY_MIN_PER_CROSSING = 60.0, 2.0
-"""Time to lay and seal a metre of fibre by hand, and longer for every crossing; estimates, not measured."""
+SURPLUS_PERCENT = 10  # silicone that stays in the cup and on the stick
+WASTE_PERCENT = 20  # fibre that breaks or is cut too short
+PRINT_MM_S = 50.0  # mean speed along lines of filament, a rule of thumb
+RESIN_LAYER_S = 12.0  # time for a layer of resin, a rule of thumb
+LAY_MIN_PER_M = 60.0  # time to lay and seal a metre of fibre by hand, an estimate
+LAY_MIN_PER_CROSSING = 2.0  # additional time for every crossing, an estimate
 PRINT_SETTINGS_HEAD = ("PrusaSlicer", "OrcaSlicer, Bambu Studio", "Cura", "because")
 _PRINT_SETTINGS = """\
 Layer height: {layer} | Layer height: {layer} | Layer Height: {layer} \
@@ -66,32 +64,29 @@ what is added on either side narrows the silicone between two.
 {layers:.3g} layers.
 - Calibrate the exposure: a wall that is {ridge:g} mm wide in the file must be so on the plate.
 - Wash and cure it well. Traces of resin can keep silicone from curing: try a drop on a scrap first."""
-_SOLID_MM = 0.8
-"""Thickness of solid plastic that hides the infill below it."""
+_SOLID_MM = 0.8  # thickness of solid plastic that hides the infill below it
 _MAX_WALLS = 4
-_MIN_LINE = 0.85
-"""Least width of a line, in nozzles."""
-_MAX_ROWS = 24
-"""Rows of a table of crossings that have room on a page."""
+_MIN_LINE = 0.85  # minimum width of a line, in nozzles
+_MAX_ROWS = 24  # of a table of crossings on a page
 
 
 def laying_document(plan: Plan, mould_mm3: float) -> dict[str, Any]:
     """Build the sections of the fabrication document on casting and laying, as JSON.
 
     Args:
-        plan: of the mould.
+        plan: plan of the finished pad.
         mould_mm3: volume of the mould without its pins.
 
     Returns:
-        "silicone": to mix.
-        "adhesive": volume of the tracks that it seals, by step of laying.
+        "silicone": material and amounts to mix.
+        "adhesive": volume of adhesive that seals the tracks, by step of laying.
         "order": amounts to order, and estimated hours of work.
-        "fibre": their material.
+        "fibre": material of the fibres.
         "fibres": one entry per fibre, in the order of their numbers.
-        "laying_order": the numbers laid in each step, deep first.
-        "crossings": all of them, with the thickness of silicone between the fibres.
-        "common_tracks": stretches of tracks over deeper ones that are longer than at two crossings at right angles.
-        "exits": for leads to one side, the numbers along it from left to right as the pad lies turned over.
+        "laying_order": the numbers laid in each step, the deepest first.
+        "crossings": all crossings, with the thickness of silicone between the fibres.
+        "common_tracks": stretches of tracks over deeper ones, if longer than two crossings at right angles.
+        "exits": with leads to one side, the numbers along it from left to right as the pad lies turned over.
     """
     document = {
         "silicone": _silicone(plan, mould_mm3),
@@ -117,7 +112,7 @@ def pad_document(plan: Plan) -> dict[str, Any]:
 
 
 def _silicone(plan: Plan, mould_mm3: float) -> dict[str, Any]:
-    # It fills the mould to the top of its walls: the box around the mould less the mould itself.
+    # The silicone fills the mould to the top of its walls: the bounding box less the volume of plastic.
     printed, material = plan.shrinkage_compensated, plan.settings.silicone.material
     volume_ml = (printed.tray.area * (plan.settings.mould.floor_mm + printed.silicone_mm) - mould_mm3) / 1000
     mass_g = volume_ml * material.density_g_per_ml * (1 + SURPLUS_PERCENT / 100)
@@ -135,7 +130,7 @@ def _silicone(plan: Plan, mould_mm3: float) -> dict[str, Any]:
 
 
 def _adhesive(plan: Plan) -> dict[str, Any]:
-    # Neither the fibres in the tracks nor the volume that crossing tracks share is deducted.
+    # An upper bound: it includes the fibres, and counts the volume at crossings twice.
     steps = []
     for layer in fibre_layers(plan):
         tapered = layer.depth_mm / 2 if plan.settings.ridge_slope else 0
@@ -185,7 +180,7 @@ def _crossings(plan: Plan) -> dict[str, Any]:
     for crossing in plan.crossings:
         pair = crossing.first, crossing.second
         depths = [plan.depths_mm[plan.layer_indices[fibre]] for fibre in pair]
-        # Fibres lie on the bottoms of their tracks: between two is the difference of depths less one diameter.
+        # Fibres lie at the bottom of their tracks, so that the gap is the difference of depths less one diameter.
         gap = abs(depths[0] - depths[1]) - plan.settings.fibre.material.diameter_mm
         position = [round(x, 3) for x in plan.pad.to_mm(crossing.position).tolist()]
         table.append([*(fibre_name(plan, fibre) for fibre in pair), *position, *depths, round(gap, 3)])
@@ -199,7 +194,7 @@ def _crossings(plan: Plan) -> dict[str, Any]:
 
 
 def _common_tracks(plan: Plan) -> list[dict[str, Any]]:
-    """Return the long common stretches, the longest first; tracks at a right angle have two widths in common."""
+    """Return the long common stretches, the longest first; a crossing at a right angle has a length of two widths."""
     min_mm = 4 * plan.settings.mould.ridge_width_mm
     return [
         {
@@ -214,7 +209,7 @@ def _common_tracks(plan: Plan) -> list[dict[str, Any]]:
 
 
 def laying_page(document: Document) -> str:
-    """Write `laying.md`, a page to print for the bench, from a fabrication document."""
+    """Return `laying.md`, a page to print for the bench, from a fabrication document."""
     sections = {
         "Pad": _pad_lines(document),
         "Order": _order_lines(document),
@@ -318,7 +313,7 @@ def print_settings_rows(mould: MouldSettings, printer: PrinterSettings) -> list[
     ridge_lines = "one line" if n_lines == 1 else f"{n_lines} lines"
     if ridge < printer.nozzle_mm - 1e-9:
         ridge_lines = "narrower than the nozzle: see the checks"
-    # The first layer takes up the fraction of a layer in the floor; it has half a nozzle or a layer and a half at most.
+    # The first layer contains the fraction of a layer in the floor; it is at most half a nozzle, or 1.5 layers, high.
     layers = mould.floor_mm / layer
     fraction = max(0.0, layers - math.floor(layers + 1e-6))
     max_first = min(max(1.5, printer.nozzle_mm / 2 / layer), layers)

@@ -1,6 +1,6 @@
-"""Pictures from above of a mould, of tracks and toolpath, of any mesh with findings, and of a pad's orientation.
+"""Pictures of a mould, of tracks, toolpath and crossing, of any mesh with findings, and of a pad's orientation.
 
-The same input gives the same bytes; files are small, for some are kept in git.
+The same input gives the same bytes. Files are small, since some are kept in git.
 """
 
 import math
@@ -38,40 +38,37 @@ from padforge.fabricate.plan import (
 )
 
 CARE = "#7b3fa0"
-"""Colour of warnings: unlike both families, and unlike failures."""
-_NUMBER, _HEAD, _EDGE, _GREY = "#8a867d", "#b4b0a7", "#a7a49c", "#77746c"
-"""Greys of the numbers on the floor, of the heads of screws, of outlines, and of text beside a picture."""
-_RAMP = (PAPER, "#a9c4c9", "#4f7f8e", "#24404c")
-"""Colours of a mesh from its lowest visible height to its highest."""
+"""Colour of warnings, different from both families and from failures."""
+_NUMBER = "#8a867d"  # colour of the numbers on the floor
+_HEAD = "#b4b0a7"  # colour of the heads of screws
+_EDGE = "#a7a49c"  # colour of outlines
+_GREY = "#77746c"  # colour of text beside a picture
+_RAMP = (PAPER, "#a9c4c9", "#4f7f8e", "#24404c")  # colours of a mesh from its lowest visible height to its highest
 _DPI = 100
 PIXELS = 900
 """Longer side of the axes: 14 pixels a mm for the published pad, about six for a ridge."""
-_MIN_WIDTH, _MIN_MM = 600, 1e-6
-"""Pixels, with room for a title and a legend; and the size of smaller meshes."""
-_FLAT = 1e-3
-"""Slope above which a face is not flat, and z of the normal below which it is upright."""
-_MARGIN_LEFT, _MARGIN_RIGHT, _MARGIN_TOP, _MARGIN_BOTTOM = 66, 24, 44, 62
-"""Pixels for title, ticks and axis labels; the rows of the legend come below."""
-_ROW, _COLUMNS = 21, 3
-"""Height of a row of the legend in pixels, and entries in a row."""
-_LINE, _LETTER = 15, 6.2
-"""Height of a line of the note below the legend and width of a letter in it, pixels."""
-_FAIL_MARKS, _WARN_MARKS = "osp8H", "D^v<>"
-"""Markers of the first checks that fail or warn; all further ones have a cross."""
+_MIN_WIDTH = 600  # pixels, for a title and a legend
+_FLAT = 1e-3  # mm or slope: a face is flat below it, and vertical if z of its normal is below it
+_MARGIN_LEFT, _MARGIN_RIGHT, _MARGIN_TOP, _MARGIN_BOTTOM = 66, 24, 44, 62  # pixels, for title, ticks and axis labels
+_ROW = 21  # height of a row of the legend, pixels
+_COLUMNS = 3  # entries in a row of the legend
+_LINE = 15  # height of a line of the note below the legend, pixels
+_FAIL_MARKS = "osp8H"  # markers of the first checks that fail; further ones have a cross
+_WARN_MARKS = "D^v<>"  # markers of the first checks that warn
 
 
 def draw_mould(plan: Plan, vertices: ArrayLike, triangles: ArrayLike, findings: Sequence[Finding], path: Path) -> None:
-    """Write the mesh of a mould from above as PNG: colour stands for family and height.
+    """Write a picture of a mould from above as PNG, coloured by family and height.
 
-    Every fibre has its number on the wall at both of its ends, to be read as the mould lies; those that are cast are
-    mirrored. Rings mark where a check fails and diamonds where it warns; with more checks come further marks.
+    Every fibre has its number on the wall at both ends; the numbers that are cast are mirrored. Rings and further
+    markers show where checks fail, diamonds and further ones where they warn.
 
     Args:
-        plan: of the mould.
-        vertices: (n, 3), mm.
-        triangles: (m, 3) vertex indices.
-        findings: of the checks.
-        path: of the picture.
+        plan: plan of the mould.
+        vertices: vertices (n, 3), mm.
+        triangles: vertex indices (m, 3).
+        findings: results of the checks.
+        path: file to write.
     """
     from matplotlib.patches import Patch
 
@@ -114,7 +111,7 @@ def _mould_colours(plan: Plan, corners: Array) -> NDArray[np.str_]:
 
 
 def draw_tracks(plan: Plan, path: Path) -> None:
-    """Write the fibres as they lie in the tray, from above, as PNG; the deeper of two that cross covers the other."""
+    """Write a picture of the fibres as they lie in the tray, from above, as PNG; deeper fibres cover shallower ones."""
     x_min, y_min, x_max, y_max = plan.silicone.bounds
     room = 0.06 * (x_max - x_min)
     layers, clashes, layout = fibre_layers(plan), plan.clash_positions_mm, plan.pad.layout
@@ -136,20 +133,24 @@ def draw_tracks(plan: Plan, path: Path) -> None:
 
 
 def draw_findings(vertices: ArrayLike, triangles: ArrayLike, findings: Sequence[Finding], path: Path) -> None:
-    """Write any mesh from above as PNG: colour stands for the height, marks for findings.
+    """Write a picture of any mesh from above as PNG, coloured by height, with the positions of findings.
 
-    Vertices (n, 3), mm, are finite, and there is at least one triangle (m, 3).
+    Args:
+        vertices: vertices (n, 3), mm, finite.
+        triangles: vertex indices (m, 3), m > 0.
+        findings: results of the checks.
+        path: file to write.
     """
     from matplotlib.colors import LinearSegmentedColormap
 
     points = np.asarray(vertices, dtype=float)
     corners = points[np.asarray(triangles)]
     upwards = corners[_normal_z(corners) > _FLAT]
-    z = (upwards if len(upwards) else corners)[:, :, 2]  # the underside is hidden, if the mesh has one
+    z = (upwards if len(upwards) else corners)[:, :, 2]  # the underside, if any, is hidden
     low, high, ground = float(z.min()), float(z.max()), float(points[:, 2].min())
     ramp = LinearSegmentedColormap.from_list("heights", _RAMP)
     x_min, y_min, x_max, y_max = *points[:, :2].min(axis=0).tolist(), *points[:, :2].max(axis=0).tolist()
-    bounds = (x_min, y_min, max(x_max, x_min + _MIN_MM), max(y_max, y_min + _MIN_MM))
+    bounds = (x_min, y_min, max(x_max, x_min + 1e-6), max(y_max, y_min + 1e-6))
     size = " x ".join(f"{side:.4g}" for side in np.ptp(points, axis=0))
     picture = _Picture(bounds, f"Mesh from above, {size} mm", len(_remarks(findings)))
     picture.show(corners, ramp((corners[:, :, 2].mean(axis=1) - low) / ((high - low) or 1.0)))
@@ -165,7 +166,7 @@ def _normal_z(corners: Array) -> Array:
 
 
 def _draw_layer(picture: "_Picture", plan: Plan, layer: FibreLayer) -> list[Any]:
-    """Draw the fibres of a layer with their numbers, at both ends for leads to one side; return the legend's entry."""
+    """Draw the fibres of a layer with their numbers, at both ends with leads to one side; return the legend's entry."""
     from matplotlib.patheffects import withStroke
     from shapely.ops import substring
 
@@ -191,23 +192,24 @@ def _draw_layer(picture: "_Picture", plan: Plan, layer: FibreLayer) -> list[Any]
 # Orientation
 
 TURN_DEG = 20.0
-"""Angle of the pad in use under the arm: an example."""
-_WIDTH_MM, _HEIGHT_MM, _HALF_MM = 64.0, 56.0, 21.0
-"""Width and height of a panel, and half the side of the mould in it."""
+"""Example of the angle of the pad in use under the arm."""
+_WIDTH_MM = 64.0  # of a panel
+_HEIGHT_MM = 56.0  # of a panel
+_HALF_MM = 21.0  # half the side of the mould in a panel
 _PANELS = (
     ("1  In the mould", "tracks down, numbers mirrored"),
     ("2  Turned over, left to right", "tracks up, numbers read right: lay here"),
     ("3  In use", "tracks up: this face is pressed"),
 )
-_LABEL_MM, _BESIDE_MM = 2.6, 1.2
-"""Text height, and gap between an edge and the number beside it."""
-_SLAB_MM, _TRACK_MM, _FLOOR_MM, _WALL_MM = 6.0, 1.6, 1.5, 2.0
-"""Pad, track, and floor and wall of the mould in the side views, which are not to scale."""
+_LABEL_MM = 2.6  # text height
+_SLAB_MM = 6.0  # thickness of the pad in the side views, which are not to scale
+_TRACK_MM = 1.6  # size of a track there
+_WALL_MM = 2.0  # thickness of the mould's walls there
 
 
 @dataclass(frozen=True)
 class _Panel:
-    """A view of the pad from above, its centre at (x, 0) mm, turned over if `mirrored`, then counter-clockwise."""
+    """A view of the pad from above, centred at (x, 0) mm, mirrored first, then rotated counter-clockwise."""
 
     x: float
     scale: float
@@ -215,7 +217,7 @@ class _Panel:
     turn_deg: float = 0.0
 
     def project(self, points: ArrayLike) -> Array:
-        """Return the points (n, 2) on the drawing of points (n, 2) of the plan, mm."""
+        """Transform points (n, 2) of the plan to points (n, 2) of the drawing, mm."""
         cos, sin = math.cos(math.radians(self.turn_deg)), math.sin(math.radians(self.turn_deg))
         scaled = self.scale * np.asarray(points) * [-1 if self.mirrored else 1, 1]
         return (self.x, 0.0) + scaled @ np.array([[cos, sin], [-sin, cos]])
@@ -241,7 +243,7 @@ def draw_orientation(plan: Plan, path: Path) -> None:
 
 
 def _draw_panel(picture: "_Picture", plan: Plan, panel: _Panel) -> None:
-    """Draw the pad in a panel with its axes, and every fibre's number outside the pad beside its start."""
+    """Draw the pad and its axes in a panel, with every fibre's number outside the pad, beside its start."""
     axes = picture.axes
     if not panel.mirrored:
         axes.fill(*panel.project(plan.tray.exterior.coords).T, color=FAINT)
@@ -261,7 +263,7 @@ def _draw_panel(picture: "_Picture", plan: Plan, panel: _Panel) -> None:
             for hole in holes:
                 axes.fill(*panel.project(hole).T, color=PAPER)
         start = lead.turned_mm.copy()
-        start[lead.axis] = edges[lead.axis] - (_BESIDE_MM + size / 2) / panel.scale
+        start[lead.axis] = edges[lead.axis] - (1.2 + size / 2) / panel.scale  # outside the edge
         picture.write(str(fibre + 1), panel.project([start])[0], size, color=colour, weight="bold")
     length = 0.45 * math.sqrt(math.prod(plan.cavity.bounds[2:]))
     for axis, tip in zip("xy", np.eye(2) * length, strict=True):
@@ -286,7 +288,7 @@ def _draw_sides(picture: "_Picture", plan: Plan, panels: Sequence[_Panel]) -> No
     """Draw cross-sections of all panels at the near side, where fibres start; heights are not to scale."""
     top = -_HEIGHT_MM / 2 - 6
     bottom, half = top - _SLAB_MM, plan.cavity.bounds[2] * panels[0].scale
-    floor = bottom - _FLOOR_MM
+    floor = bottom - 1.5  # the underside of the mould
 
     def box(x: float, y: float, width: float, height: float, colour: str) -> None:
         corners = [(x, y), (x + width, y), (x + width, y + height), (x, y + height)]
@@ -313,9 +315,9 @@ def _draw_sides(picture: "_Picture", plan: Plan, panels: Sequence[_Panel]) -> No
 
 
 def draw_crossing(plan: Plan, path: Path) -> None:
-    """Draw the narrowest crossing of a pad in section across the deeper fibre, the pad turned over, to scale.
+    """Draw the section of a pad's narrowest crossing, across the deeper fibre and along the upper one, to scale.
 
-    The upper fibre comes to lie along its track, which is cut lengthwise; adhesive covers both.
+    The pad is turned over, and adhesive covers both fibres.
     """
     fibre_mm, width = plan.settings.fibre.material.diameter_mm, plan.settings.mould.ridge_width_mm
     depths = [[(plan.depths_mm[plan.layer_indices[k]], k) for k in (c.first, c.second)] for c in plan.crossings]
@@ -355,8 +357,8 @@ def draw_crossing(plan: Plan, path: Path) -> None:
 def draw_toolpath(plan: Plan, steps: Sequence[Step], path: Path) -> None:
     """Draw the toolpath of the needle on the pad turned over, and the order of the fibres.
 
-    A ring with the fibre's number marks where it is fastened, a dot with its turn where it is cut. Travel moves above
-    the pad are dashed, and the needle's box is red.
+    A ring with the fibre's number marks where it is fastened, a dot with its turn where it is cut. Travel moves are
+    dashed, and the needle's box is red.
     """
     strokes, dispenser = [stroke for step in steps for stroke in step.strokes], plan.settings.dispenser
     points = np.vstack([stroke.positions_mm for stroke in strokes])
@@ -393,13 +395,13 @@ def draw_toolpath(plan: Plan, steps: Sequence[Step], path: Path) -> None:
 
 
 def _remarks(findings: Sequence[Finding]) -> list[Finding]:
-    """Return the findings with positions that fail, then those that warn."""
+    """Return the findings with positions, failures before warnings."""
     remarks = [finding for finding in findings if finding.status != "pass" and finding.positions_mm]
     return sorted(remarks, key=lambda finding: finding.status)
 
 
 class _Picture:
-    """A figure whose axes cover `bounds` (x_min, y_min, x_max, y_max), mm, in whole pixels; legend and note below."""
+    """A figure whose axes cover `bounds` (x_min, y_min, x_max, y_max), mm, with a legend and a note below."""
 
     def __init__(self, bounds: Bounds, title: str, n_entries: int, note: str = "") -> None:
         from matplotlib.figure import Figure
@@ -407,7 +409,7 @@ class _Picture:
         x_min, y_min, x_max, y_max = bounds
         axes_width, axes_height = _count_pixels(bounds)
         width = _MARGIN_LEFT + max(axes_width, _MIN_WIDTH) + _MARGIN_RIGHT
-        self.note = textwrap.wrap(note, int((width - _MARGIN_LEFT) / _LETTER))
+        self.note = textwrap.wrap(note, int((width - _MARGIN_LEFT) / 6.2))  # mean width of a letter, pixels
         legend = _ROW * math.ceil(n_entries / _COLUMNS) + 6 * (n_entries > 0)
         bottom = _MARGIN_BOTTOM + legend + _LINE * len(self.note)
         height = bottom + axes_height + _MARGIN_TOP
@@ -426,7 +428,7 @@ class _Picture:
         return length_mm * self.pixels[0] / (x_max - x_min) * 72 / _DPI
 
     def show(self, corners: Array, colours: ArrayLike) -> None:
-        """Draw triangles (m, 3, 3), mm, from above in their colours (m,), and upright ones as lines."""
+        """Draw triangles (m, 3, 3), mm, from above in their colours (m,); vertical ones are lines."""
         from matplotlib.collections import PolyCollection
         from matplotlib.colors import to_rgba_array
 
@@ -445,7 +447,7 @@ class _Picture:
             marker, positions = next(markers, "X"), np.array(finding.positions_mm).T
             label = f"{finding.status}: {finding.name} ({len(finding.positions_mm)})"
             style = {"marker": marker, "mfc": "none", "linestyle": "none", "ms": 10, "zorder": 5}
-            self.axes.plot(*positions, mec="white", mew=3.4, **style)  # sets the mark off from its background
+            self.axes.plot(*positions, mec="white", mew=3.4, **style)  # a rim around the mark
             handles += self.axes.plot(*positions, mec=colour, mew=1.5, label=label, **style)
         return handles
 
@@ -455,7 +457,7 @@ class _Picture:
         self.axes.text(x, y, text, **{"size": self.points(height_mm), "ha": "center", "va": "center", **style})
 
     def arrow(self, start: Array, end: Array) -> None:
-        """Draw an arrow with a white rim, which sets it off from its background."""
+        """Draw an arrow with a white rim."""
         for colour, width in (("white", 3.5), (INK, 1.2)):
             style = {"arrowstyle": "->", "color": colour, "linewidth": width, "shrinkA": 0, "shrinkB": 0}
             self.axes.annotate("", (end[0], end[1]), (start[0], start[1]), arrowprops=style)
@@ -498,7 +500,7 @@ class _Picture:
 
 
 def _count_pixels(bounds: Bounds) -> tuple[int, int]:
-    """Return the width and the height in pixels of x_min, y_min, x_max, y_max."""
+    """Return the width and the height of the axes for these bounds, pixels."""
     x_min, y_min, x_max, y_max = bounds
     scale = PIXELS / max(x_max - x_min, y_max - y_min)
     return max(1, round(scale * (x_max - x_min))), max(1, round(scale * (y_max - y_min)))

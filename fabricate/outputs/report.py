@@ -36,11 +36,9 @@ from padforge.fabricate.outputs.laying_page import laying_page
 from padforge.fabricate.plan import FAMILIES, FAMILY_COLOURS
 
 MAX_BYTES = 3_000_000
-"""Size of a packed mesh: base64 makes 4 MB of it, half of the maximum of a page."""
-_STEPS = np.iinfo(np.uint16).max
-"""Steps of a coordinate along a side of the box around a mesh."""
-_TOLERANCES_MM = (0.01, 0.02, 0.05, 0.1, 0.2)
-"""Tolerances to simplify a large mesh to, the last half of a common nozzle."""
+"""Maximum size of a packed mesh; base64 makes 4 MB of it, half of the maximum of a page."""
+_STEPS = np.iinfo(np.uint16).max  # steps of a coordinate along a side of the bounding box
+_TOLERANCES_MM = (0.01, 0.02, 0.05, 0.1, 0.2)  # tried in order for a large mesh; the last is half a common nozzle
 _PICTURES = ("mould.stl", "mould.png", "tracks.png", "toolpath.svg", ORIENTATION_FILE, CROSSING_FILE)
 _MAX_POSITIONS = 3
 _VIEW = """\
@@ -92,7 +90,7 @@ def pack_mesh(path: Path) -> PackedMesh | None:
         InputError: the file is missing, or holds no mesh.
     """
     corners, triangles = read_mesh(path)
-    # An STL lists the corners of each triangle anew.
+    # An STL repeats the corners that triangles share.
     vertices, indices = np.unique(corners, axis=0, return_inverse=True)
     triangles = indices.ravel()[triangles]
     packed = _pack(vertices, triangles, 0.0)
@@ -158,8 +156,8 @@ def fabrication_sections(folder: Path, document: Mapping[str, Any]) -> list[Page
     """Build the sections on a mould with its checks, and on making the pad with it.
 
     Args:
-        folder: of the fabrication's files.
-        document: its `fabrication.json`.
+        folder: folder of the fabrication's files.
+        document: contents of `fabrication.json`.
 
     Raises:
         KeyError, IndexError, TypeError, ValueError, AttributeError: the document is not as padforge writes it.
@@ -174,7 +172,7 @@ def fabrication_sections(folder: Path, document: Mapping[str, Any]) -> list[Page
 
 
 def _mould_section(folder: Path, names: Collection[str], document: Mapping[str, Any]) -> PageSection:
-    """Build the section of the view of the mould, its pictures and checks; `names` are those of files to show."""
+    """Build the section of the view of the mould, its pictures and checks; `names` are the files to show."""
     solid = folder / "mould.stl"
     mesh = pack_mesh(solid) if solid.name in names else None
     findings = document["findings"]
@@ -208,8 +206,8 @@ def _mould_section(folder: Path, names: Collection[str], document: Mapping[str, 
 
 
 def _bench_section(folder: Path, names: Collection[str], document: Mapping[str, Any]) -> PageSection:
-    """Build the section of `laying.md`, with drawings where the page links them."""
-    guide, _, _ = laying_page(document).partition("\n## Checks\n")  # which the mould's section lists in full
+    """Build the section of `laying.md`, with the drawings in place of their links."""
+    guide, _, _ = laying_page(document).partition("\n## Checks\n")  # the mould's section has the full checks
     body = []
     for link, name, caption in (
         (ORIENTATION_LINK, ORIENTATION_FILE, ORIENTATION_CAPTION),
@@ -221,7 +219,7 @@ def _bench_section(folder: Path, names: Collection[str], document: Mapping[str, 
 
 
 def _findings_table(findings: Sequence[Mapping[str, Any]]) -> str:
-    """Return a table of findings, with their first positions if they have any."""
+    """Return a table of findings with up to `_MAX_POSITIONS` of their positions."""
     rows = []
     for finding in findings:
         positions = [f"({x:.1f}, {y:.1f})" for x, y in finding["positions_mm"]]

@@ -1,8 +1,8 @@
-"""Recording by hand: a person is asked where to press, presses are detected in the readings, and all of it is kept.
+"""Recording by hand: a person is asked to press targets, and the presses are detected in the readings.
 
-Targets come in an order with short ways that still covers the whole pad every few presses. A rejected press stays in
-the recording at an unknown position: its effect on the pad shows in the presses around it. The view of a session is
-JSON, for the page (`live/pages/hand.html`), and a few lines of text for the terminal.
+The order of the targets has short distances, and covers the whole pad every few presses. A rejected press is recorded
+at an unknown position, since it influences the readings of the next presses. The view of a session is JSON, for the
+page (`live/pages/hand.html`), and a few lines of text for the terminal.
 """
 
 from collections import deque
@@ -25,12 +25,12 @@ from padforge.sense.rig.devices import Board, RigFault
 from padforge.sense.rig.streams import HISTORY, SLACK, RingBuffer, stream_board
 from padforge.sense.signals.press_detection import RELEASE_DELAY_S, TOUCH_DELAY_S, PressDetector
 
-KIND = "hand"  # of the source of such a recording, whose depths are unknown
-# Targets of a uniform plan that are ordered by a short way before the next ones: a session that ends early has covered
-# the whole pad, and drift with time is not confused with position.
+KIND = "hand"  # kind of source of such a recording, whose depths are unknown
+# A uniform plan is ordered by short distances within rounds of this many targets. Each round covers the whole pad, so
+# that a session may end early, and drift with time is not confused with position.
 ROUND = 25
-TRAIL = 12  # presses that the view shows
-UNKNOWN = (np.nan, np.nan)
+TRAIL = 12  # latest presses in the view
+UNKNOWN = (np.nan, np.nan)  # position of a rejected press
 COMMANDS = (
     {"key": "b", "command": "back", "text": "Take the last press back"},
     {"key": "s", "command": "skip", "text": "Skip this place"},
@@ -38,20 +38,22 @@ COMMANDS = (
     {"key": "q", "command": "quit", "text": "End"},
 )
 """Commands of a person, by a key or a button."""
-PATH_TOLERANCE = 0.02  # of the paths drawn, grid units
 BAR = 30  # characters of the progress bar
 
-# In the published recording, with presses detected as here, one press in 370 is weaker than MIN_RESPONSE of the usual
-# one, and one in 80 changes by more than MIN_COSINE while it is held.
-MIN_RESPONSE = 0.15  # share of the usual response, all fibres together, below which a press tells too little
-MIN_COSINE = 0.95  # of the responses early in a press and at its end, below which it was not at one position
-MIN_PRESSES = 5  # accepted presses from which on the usual response is known
-TOUCHED, UNTOUCHED = 0.5, 0.25  # distance from the baseline, share of the usual response: more, less than that
-SINK_S, RELEASE_S = 0.4, 1.0  # a touch has sunk in; a release has ended but for slow creep
+# In the published recording, with the same detection, one press in 370 has a response below MIN_RESPONSE, and one in
+# 80 a cosine below MIN_COSINE. Responses are relative to the median norm of the responses of accepted presses.
+MIN_RESPONSE = 0.15  # relative response below which a press is too weak
+MIN_COSINE = 0.95  # between the responses early and late in a press, below which the finger moved
+MIN_PRESSES = 5  # accepted presses after which relative responses are defined
+TOUCHED = 0.5  # relative deviation from the baseline above which the pad is touched
+UNTOUCHED = 0.25  # relative deviation below which it is not
+SINK_S = 0.4  # time after a touch when the finger has reached its depth
+RELEASE_S = 1.0  # time after a release when the pad has recovered, except for slow creep
 
-SETTLE_S = 2.0  # before the first press: the baseline and its noise are learnt from that
-MIN_SHOWN_S = 0.6  # a press sooner after its target was shown was meant for the one before, or is its echo
-MIN_HOLD, MAX_HOLD = 0.8, 4.0  # shares of the hold that a press has to last, and may: people lift early
+SETTLE_S = 2.0  # before the first press, to measure baseline and noise
+MIN_SHOWN_S = 0.6  # an earlier press after a target was shown was meant for the previous one, or is its echo
+MIN_HOLD = 0.8  # minimum duration of a press, in holds: people lift early
+MAX_HOLD = 4.0  # maximum duration, in holds
 
 Position = tuple[float, float]
 OnView = Callable[[dict[str, Any]], None]
@@ -59,9 +61,9 @@ PollCommands = Callable[[], Sequence[str]]
 
 
 def plan_targets(config: RigConfig) -> Array:
-    """Return the targets (Q, 2) that `[rig]` asks for: of a grid or a file in that order, or uniform ones in rounds.
+    """Return the targets (Q, 2) of `[rig]`, mm: a grid or a file in its order, or uniform ones ordered in rounds.
 
-    Uniform targets are whole millimetres: nobody hits fractions, and whole ones are found on squared paper.
+    Uniform targets are rounded to millimetres, which a person finds on squared paper.
     """
     rig = config.rig
     if rig.plan == "adaptive":
@@ -75,7 +77,7 @@ def plan_targets(config: RigConfig) -> Array:
 
 
 def _order_in_rounds(positions_mm: Array) -> Array:
-    """Order positions (Q, 2) by nearest neighbour, `ROUND` at a time, each round from where the last one ended."""
+    """Order positions (Q, 2) by nearest neighbour in rounds of `ROUND`; a round starts where the previous one ended."""
     ordered = np.empty_like(positions_mm)
     position = positions_mm[0]
     for first in range(0, len(positions_mm), ROUND):
@@ -88,7 +90,7 @@ def _order_in_rounds(positions_mm: Array) -> Array:
 
 
 def _remaining_targets(targets_mm: Array, pressed_mm: Array) -> Array:
-    """Return those of the targets (Q, 2), in order, without the positions (R, 2) already pressed, one for one."""
+    """Return the targets (Q, 2), in order, except one for each of the positions (R, 2) already pressed."""
     pressed, remaining = pressed_mm.tolist(), []
     for position in targets_mm.tolist():
         if position in pressed:
@@ -99,7 +101,7 @@ def _remaining_targets(targets_mm: Array, pressed_mm: Array) -> Array:
 
 
 def open_recorder_by_hand(config: RigConfig, board: Mapping[str, Any], resume: bool) -> tuple[Recorder, Array, Array]:
-    """Return the recorder, new or resumed, the targets (Q, 2) of its plan, and those (P, 2) still to press, mm."""
+    """Return the recorder, new or resumed, the targets (Q, 2) of its plan, and the remaining targets (P, 2), mm."""
     is_resumed = resume and (config.out / START).exists()
     if is_resumed:
         presses = read_source(config, config.rig, KIND)["plan"]["presses"]
@@ -112,16 +114,16 @@ def open_recorder_by_hand(config: RigConfig, board: Mapping[str, Any], resume: b
 
 
 class HandPhase(StrEnum):
-    """What a person is asked to do.
+    """State of a session: what the person is asked to do.
 
     SETTLE --ready--> PRESS --touch--> HOLD --held for hold_s--> LIFT --release--> WAIT --ready--> PRESS ... DONE
 
-    A touch that comes in SETTLE, WAIT or DONE leads to LIFT at once and is rejected, as is a press that was held for
-    too short or too long a time, and one whose readings say that it was too weak or that the finger moved.
+    A touch in SETTLE, WAIT or DONE leads to LIFT and is rejected. Rejected are also presses that were held for too
+    short or too long, were too weak, or moved.
     """
 
-    SETTLE = "settle"  # keep hands off before the first press
-    WAIT = "wait"  # until the pad has recovered
+    SETTLE = "settle"  # hands off before the first press
+    WAIT = "wait"  # for the pad to recover
     PRESS = "press"
     HOLD = "hold"
     LIFT = "lift"
@@ -129,35 +131,41 @@ class HandPhase(StrEnum):
 
 
 def press_responses(readings: Array, down_command: int, up_command: int) -> Array:
-    """Return the responses (2, C) of a press early, once it has sunk in, and at its end.
+    """Return the mean responses of a press in the second and in the last quarter of its hold.
 
-    They are the differences from the baseline before it, V, 0 where missing; of readings (n, C), NaN where missing.
+    Args:
+        readings: readings (n, C), V, NaN where missing.
+        down_command: index of the reading at which the press began.
+        up_command: index of the reading at which it ended.
+
+    Returns:
+        Differences (2, C) from the baseline before the press, V; 0 where missing.
     """
     quarter = max((up_command - down_command) // 4, 1)
-    early, last = down_command + quarter, up_command - 1  # the last reading may show the finger leave
-    parts = (
+    early, last = down_command + quarter, up_command - 1  # the last reading may show the release
+    windows = (
         readings[max(down_command + REST[0], 0) : down_command],
         readings[early : early + quarter],
         readings[max(last - quarter, down_command) : last],
     )
-    with np.errstate(invalid="ignore"):  # 0 / 0: no reading, NaN
-        baseline, *held = (np.nansum(part, axis=0) / np.count_nonzero(~np.isnan(part), axis=0) for part in parts)
+    with np.errstate(invalid="ignore"):  # 0 / 0 = NaN without readings
+        baseline, *held = (np.nansum(rows, axis=0) / np.count_nonzero(~np.isnan(rows), axis=0) for rows in windows)
     return np.nan_to_num(np.array(held) - baseline)
 
 
 class PressValidator:
-    """Learns the usual response and the pad's baseline from accepted presses, and checks others by them.
+    """Checks presses, and the press detector, against the responses and the baseline of accepted presses.
 
-    The detector, too: one that takes a finger that slid for one that was lifted takes the lift for the next touch, and
-    so on. But a pad that nothing touches reads as it did untouched before.
+    A detector that mistakes a sliding finger for a release takes the real release for the next touch, and so on. The
+    baseline reveals this: the readings of an untouched pad return to it.
     """
 
     def __init__(self) -> None:
-        self._norms_v: list[float] = []
+        self._norms_v: list[float] = []  # of the late responses of accepted presses
         self._baseline: Array | None = None
 
     def accept(self, responses: Array, baseline: Array) -> None:
-        """Learn from a press with these `press_responses`, from a baseline (C,) V."""
+        """Add an accepted press with these `press_responses` from a baseline (C,), V."""
         self._norms_v.append(float(np.linalg.norm(responses[1])))
         self._baseline = baseline
 
@@ -166,53 +174,60 @@ class PressValidator:
         self._norms_v.pop()
 
     def relative_response(self, volts: Array) -> float:
-        """Return the norm of (C,) V as a share of the usual response; inf before that is known."""
+        """Return the norm of a response (C,), V, over the median of accepted presses; inf before `MIN_PRESSES`."""
         if len(self._norms_v) < MIN_PRESSES:
             return np.inf
         return float(np.linalg.norm(np.nan_to_num(volts)) / np.median(self._norms_v))
 
     def rejection(self, responses: Array) -> str:
         """Return why a press with these `press_responses` is rejected, or ""."""
-        if self.relative_response(responses[1]) < MIN_RESPONSE:
+        early, late = responses
+        if self.relative_response(late) < MIN_RESPONSE:
             return "it was much weaker than the others, press deeper"
-        early, end = np.linalg.norm(responses, axis=1)
-        if responses[0] @ responses[1] < MIN_COSINE * early * end:
+        if early @ late < MIN_COSINE * np.linalg.norm(early) * np.linalg.norm(late):
             return "it changed while it was held, press one place with one finger"
         return ""
 
     def is_untouched(self, volts: Array, before: Array, held_s: float) -> bool:
-        """Return whether nothing touches a pad that the detector has touched.
+        """Return whether nothing touches the pad although a touch was detected.
 
-        Either the readings (C,) are as before the touch: that was none, or its end was missed. Or they are back at the
-        baseline: that was the end of a press that the detector had ended too soon.
+        Args:
+            volts: present readings (C,).
+            before: readings (C,) before the touch.
+            held_s: time since the touch.
         """
+        # 1. The readings equal those before the touch: it was a false detection, or the release was missed.
         if held_s > RELEASE_S and self.relative_response(volts - before) < MIN_RESPONSE:
             return True
+        # 2. They are back at the baseline, and were not before: the touch was the release of an earlier press.
         if held_s < SINK_S or self._baseline is None:
             return False
         was_touched = TOUCHED < self.relative_response(before - self._baseline) < np.inf
         return was_touched and self.relative_response(volts - self._baseline) < UNTOUCHED
 
     def is_touched(self, volts: Array) -> bool | None:
-        """Return whether something touches a pad with readings (C,) V, whatever was detected; None if that is unclear.
+        """Return whether the pad is touched, from its readings (C,), V, alone; None if that is unclear.
 
-        If nothing does, these are the baseline from now on: it drifts.
+        The readings of an untouched pad become the baseline, which drifts.
         """
-        share = np.inf if self._baseline is None else self.relative_response(volts - self._baseline)
-        if share < UNTOUCHED:
+        deviation = np.inf if self._baseline is None else self.relative_response(volts - self._baseline)
+        if deviation < UNTOUCHED:
             self._baseline = volts
             return False
-        return True if TOUCHED < share < np.inf else None
+        return True if TOUCHED < deviation < np.inf else None
 
     def reset_baseline(self) -> None:
-        """Learn the baseline anew, from the next accepted press: nothing touches the pad, whatever it reads."""
+        """Forget the baseline until the next accepted press."""
         self._baseline = None
 
 
 class PressSequence:
-    """Targets (Q, 2) to press one after the other, each asked for until a press of it is accepted.
+    """Targets to press one after the other, each until a press of it is accepted.
 
-    A press is to be held for `hold_s`, and the pad to be left alone for as long after it.
+    Args:
+        targets_mm: positions (Q, 2).
+        hold_s: time for which a press is to be held, and for which the pad is to recover after it.
+        now_s: time of the start.
     """
 
     def __init__(self, targets_mm: Array, hold_s: float, now_s: float) -> None:
@@ -220,11 +235,11 @@ class PressSequence:
         self.hold_s, self.accepted_mm = hold_s, list[Position]()
         self._since_s, self._ready_s, self._is_settling = now_s, now_s + SETTLE_S, True
         self._touched_s: float | None = None
-        self._rejection = ""  # of the press under way
+        self._rejection = ""  # why the current press is rejected
 
     @property
     def target(self) -> Position | None:
-        """The position to press; None when all are done."""
+        """The position to press; None after the last one."""
         return self.remaining[0] if self.remaining else None
 
     @property
@@ -246,18 +261,18 @@ class PressSequence:
         return HandPhase.PRESS if self.remaining else HandPhase.DONE
 
     def progress(self, now_s: float) -> float:
-        """Return how far the wait or the hold has gone, 0 to 1."""
+        """Return the elapsed fraction of the wait or the hold, 0 to 1."""
         waited = (now_s - self._since_s) / (self._ready_s - self._since_s)
         return min(max(self.held_s(now_s) / self.hold_s if self.is_pressed else waited, 0.0), 1.0)
 
     def touch(self, time_s: float) -> Position | None:
-        """Note a touch; return the target it was meant for, None if none was asked for."""
+        """Begin a press; return its target, None if none was requested."""
         self._touched_s = time_s
         self._rejection = "" if self.remaining and time_s >= self._ready_s else "it came before it was asked for"
         return None if self._rejection else self.remaining[0]
 
     def release(self, time_s: float) -> str:
-        """Note a release; return why the press is rejected, or ""."""
+        """End a press; return why it is rejected, or ""."""
         held_s, rejection = self.held_s(time_s), self._rejection
         if not rejection and held_s < MIN_HOLD * self.hold_s:
             rejection = f"it was held for {held_s:.1f} s, hold it for {self.hold_s:.1f} s"
@@ -268,23 +283,23 @@ class PressSequence:
         return rejection
 
     def wait(self, now_s: float) -> None:
-        """Wait until the pad, which is released now, has recovered."""
+        """Wait for the pad, released now, to recover."""
         self._wait_until(now_s, now_s + self.hold_s)
 
     def accept(self, now_s: float) -> None:
-        """Accept the press released last, and go on to the next target."""
+        """Accept the last press, and continue with the next target."""
         self.accepted_mm.append(self.remaining.popleft())
         self._wait_until(now_s, self._ready_s)
 
     def skip(self, now_s: float) -> None:
-        """Leave the target out, and reject the press under way, if any."""
+        """Skip the target, and reject the current press, if any."""
         self.reject("its place was skipped")
         if self.remaining:
             self.remaining.popleft()
         self._wait_until(now_s, self._ready_s)
 
     def undo(self, now_s: float) -> bool:
-        """Ask again for the press under way, or for the one accepted last; return whether it was that."""
+        """Reject the current press, or else withdraw the last accepted one; return whether the latter was done."""
         if self.is_pressed or not self.accepted_mm:
             self.reject("it was taken back")
             return False
@@ -293,37 +308,45 @@ class PressSequence:
         return True
 
     def reject(self, reason: str) -> None:
-        """Reject the press under way, if any; the first reason counts."""
+        """Reject the current press, if any; the first reason is reported."""
         self._rejection = self._rejection or reason if self.is_pressed else ""
 
     def _wait_until(self, now_s: float, until_s: float) -> None:
-        """Wait until a time, and at least until the target can have been seen."""
+        """Wait until a time, but at least until the person has seen the target."""
         self._since_s, self._ready_s = now_s, max(until_s, now_s + MIN_SHOWN_S)
 
 
 class HandSession:
-    """A session of recording by hand, of the targets (Q, 2) in this order; `n_done` presses were made before."""
+    """A session of recording by hand.
+
+    Args:
+        recorder: recorder of the session, new or resumed.
+        n_fibres: number of fibres C.
+        targets_mm: positions (Q, 2), in their order.
+        hold_s: see `PressSequence`.
+        n_done: presses of the plan made in earlier sessions.
+    """
 
     def __init__(self, recorder: Recorder, n_fibres: int, targets_mm: Array, hold_s: float, n_done: int = 0) -> None:
         self._recorder, self._n_fibres, self._n_done = recorder, n_fibres, n_done
-        # Times of a recording begin at 0, and go on a second after the last ones if it is resumed.
+        # Times begin at 0, or 1 s after the last reading of a resumed recording.
         self._start_s = recorder.last_s + 1 if np.isfinite(recorder.last_s) else 0.0
         self._zero_s: float | None = None
-        self._first = recorder.n_readings  # of this session, in the recording; other indices count from it
+        self._first = recorder.n_readings  # index in the recording of the session's first reading, which has index 0
         self._number = max(recorder.done, default=-1) + 1
         self._sequence = PressSequence(targets_mm, hold_s, self._start_s)
         self._ring, self._now_s = RingBuffer(1 + n_fibres), self._start_s
-        self._detector: PressDetector | None = PressDetector(n_fibres)  # None while it is not to be believed
+        self._detector: PressDetector | None = PressDetector(n_fibres)  # None while the pad is touched undetected
         self._detector_start, self._validator = 0, PressValidator()
         self._touched = self._down_command = self._released = 0
         self._released_s = self._start_s
-        self._baseline = np.zeros(n_fibres)  # before the press under way
+        self._baseline = np.zeros(n_fibres)  # before the current press
         self._accepted: list[tuple[int, int, int]] = []  # number, down and up command in the recording
         self._max_response_v = 1e-3
         self._message, self._rejected_mm = "", None
 
     def run(self, blocks: Iterable[tuple[Array, Array]], on_view: OnView, poll_commands: PollCommands) -> None:
-        """Record blocks of times (n,) s and readings (n, C) V until all presses are made or the command quit comes."""
+        """Record blocks of times (n,), s, and readings (n, C), V, until all presses are made or the command is quit."""
         try:
             for times_s, readings in blocks:
                 for command in poll_commands():
@@ -341,7 +364,7 @@ class HandSession:
             self._recorder.abort("the session ended")
 
     def feed(self, times_s: Array, readings: Array) -> None:
-        """Record readings (n, C) V at times (n,) s, and handle the touches and releases in them."""
+        """Record readings (n, C), V, at times (n,), s, and handle the touches and releases in them."""
         if self._zero_s is None:
             self._zero_s = float(times_s[0]) - self._start_s
         times_s = times_s - self._zero_s
@@ -366,18 +389,18 @@ class HandSession:
     def _release(self, released: int) -> None:
         up_command = max(self._ring.command_index(released, RELEASE_DELAY_S), self._touched + 1, self._down_command + 1)
         target, rejection = self._sequence.target, self._sequence.release(self._time_s(released))
-        # Of a press whose begin is no longer in the ring, by its end alone.
+        # A press whose beginning has left the ring buffer is judged by its end.
         first = max(self._down_command + REST[0], self._released, self._ring.end - HISTORY - SLACK)
         readings = self._ring.rows(first, self._ring.end)[:, 1:]
         responses = press_responses(readings, max(self._down_command - first, 1), up_command - first)
         rejection = rejection or self._validator.rejection(responses)
-        press = self._number, self._first + self._down_command, self._first + up_command
+        indices = self._first + self._down_command, self._first + up_command
         if rejection:
-            self._record_rejected(*press, rejection)
+            self._record_rejected(self._number, *indices, rejection)
             self._message, self._rejected_mm = f"not counted: {rejection}", target
         else:
             self._recorder.finish(self._first + up_command)
-            self._accepted.append(press)
+            self._accepted.append((self._number, *indices))
             self._validator.accept(responses, self._baseline)
             self._max_response_v = max(self._max_response_v, float(np.abs(responses).max()))
             self._sequence.accept(self._now_s)
@@ -403,7 +426,7 @@ class HandSession:
             self._restart_detector()
 
     def _check_detector(self) -> None:
-        """Believe the readings if they contradict the detector, and restart it."""
+        """Restart the detector if the readings contradict it."""
         rows = self._ring.rows(max(self._ring.end - HISTORY, 0), self._ring.end)
         latest = rows[np.searchsorted(rows[:, 0], self._now_s - SINK_S) :, 1:]
         volts = interpolate_gaps(latest).mean(axis=0)
@@ -418,7 +441,7 @@ class HandSession:
                 self._restart_detector()
 
     def _restart_detector(self) -> None:
-        """Nothing touches the pad, whatever was detected."""
+        """Restart the detector for an untouched pad, and reject the current press, if any."""
         if self._sequence.is_pressed:
             self._sequence.reject("nothing touches the pad")
             self._release(self._ring.end - 1)
@@ -429,10 +452,10 @@ class HandSession:
         return float(self._ring.rows(reading, reading + 1)[0, 0])
 
     def view(self) -> dict[str, Any]:
-        """Return what there is to show now, as JSON: lines, numbers of presses, and positions [x, y] in mm or None.
+        """Return the present view as JSON; positions are [x, y], mm, or None.
 
-        "progress" is of the phase, 0 to 1; "rejected" is the target of the last press if that was rejected; "swing" of
-        a fibre the difference from its baseline as a share of the largest response, None if missing.
+        "progress" is the elapsed fraction of the phase, 0 to 1; "rejected" the target of the last press if that was
+        rejected; "swing" the deviation of a fibre from its baseline over the maximum response so far, None if missing.
         """
         sequence, end = self._sequence, self._ring.end
         baseline = self._baseline if sequence.is_pressed else self._ring.baseline(end)
@@ -475,11 +498,18 @@ class HandSession:
 def record_by_hand(
     config: RigConfig, board: Board, on_view: OnView, poll_commands: PollCommands, resume: bool = False
 ) -> Recording:
-    """Record presses by hand into `config.out`, with a board that is not yet connected; `resume` what is there, if any.
+    """Record presses by hand; completed presses are on the disk even if the session fails.
 
-    What is done is on the disk whatever happens. `on_view` receives what there is to show, see `HandSession.view`;
-    `poll_commands` returns the commands, of `COMMANDS`, since its last call. Raises InputError for settings, targets or
-    a run directory that cannot be, or if no press was made; RigFault if the board or the disk failed.
+    Args:
+        config: pad, settings and run directory.
+        board: board, not yet connected.
+        on_view: receives every `HandSession.view`.
+        poll_commands: returns the commands, of `COMMANDS`, since its last call.
+        resume: whether to continue a recording in the run directory.
+
+    Raises:
+        InputError: settings, targets or the run directory are invalid, or no press was made.
+        RigFault: the board or the disk failed.
     """
     if not resume:
         check_new_recording(config.out)
@@ -500,20 +530,20 @@ def _position_text(position_mm: Position | None) -> str:
 
 
 def pad_view(pad: Morphology, title: str, mirrored: bool = False) -> dict[str, Any]:
-    """Return the constant part of the view, as JSON; of a pad `mirrored`, with its tracks up, x runs to the left."""
+    """Return the constant part of the view as JSON; if the pad is `mirrored`, with its tracks up, x points left."""
     return {
         "title": title,
         "centre_mm": [0.0, 0.0],
         "half_mm": [side / 2 for side in pad.layout.size_mm],
         "mirrored": mirrored,
-        "paths": [np.round(pad.to_mm(path), 1).tolist() for path in flatten(pad, PATH_TOLERANCE)],
+        "paths": [np.round(pad.to_mm(path), 1).tolist() for path in flatten(pad, 0.02)],  # tolerance in grid units
         "commands": COMMANDS,
         "ended": "",
     }
 
 
 def view_lines(view: Mapping[str, Any]) -> list[str]:
-    """Write the view of `HandSession.view` as text."""
+    """Return a view of `HandSession.view` as lines of text."""
     full = round(BAR * view["progress"])
     return [
         view["prompt"].upper(),

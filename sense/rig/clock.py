@@ -1,6 +1,6 @@
-"""The clock of a rig: drivers and the press loop take all their times from it.
+"""The clock of a rig, from which drivers and the press loop take all their times: the host's `time.monotonic`, s.
 
-It is the host's `time.monotonic`, s. Tests put one in its place that stands still while a thread gets no processor.
+Tests replace it by a clock that stands still while a thread gets no processor.
 """
 
 import time
@@ -16,13 +16,13 @@ def now() -> float:
 
 
 def sleep(seconds: float) -> None:
-    """Wait until so much time has passed."""
+    """Wait for a time."""
     _sources[-1][1](seconds)
 
 
 @contextmanager
 def replaced(read: Callable[[], float], wait: Callable[[float], None]) -> Iterator[None]:
-    """Take times from another clock in the body, in all threads of this process."""
+    """Return a context in which all threads of this process take their times from another clock."""
     _sources.append((read, wait))
     try:
         yield

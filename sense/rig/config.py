@@ -1,7 +1,7 @@
-"""Configuration of a recording on a rig: how the pad lies before the arm, what is recorded, and whether it may resume.
+"""Configuration of a recording on a rig: the pad's frame, what is recorded, and whether a recording may be resumed.
 
-The pad's frame comes from `[rig]`, or on a printer's bed from the holder that was printed there. A recording keeps its
-settings, plan and devices in `start.json`; it is resumed only with those that do not change what a press is.
+The pad's frame comes from `[rig]`, or on a printer's bed from the holder that was printed there. A recording stores its
+settings, plan and devices in `start.json`. It may be resumed with other settings only if presses stay comparable.
 """
 
 import json
@@ -34,20 +34,21 @@ from padforge.sense.rig.devices import Pose, RigFault
 from padforge.sense.rig.safety import check_probe
 from padforge.sense.settings import SIMULATED, Millimetres, RigSettings
 
-FABRICATION_FILE, FABRICATION_FORMAT = "fabrication.json", "padforge-fabrication/1"
+FABRICATION_FILE = "fabrication.json"
+FABRICATION_FORMAT = "padforge-fabrication/1"
 _ROUNDING_MM = 1e-6
 
-KIND = "rig"  # of the source of a recording that an arm pressed
+KIND = "rig"  # kind of source of a recording that an arm pressed
 _PLAN_KEYS = ("presses", "plan", "seed")
 _CHANGEABLE = {
     *_PLAN_KEYS,  # the plan is stored
-    *("host", "port", "baud", "printer_port", "printer_baud"),  # serial numbers are compared
+    *("host", "port", "baud", "printer_port", "printer_baud"),  # devices are compared by their serial numbers
     *("box_mm", "max_depth_mm", "max_force_n"),
     *SIMULATED,
 }
-"""Settings that may change within a recording; any other changes what a press is."""
+"""Settings that may change when a recording is resumed; any other would make its presses incomparable."""
 _IDENTITY_KEYS = {"arm": ("model", "serial", "tcp"), "board": ("name", "serial", "firmware")}
-"""Of the identity of a device, what all of a recording shares."""
+"""Keys of a device's identity that must not change when a recording is resumed."""
 
 
 @dataclass(frozen=True)
@@ -55,14 +56,14 @@ class RobotFrame:
     """The pad's frame in the arm's base frame."""
 
     centre_mm: tuple[float, float]  # of the pad
-    turn_rad: float  # from the base's y axis to the pad's
+    turn_rad: float  # angle from the base's y axis to the pad's
     contact_mm: float  # height of the pad's surface
-    tool_rad: tuple[float, float, float]  # rotation vector
-    mirrored: bool = False  # the pad lies with its tracks up: its y axis as on the plan, its x axis the other way
+    tool_rad: tuple[float, float, float]  # rotation vector of the tool
+    mirrored: bool = False  # whether the pad lies with its tracks up, which inverts its x axis
 
     @classmethod
     def from_settings(cls, rig: RigSettings) -> "RobotFrame":
-        """Return the frame that `[rig]` sets; raises RigFault if the contact height or the pad's centre is unknown."""
+        """Return the frame of `[rig]`; raises RigFault("refused") if the pad's height or centre is unknown."""
         if rig.contact_mm is None:
             message = "[rig] contact_mm is unknown, allowed is the height of the pad's surface in the base frame"
             raise RigFault("refused", message, "touch the pad with the tool by hand and note its z")
@@ -83,7 +84,7 @@ class RobotFrame:
 
     @property
     def _axes(self) -> Array:
-        """(2, 2) x and y axis of the plan in the base frame, a row each."""
+        """x and y axis of the plan in the base frame, the rows of a (2, 2) array."""
         c, s = math.cos(self.turn_rad), math.sin(self.turn_rad)
         return np.array([[-c, -s] if self.mirrored else [c, s], [-s, c]])
 
@@ -101,7 +102,7 @@ class HolderFrame(Settings):
 
 
 def cast_thickness_mm(folder: Path) -> float | None:
-    """Return the thickness of the pad that the mould in a folder casts, mm; None if there is no mould."""
+    """Return the thickness, mm, of the pad cast in the mould of a folder; None if there is no mould."""
     path = folder / FABRICATION_FILE
     if not path.is_file():
         return None
@@ -110,10 +111,11 @@ def cast_thickness_mm(folder: Path) -> float | None:
 
 
 def locate_on_bed(rig: RigSettings, folder: Path) -> RigSettings:
-    """Fill in where the pad lies on a printer's bed, and the workspace above it, from the holder in `folder`.
+    """Return settings completed with the pose of the pad on a printer's bed, and the workspace above it.
 
-    The workspace is the pad seen from above, as far as the nozzle gets; down to `max_depth_mm`, but never below the top
-    of the holder's walls. What `[rig]` sets takes precedence; what neither tells raises RigFault("refused").
+    The pose is that of the holder in `folder`. In x and y the workspace is the pad, as far as the nozzle reaches; in z
+    it ends `max_depth_mm` below the pad's surface, or at the top of the holder's walls if that is higher. Values of
+    `[rig]` take precedence; missing values raise RigFault("refused").
     """
     check_probe(rig)
     if None not in (rig.pad_mm, rig.contact_mm, rig.box_mm):
@@ -129,7 +131,7 @@ def locate_on_bed(rig: RigSettings, folder: Path) -> RigSettings:
     contact = frame.surface_mm if rig.contact_mm is None else rig.contact_mm
     side = frame.pad_mm
     half_x, half_y = (length / 2 for length in (side if isinstance(side, tuple) else (side, side)))
-    if round(frame.angle_deg / 90) % 2:  # the pad lies turned by quarters on the bed
+    if round(frame.angle_deg / 90) % 2:  # quarter turn of the pad on the bed
         half_x, half_y = half_y, half_x
     width, depth, height = frame.bed_mm
     dx, dy, dz = rig.tcp_mm or (0.0, 0.0, 0.0)
@@ -151,20 +153,20 @@ def locate_on_bed(rig: RigSettings, folder: Path) -> RigSettings:
 
 @dataclass(frozen=True)
 class RigConfig:
-    """What is to be recorded: the pad, what presses it, settings, the run directory, and where all that came from."""
+    """Configuration of a recording."""
 
     pad: Morphology
-    contact: Contact  # what a press deforms
+    contact: Contact
     rig: RigSettings
-    out: Path  # the run directory
-    command: str  # for the provenance, as are the inputs
-    inputs: Sequence[Path] = ()
-    pad_settings: PadSettings | None = None  # which part of the pad is pressed, unless a file says where
-    folder: Path = Path()  # of the pad, with what fabricate has written
+    out: Path  # run directory
+    command: str  # for the provenance
+    inputs: Sequence[Path] = ()  # files for the provenance
+    pad_settings: PadSettings | None = None  # sensed area and keep-outs; None for the whole pad
+    folder: Path = Path()  # folder of the pad, with the files of `fabricate`
 
 
 def load_or_make_plan(config: RigConfig, rig: RigSettings, resume: bool) -> PressPlan:
-    """Return the stored plan of a resumed recording, otherwise the one that `rig` asks for."""
+    """Return the stored plan of a resumed recording, otherwise a new one by `rig`."""
     if resume and (config.out / START).exists():
         plan = PressPlan.from_rows(read_source(config, rig, KIND)["plan"]["presses"])
         free = pressable_test(config.pad, fit_pad_settings(config.pad, config.pad_settings))
@@ -173,7 +175,11 @@ def load_or_make_plan(config: RigConfig, rig: RigSettings, resume: bool) -> Pres
 
 
 def read_source(config: RigConfig, rig: RigSettings, kind: str) -> dict[str, Any]:
-    """Return the source of the recording to resume; raises InputError if it was begun otherwise or has no plan."""
+    """Return the source of the recording to resume.
+
+    Raises:
+        InputError: the recording has no plan, is of another kind or pad, or was begun with other settings that matter.
+    """
     source = read_json(config.out / START, FORMAT).get("source")
     if not isinstance(source, dict) or not isinstance(plan := source.get("plan"), dict) or "presses" not in plan:
         raise InputError(f"{config.out}: has no plan, so that it cannot be resumed")
@@ -183,17 +189,17 @@ def read_source(config: RigConfig, rig: RigSettings, kind: str) -> dict[str, Any
     if source.get("morphology") != now["morphology"]:
         raise InputError(f"{config.out}: was begun with another pad than the one given")
     for key in sorted(now["rig"].keys() - _CHANGEABLE):
-        if (before := _get(source.get("rig"), key)) != (value := now["rig"][key]):
-            raise InputError(f"[rig] {key}: got {value}, the recording in {config.out} was begun with {before}")
+        if (stored := _get(source.get("rig"), key)) != (value := now["rig"][key]):
+            raise InputError(f"[rig] {key}: got {value}, the recording in {config.out} was begun with {stored}")
     return source
 
 
 def plan_notice(config: RigConfig) -> str:
-    """Say that a resumed recording keeps its plan if `[rig]` asks for another; otherwise return ""."""
+    """Return a notice that a resumed recording keeps its plan although `[rig]` sets another; "" if it does not."""
     if not (config.out / START).exists():
         return ""
-    before, now = read_json(config.out / START, FORMAT)["source"]["rig"], config.rig.model_dump(mode="json")
-    changed = [f"{key} = {before.get(key)}" for key in _PLAN_KEYS if before.get(key) != now[key]]
+    stored, current = read_json(config.out / START, FORMAT)["source"]["rig"], config.rig.model_dump(mode="json")
+    changed = [f"{key} = {stored.get(key)}" for key in _PLAN_KEYS if stored.get(key) != current[key]]
     return f"{config.out}: goes on by the plan it was begun with, [rig] {', '.join(changed)}" if changed else ""
 
 
@@ -206,10 +212,19 @@ def open_recorder(
     identities: Mapping[str, Mapping[str, Any]],
     kind: str = KIND,
 ) -> Recorder:
-    """Return the recorder of a new recording in `folder`, or of the one there, if any, that is resumed.
+    """Return the recorder of a new recording in `folder`, or of the one there if `resume`.
 
-    The plan is x and y, or x, y and depth, of each press; identities are what "arm" and "board" returned on connecting.
-    Raises InputError if the recording cannot be resumed, or was begun with another arm, tool or board.
+    Args:
+        config: pad, settings and provenance.
+        rig: settings to store, completed for the devices.
+        presses: plan, x and y or x, y and depth of each press, mm.
+        folder: run directory.
+        resume: whether to continue a recording in `folder`, if there is one.
+        identities: results of `connect`, by "arm" and "board".
+        kind: kind of the source.
+
+    Raises:
+        InputError: the recording cannot be resumed, or was begun with another arm, tool or board.
     """
     devices = json.loads(json.dumps({name: dict(identity) for name, identity in identities.items()}))
     if resume and (folder / START).exists():
@@ -226,7 +241,7 @@ def open_recorder(
 
 
 def _settings_and_pad(config: RigConfig, rig: RigSettings) -> dict[str, Any]:
-    """Settings, with the wired inputs and the side of the pad filled in, and the pad."""
+    """Return `[rig]`, with the wired inputs and the pad's side filled in, and the pad, as JSON."""
     wired = rig.model_copy(update={"channels": rig.inputs(len(config.pad.knots)), "mirrored": bool(rig.mirrored)})
     return {"rig": wired.model_dump(mode="json"), "morphology": pad_source(config.pad)}
 

@@ -1,9 +1,9 @@
-"""Devices of a rig behind two small protocols: an arm that presses and a board that reads the fibres.
+"""Protocols of the devices of a rig: an arm that presses, and a board that reads the fibres.
 
-Ours and third-party devices are used alike. Times are seconds of one clock, the host's `time.monotonic`;
-lengths are mm in the arm's base frame, angles radians. Arms and boards are found by name, as entry points of installed
-packages: `padforge.arms` names functions of `RigSettings` that return an `Arm`; `padforge.boards` functions of
-`RigSettings` and the inputs to read, in the order of the fibres, that return a `Board`.
+Times are seconds of one clock, the host's `time.monotonic`; lengths are mm in the arm's base frame, angles radians.
+Devices are entry points of installed packages, of padforge or others: in the group `padforge.arms` functions of
+`RigSettings` that return an `Arm`; in `padforge.boards` functions of `RigSettings` and the inputs to read, in the order
+of the fibres, that return a `Board`.
 """
 
 import errno
@@ -33,29 +33,35 @@ ROOT = Path(padforge.__file__).parents[1]
 
 
 class RigFault(Fault):
-    """A fault of the rig that ends or prevents a recording: what happened, and what a person can do about it."""
+    """A fault of the rig that ends or prevents a recording.
+
+    Args:
+        cause: kind of the fault, for programs; "refused" if nothing was begun.
+        message: what happened.
+        advice: what a person can do about it.
+    """
 
     def __init__(self, cause: Cause, message: str, advice: str = "") -> None:
         super().__init__(f"{message}; {advice}" if advice else message)
-        self.cause: Cause = cause  # for programs
-        self.exit_code = 2 if cause == "refused" else 1  # of a command that ends with it: 2 if nothing was begun
+        self.cause: Cause = cause
+        self.exit_code = 2 if cause == "refused" else 1  # of the command
 
 
 @dataclass(frozen=True)
 class ArmState:
     """State of the arm at one moment."""
 
-    time_s: float  # when it arrived
+    time_s: float  # host time of its arrival
     pose: Pose  # of the tool
     speed_mm_s: float  # of the tool, >= 0
-    force_n: float | None  # at the tool, along z; None without a sensor, which `[rig] max_force_n` has to permit
+    force_n: float | None  # on the tool along z; None without a sensor, which `[rig] max_force_n` has to permit
     protective_stop: bool  # whether the controller has stopped the arm
     emergency_stop: bool  # whether a person has stopped the arm
-    moving: bool  # whether the last move is still under way
+    moving: bool  # whether the last move is in progress
     sideways_n: float = 0.0  # force on the tool across z, >= 0; 0 without a sensor
 
     def to_row(self) -> list[float]:
-        """Return the row of the state, by `STATE_COLUMNS`."""
+        """Return the state as a row of `STATE_COLUMNS`."""
         force_n = math.nan if self.force_n is None else self.force_n
         stopped = self.protective_stop or self.emergency_stop
         return [self.time_s, *self.pose, self.speed_mm_s, force_n, float(not stopped)]
@@ -82,7 +88,7 @@ class Arm(Protocol):
         ...
 
     def drain(self) -> Array:
-        """Return the (n, 10) states since the last call, by `STATE_COLUMNS`, none twice."""
+        """Return the states since the last call, each exactly once; shape (n, 10), by `STATE_COLUMNS`."""
         ...
 
     def move(self, pose: Pose, speed_mm_s: float, acceleration_mm_s2: float) -> None:
@@ -100,11 +106,11 @@ class Arm(Protocol):
 
 @dataclass(frozen=True)
 class BoardSamples:
-    """Samples as a board delivers them."""
+    """Consecutive samples of a board."""
 
     times_s: Array  # (n,) host times, ascending
     volts: Array  # (n, C) readings of C channels
-    missing: Indices  # (n,) number of samples lost before each of them; a gap is never filled
+    missing: Indices  # (n,) number of samples lost before each sample; gaps are not filled
 
 
 class Board(Protocol):
@@ -113,13 +119,13 @@ class Board(Protocol):
     def connect(self) -> Mapping[str, Any]:
         """Open the link, start sampling and return the board's identity (name, versions, bits ...) as JSON.
 
-        Of it are used: `rate_hz`, samples a second; `channels`, the number C; `inputs`, which of the board they are;
-        `supply_v`, the reading at full scale, if that is known; and `warning`, which `doctor` shows.
+        These keys are used: `rate_hz`, samples a second; `channels`, the number C; `inputs`, their numbers on the
+        board; optionally `supply_v`, the reading at full scale; and `warning`, which `doctor` shows.
         """
         ...
 
     def read(self) -> BoardSamples:
-        """Return all samples since the last call at once; raises RigFault("stale") after 1 s without any, or "lost"."""
+        """Return all samples since the last call, without waiting; raises RigFault("stale") after 1 s without any."""
         ...
 
     def close(self) -> None:
@@ -128,7 +134,7 @@ class Board(Protocol):
 
 
 def load_device(group: Group, name: str) -> Callable[..., Any]:
-    """Return the function that makes an arm or a board; raises InputError if there is none that can be imported."""
+    """Return the function that creates an arm or a board; raises InputError if it is missing or cannot be imported."""
     points = {point.name: point for point in reversed(list(entry_points(group=group)))}
     if name not in points:
         allowed = ", ".join(sorted(points)) or "none: padforge is not installed, run pip install ."
@@ -146,9 +152,9 @@ def check_platform() -> None:
 
 
 def start(module: str, *arguments: str, stderr: int | None = None) -> subprocess.Popen[bytes]:
-    """Start `python -m module` with pipes to its stdin and stdout; an interrupt from the keyboard does not reach it.
+    """Start `python -m module` with pipes to its stdin and stdout, in a session that Ctrl-C does not reach.
 
-    It finds this package wherever it is started from, and imports nothing from the current folder (`-P`).
+    Its path contains this installation of padforge, and not the current folder (`-P`).
     """
     path = os.pathsep.join((str(ROOT), *filter(None, os.environ.get("PYTHONPATH", "").split(os.pathsep))))
     return subprocess.Popen(
@@ -170,22 +176,28 @@ def host_ports() -> list[Any]:
 
 
 class SerialStream:
-    """An open serial port. Any method but `close` raises RigFault("lost") once the device is gone."""
+    """An open serial port, locked by this process. `receive` and `send` raise RigFault("lost") once the device is gone.
+
+    Args:
+        port: name of the port.
+        baud: speed.
+        timeout_s: longest wait of `receive`.
+        device: name of the device in messages.
+
+    Raises:
+        RigFault: "refused" if the port cannot be opened.
+    """
 
     def __init__(self, port: str, baud: int, timeout_s: float, device: str = "board") -> None:
-        """Open a port for this process alone; `timeout_s` is the longest wait of `receive`.
-
-        Raises RigFault("refused"), and why, if it cannot be opened.
-        """
         serial = _import_pyserial()
         self.port, self._device = port, device
         try:
             self.serial: Any = serial.Serial(port, baud, timeout=timeout_s, write_timeout=1, exclusive=True)
-        except Exception as error:  # pyserial lets termios.error through, which is no OSError
+        except Exception as error:  # pyserial also raises termios.error, which is not an OSError
             raise port_fault(port, error) from error
 
     def receive(self) -> tuple[float, bytes]:
-        """Wait for bytes; return the host time and all that have come, possibly none."""
+        """Wait for bytes; return the host time and all bytes received, possibly none."""
         try:
             data = self.serial.read(1)
             if data:
@@ -207,13 +219,12 @@ class SerialStream:
             self.serial.close()
 
     def _lost(self, error: OSError) -> RigFault:
-        return RigFault(
-            "lost", f"{self.port}: the {self._device} is gone ({error})", "check its cable and connect again"
-        )
+        message = f"{self.port}: the {self._device} is gone ({error})"
+        return RigFault("lost", message, "check its cable and connect again")
 
 
 def port_fault(port: str, error: Exception) -> RigFault:
-    """Translate pyserial's `error` on opening `port` into a fault with advice."""
+    """Return the fault, with advice, for pyserial's error on opening a port."""
     number = getattr(error, "errno", None)
     reason, advice = f"cannot be opened ({error})", "check that it is the right port"
     if number == errno.ENOENT:

@@ -1,4 +1,4 @@
-"""Diagnoses of a rig before a long run: whether it responds, how fast, and which channels have a working fibre."""
+"""Diagnosis of a rig before a long run: response and rates of the devices, and the state of each channel."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -14,16 +14,17 @@ from padforge.sense.settings import RigSettings
 
 Status = Literal["ok", "warn", "fail"]
 
-OBSERVE_S = 2.0
-_DEAD_V = 0.02  # a channel nearer than this to either end of the range is open, shorted or saturated
-_STUCK_V, _NOISY_V = 1e-6, 0.02  # std below and above: an ADC that reads a fibre shows noise, but little
-_LATE_S = 0.1
-_RATE_TOLERANCE = 0.01
+OBSERVE_S = 2.0  # duration of the observation of each device
+_DEAD_V = 0.02  # a channel closer than this to either end of the range is open, shorted or saturated
+_STUCK_V = 1e-6  # minimum standard deviation: an ADC that reads a fibre shows some noise
+_NOISY_V = 0.02  # maximum standard deviation
+_LATE_S = 0.1  # maximum latency, age or gap
+_RATE_TOLERANCE = 0.01  # relative
 
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """What was examined, whether it is well, and what was measured, in one line."""
+    """Result of one check: its subject, its status, and the measurement in one line."""
 
     name: str
     status: Status
@@ -31,7 +32,7 @@ class Diagnosis:
 
 
 def examine_board(board: Board) -> list[Diagnosis]:
-    """Connect and close a board: whether it responds, its rate, gaps and latency, and each of its channels."""
+    """Connect, check and close a board: its identity, rate, lost samples, latency, and each of its channels."""
     try:
         identity = board.connect()
         times_s, volts, n_missing = _read_samples(board)
@@ -54,7 +55,7 @@ def examine_board(board: Board) -> list[Diagnosis]:
 
 
 def examine_arm(arm: Arm, rig: RigSettings) -> list[Diagnosis]:
-    """Connect and close an arm, without moving it; what would keep `record` from moving it fails here, too."""
+    """Connect, check and close an arm without moving it; a check fails if `record` would refuse to move the arm."""
     try:
         identity = arm.connect()
         arm.drain()
@@ -83,7 +84,7 @@ def examine_arm(arm: Arm, rig: RigSettings) -> list[Diagnosis]:
 
 
 def _examine_tcp(identity: Mapping[str, Any], rig: RigSettings) -> list[Diagnosis]:
-    """Whether the arm and `[rig]` agree on the tip; nothing of an arm that keeps none."""
+    """Check that `[rig]` agrees with the arm's tool centre point; [] if the arm stores none."""
     if "tcp" not in identity:
         return []
     try:
@@ -94,7 +95,7 @@ def _examine_tcp(identity: Mapping[str, Any], rig: RigSettings) -> list[Diagnosi
 
 
 def _examine_force(force_n: float | None, max_force_n: float | None) -> Diagnosis:
-    """Whether the force is watched."""
+    """Check that the force is measured and limited."""
     measured = "the arm measures no force" if force_n is None else f"{force_n:.1f} N"
     if max_force_n is None:
         return Diagnosis("force", "warn", f'{measured}; [rig] max_force_n is "unwatched": no force stops the arm')
@@ -114,7 +115,7 @@ def _read_samples(board: Board) -> tuple[Array, Array, int]:
 
 
 def _examine_channel(number: int, board_input: int, volts: Array, supply_v: float) -> Diagnosis:
-    """Whether a channel reads like one with a fibre on it."""
+    """Check that the readings (n,) of a channel look like those of a fibre."""
     name, baseline, noise = f"channel {number}", float(np.median(volts)), float(volts.std())
     text = f"input {board_input} rests at {baseline:.3f} V, noise {1e3 * noise:.2f} mV"
     if baseline < _DEAD_V:

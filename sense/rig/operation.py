@@ -1,6 +1,6 @@
-"""Operation of a rig: devices are opened, diagnosed, and made to record; or a recording is simulated at once.
+"""Operation of a rig: opening and diagnosing its devices, recording with them, and simulated recordings.
 
-An adaptive plan moves its presses, as the recording goes on, to where a localizer errs most.
+An adaptive plan moves its next presses to where the errors of a localizer are largest.
 """
 
 import logging
@@ -54,31 +54,33 @@ from padforge.sense.simulation.simulated_recording import simulate
 _log = logging.getLogger(__name__)
 
 ADAPT_EVERY = 20  # presses between two evaluations of the localizer by an adaptive plan
-_N_CANDIDATES = 500
-_N_NEIGHBOURS = 5
 
 OpenedRig = AbstractContextManager[tuple[Arm, Board, RigSettings]]
-"""An arm and a board, not yet connected, and the settings for them, which name the inputs of the board."""
+"""An arm and a board, not yet connected, and their settings, with the inputs of the board filled in."""
 
 
 class AdaptivePlanner:
-    """Moves presses to those candidates where errors nearby, times the distance to the nearest press, are largest.
+    """Moves presses to the random candidates with the largest `acquisition`.
 
-    The localizer is calibrated on an earlier recording; `run` is being written, and synced after every press.
+    Args:
+        localizer: localizer calibrated on an earlier recording.
+        run: run directory of the current recording, synced after every press.
+        rng: generator of candidates.
+        free: returns which positions (n, 2), mm, may be pressed.
     """
 
     def __init__(self, localizer: LocalizerModel, run: Path, rng: np.random.Generator, free: PositionTest) -> None:
         self._localizer, self._run, self._rng, self._free = localizer, run, rng, free
 
     def __call__(self, plan: PressPlan, press: int) -> PressPlan:
-        """Return the plan with its next presses, from `press` on, moved; unchanged between two evaluations."""
+        """Return the plan with `ADAPT_EVERY` presses from `press` on moved; otherwise the plan itself."""
         if press == 0 or press % ADAPT_EVERY:
             return plan
         recording = Recording.open(self._run)
         errors_mm = np.linalg.norm(self._localizer.predict(recording).positions_mm - recording.presses_mm, axis=1)
         positions_mm = plan.positions_mm.copy()
         corner_mm = np.abs(plan.positions_mm).max(axis=0)
-        candidates = sample_uniform(np.array([-corner_mm, corner_mm]), _N_CANDIDATES, self._rng, self._free)
+        candidates = sample_uniform(np.array([-corner_mm, corner_mm]), 500, self._rng, self._free)
         pressed = recording.presses_mm
         for number in range(press, min(press + ADAPT_EVERY, len(plan))):
             score = acquisition(candidates, recording.presses_mm, errors_mm, pressed)
@@ -88,8 +90,18 @@ class AdaptivePlanner:
 
 
 def acquisition(candidates: Array, evaluated: Array, errors: Array, pressed: Array) -> Array:
-    """Score candidates (K, 2): mean error of the nearest evaluated presses times distance to the nearest pressed."""
-    _, nearest = KDTree(evaluated).query(candidates, k=min(_N_NEIGHBOURS, len(evaluated)))
+    """Return the acquisition score (K,) of candidate positions, which prefers large errors and unexplored positions.
+
+    Args:
+        candidates: positions (K, 2).
+        evaluated: positions (N, 2) of presses with an error of the localizer.
+        errors: these errors (N,).
+        pressed: positions (P, 2) that have been pressed or are planned.
+
+    Returns:
+        Mean error of the five nearest evaluated presses, times the distance to the nearest pressed position.
+    """
+    _, nearest = KDTree(evaluated).query(candidates, k=min(5, len(evaluated)))
     distance, _ = KDTree(pressed).query(candidates)
     return errors[nearest].reshape(len(candidates), -1).mean(axis=1) * distance
 
@@ -103,9 +115,16 @@ def record_simulated(
     like: Twin | None = None,
     replacing: bool = False,
 ) -> Recording:
-    """Record presses on a simulated pad at once, see `simulate`; `overrides` of `[rig]` take precedence.
+    """Simulate a recording faster than real time, see `simulate`, and save it.
 
-    `inputs` are files it is made from; `replacing` tells whether a simulated recording in `out` is replaced.
+    Args:
+        spec: settings.
+        pad: pad, or its twin.
+        out: run directory.
+        overrides: values of `[rig]` that take precedence over `spec`.
+        inputs: files for the provenance.
+        like: twin of another pad; the simulated pad has its sensitivity, gain and noise.
+        replacing: whether to replace a simulated recording in `out`.
     """
     if not replacing:
         check_new_folder(out)
@@ -120,13 +139,13 @@ def record_simulated(
 
 
 def check_press_depths(pad: Morphology, rig: RigSettings, contact: Contact, folder: Path) -> None:
-    """Check that presses do not go through a pad, and warn if none is as deep as the pad is designed for.
+    """Check that presses are shallower than the pad is thick; warn if none has the depth that the pad is designed for.
 
     Args:
         pad: pad that is pressed.
-        rig: how it is pressed.
-        contact: contact of the settings, which counts where the pad does not say what it is designed for.
-        folder: folder of the pad, with what fabricate has written of its mould.
+        rig: settings of the presses.
+        contact: contact of the settings, used if the pad does not state the contact it is designed for.
+        folder: folder of the pad, with the files of `fabricate`.
 
     Raises:
         InputError: a press is as deep as the pad is thick, by `[contact]` or by its mould.
@@ -142,15 +161,15 @@ def check_press_depths(pad: Morphology, rig: RigSettings, contact: Contact, fold
 
 @contextmanager
 def opened_rig(kind: str, config: RigConfig, inputs: Sequence[int]) -> Iterator[tuple[Arm, Board, RigSettings]]:
-    """Open a rig with real devices, see `OpenedRig`, `make_arm` and `make_board`."""
+    """Open a rig with real devices; see `OpenedRig`, `make_arm` and `make_board`."""
     arm, rig = make_arm(kind, config, inputs)
-    # The arm is closed, and so stopped, before the board.
+    # Closing stops the arm, and comes before the board is closed.
     with closing(make_board(rig, inputs)) as board, closing(arm):
         yield arm, board, rig
 
 
 def make_arm(kind: str, config: RigConfig, inputs: Sequence[int]) -> tuple[Arm, RigSettings]:
-    """Return an arm by its name, not yet connected, and the settings for it, which name the inputs of the board."""
+    """Return an arm by its name, not yet connected, and its settings, with the inputs of the board filled in."""
     rig = config.rig.model_copy(update={"channels": tuple(inputs)})
     if kind == "printer":
         _check_ports(rig)
@@ -165,7 +184,7 @@ def _check_ports(rig: RigSettings) -> None:
 
 
 def make_board(rig: RigSettings, inputs: Sequence[int]) -> Board:
-    """Return the board that `[rig]` names, not yet connected, which reads these inputs, or all if empty."""
+    """Return the board of `[rig]`, not yet connected; it reads `inputs`, or all of its inputs if that is empty."""
     return load_device("padforge.boards", rig.board)(rig, inputs)
 
 
@@ -178,10 +197,21 @@ def record(
     resume: bool = False,
     on_progress: OnProgress = ignore_progress,
 ) -> Recording | None:
-    """Record with a rig, see `opened_rig`; what is done is on the disk whatever happens.
+    """Record with a rig; completed presses are on the disk even if the recording fails.
 
-    An adaptive plan needs the folder of a localizer, `model`. If `dry`, the pad is not touched, nothing is kept, and
-    None is returned. Raises RigFault if the rig failed, or the plan is not safe.
+    Args:
+        config: pad, settings and run directory.
+        opened: context of the devices, see `opened_rig`.
+        model: folder of a localizer, for an adaptive plan.
+        dry: whether to move above the pad only, and to store nothing.
+        resume: whether to continue a recording in the run directory.
+        on_progress: called after every press.
+
+    Returns:
+        The recording; None if `dry`.
+
+    Raises:
+        RigFault: a device failed, or the plan is not safe.
     """
     with opened as (arm, board, rig):
         with Interrupts() as interrupts:
@@ -194,7 +224,7 @@ def record(
                 check_new_recording(config.out)
             identities = {"board": board.connect(), "arm": arm.connect()}
             check_tcp(rig.tcp_mm, identities["arm"])
-            # Before there is a folder that would be in the way.
+            # Checked before the run directory exists, so that a refusal leaves none behind.
             check_start_state(arm.state(), Limits.from_settings(rig))
             interrupts.check()
         if rig.max_force_n is None:
@@ -217,10 +247,17 @@ def _make_planner(config: RigConfig, rig: RigSettings, model: Path | None) -> Ca
 
 
 def diagnose(kind: str, config: RigConfig, inputs: Sequence[int]) -> list[Diagnosis]:
-    """Diagnose a rig before a long run, or with `hand` the board alone; nothing moves.
+    """Diagnose a rig before a long run, without moving it.
 
-    One device is examined even if the other cannot be made; a board alone that cannot raises RigFault. A printer is
-    examined before it is asked where the pad lies.
+    Each device is examined even if the other one fails, and a printer even if the pose of the pad is unknown.
+
+    Args:
+        kind: name of the arm; "hand" for a board alone.
+        config: settings, and the folder of the pad.
+        inputs: inputs of the board to read, () for all.
+
+    Raises:
+        RigFault: there is no board, and `kind` is "hand".
     """
     ports = [f"{port.device} ({port.description})" for port in host_ports() if port.vid is not None]
     diagnoses = [Diagnosis("ports", "ok", ", ".join(ports) or "no board seen on USB")]
@@ -232,15 +269,15 @@ def diagnose(kind: str, config: RigConfig, inputs: Sequence[int]) -> list[Diagno
         diagnoses.append(Diagnosis("board", "fail", str(fault)))
     if kind == "hand":
         return diagnoses
-    rig, place = config.rig.model_copy(update={"channels": tuple(inputs)}), []
+    rig, location = config.rig.model_copy(update={"channels": tuple(inputs)}), []
     try:
         if kind == "printer":
             _check_ports(rig)
             try:
                 rig = locate_on_bed(rig, config.folder)
             except RigFault as fault:
-                place = [Diagnosis("place", "fail", str(fault))]
+                location = [Diagnosis("place", "fail", str(fault))]
         diagnoses += examine_arm(load_device("padforge.arms", kind)(rig), rig)
     except RigFault as fault:
         diagnoses.append(Diagnosis("arm", "fail", str(fault)))
-    return diagnoses + place
+    return diagnoses + location

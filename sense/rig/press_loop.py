@@ -1,8 +1,9 @@
-"""The press loop: an arm presses as planned while a board reads, and a run directory keeps everything.
+"""The press loop: an arm presses as planned while a board reads, and a run directory stores everything.
 
-Nothing moves before the whole plan has passed the limits. Every wait reads, records and checks the arm, and none is for
-the disk: a thread writes the recording, and no press begins before the one before it is on the disk. On a fault the arm
-is stopped first, then lifted off, then what was recorded so far is written, then the fault is raised.
+The arm moves only after the whole plan has passed the limits. During every wait the loop reads the devices, records,
+and checks the arm. A thread writes to the disk, so that a slow disk delays no check; a press begins only when the
+previous one is on the disk. On a fault the loop stops the arm, lifts the tool off, completes the recording on the disk,
+and then raises the fault.
 """
 
 import contextlib
@@ -36,14 +37,14 @@ from padforge.sense.rig.safety import (
 from padforge.sense.rig.streams import Averager
 from padforge.sense.settings import RigSettings
 
-_READING_DEADLINE_S = 3.0
-_DISK_DEADLINE_S = 30.0
-_SETTLE_S = 0.1  # until the state of an arm that refused a move tells why
-_RECENT = 4096  # readings whose times are remembered, to find the first one after a command
+_READING_DEADLINE_S = 3.0  # longest wait for a reading
+_DISK_DEADLINE_S = 30.0  # longest wait for the disk
+_SETTLE_S = 0.1  # time after which the state of an arm that refused a move shows the reason
+_N_RECENT = 4096  # latest readings whose times are stored, to find the first reading after a command
 
 
 class DiskThread(ThreadPoolExecutor):
-    """A thread that makes calls in their order; after one that failed it makes no more."""
+    """A thread that executes calls in their order, and none after a call that failed."""
 
     def __init__(self) -> None:
         super().__init__(1, "disk")
@@ -52,26 +53,26 @@ class DiskThread(ThreadPoolExecutor):
 
     def submit(self, call: Callable[..., Any], /, *arguments: Any, **more: Any) -> Future[Any]:
         """Queue a call."""
-        before = self._last
+        previous = self._last
 
         def work() -> None:
-            before.result()
+            previous.result()  # raises if a call before this one failed
             call(*arguments, **more)
 
         self._last = super().submit(work)
         return self._last
 
     def check(self) -> None:
-        """Raise what a failed call raised."""
-        if self._last.done():  # at once after a failure, as no more calls are made
+        """Re-raise the exception of a failed call."""
+        if self._last.done():  # soon after a failure, since later calls fail at once
             self._last.result()
 
 
 class Interrupts:
-    """A context that handles the first signal to end as before, and ignores more until the retreat is over.
+    """A context that passes the first signal to end to its previous handler, and ignores further ones.
 
-    An exception that a signal handler raises is lost if it meets a callback of C code or a finalizer, so `check` asks
-    for the signal as well. Only the main thread receives signals; in another one this does nothing.
+    An exception raised by a signal handler is lost if it occurs in a callback of C code or in a finalizer; `check`
+    raises it again. Only the main thread receives signals; in another thread this context does nothing.
     """
 
     def __init__(self) -> None:
@@ -80,20 +81,20 @@ class Interrupts:
 
     @contextlib.contextmanager
     def blocked(self) -> Iterator[None]:
-        """Ignore signals within, which is short and has to come to its end."""
+        """Return a context that ignores signals, for a short task that must not be interrupted."""
         self._blocked = True
         yield
         self._received = self._blocked = False
 
     def check(self) -> None:
-        """Raise KeyboardInterrupt if a signal has come."""
+        """Raise KeyboardInterrupt if a signal has been received."""
         if self._received:
             raise KeyboardInterrupt
 
     def __enter__(self) -> Self:
         if threading.current_thread() is threading.main_thread():
             for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-                if callable(previous := signal.getsignal(number)):  # else it is ignored, as under nohup, or not ours
+                if callable(previous := signal.getsignal(number)):  # otherwise it is ignored, as under nohup
                     self._previous[number] = previous
                     signal.signal(number, self._handle)
         return self
@@ -111,7 +112,7 @@ class Interrupts:
 class PressLoop:
     """Records presses with one arm and one board, both connected.
 
-    Presses that the recorder has are not made again; if `dry`, the arm stays above the pad all the time.
+    Presses that the recorder already has are skipped; if `dry`, the arm never touches the pad.
     """
 
     def __init__(
@@ -128,11 +129,11 @@ class PressLoop:
         ratio = max(1, round(rig.board_rate_hz / rig.rate_hz))
         self._half_s = rig.readings_per_press / 2 * ratio / rig.board_rate_hz  # half the cycle of a press
         self._averager = Averager(ratio, recorder.fibres)
-        self._recent: deque[float] = deque(maxlen=_RECENT)
+        self._recent: deque[float] = deque(maxlen=_N_RECENT)
         self._disk, self._n_readings = DiskThread(), recorder.n_readings
         self._interrupts = Interrupts()
         self._zero_s = 0.0
-        self._forces_n: list[float] = []  # since the probe last came to rest
+        self._forces_n: list[float] = []  # measured since the probe came to rest
 
     def run(
         self,
@@ -142,9 +143,14 @@ class PressLoop:
     ) -> None:
         """Make every press of the plan that the recorder does not have.
 
-        The planner may move the presses from the next one on. Progress is reported after every press, once it is on the
-        disk. Raises RigFault if the plan is not safe, or the rig failed; the arm stands still then, and what is done is
-        on the disk.
+        Args:
+            plan: positions and depths.
+            on_progress: called after every press, once it is on the disk.
+            planner: called before every press with the plan and its number; returns the plan, or one with the presses
+                from that number on moved.
+
+        Raises:
+            RigFault: the plan is not safe, or a device failed; the arm stands still, completed presses are on the disk.
         """
         check_plan(plan, self._rig)
         check_start_state(self._arm.state(), self._limits)
@@ -162,21 +168,21 @@ class PressLoop:
             self._await_disk(self._disk.submit(self._recorder.sync))
 
     def _start_clock(self) -> None:
-        """Let times begin at 0, or a second after the last ones; drop what came while the devices were connected."""
+        """Start times at 0, or 1 s after the last reading of a resumed recording; discard buffered samples."""
         self._board.read()
         self._arm.drain()
         last_s = self._recorder.last_s
         self._zero_s = clock.now() - (last_s + 1 if np.isfinite(last_s) else 0.0)
 
     def _press(self, press: int, position_mm: Array, depth_mm: float) -> Future[Any]:
-        """Make a press; return the call that puts it on the disk."""
+        """Make a press; return the queued call that writes it to the disk."""
         above = self._frame.pose(position_mm, -self._rig.clearance_mm)
         # 1. Travel, and let the pad recover for half a cycle.
         start_s = clock.now()
         self._move(above, self._rig.travel_mm_s)
         self._await_still()
         self._record_until(start_s + self._half_s)
-        # 2. Down; the press is in the journal on the disk while it is held for half a cycle.
+        # 2. Down; the journal on the disk lists the press while it is held for half a cycle.
         down_s = clock.now()
         target = self._frame.pose(position_mm, -self._rig.clearance_mm / 2 if self._dry else depth_mm)
         self._move(target, self._rig.press_mm_s)
@@ -191,7 +197,7 @@ class PressLoop:
             reached["force_n"] = float(np.median(np.abs(self._forces_n)))
         tip_mm, depths_mm = self._frame.tip(np.array([self._arm.state().pose]))
         reached["at_mm"] = [*tip_mm[0].round(4).tolist(), round(float(depths_mm[0]), 4)]
-        # 3. Up; the press is done once the journal says so on the disk.
+        # 3. Up; the press is complete once the journal on the disk says so.
         up_s = clock.now()
         self._move(above, self._rig.press_mm_s)
         self._await_reading(up_s)
@@ -206,7 +212,7 @@ class PressLoop:
         try:
             self._arm.move(pose, speed_mm_s, self._rig.acceleration_mm_s2)
         except RigFault:
-            clock.sleep(_SETTLE_S)  # the next state tells why, if the arm was stopped a moment ago
+            clock.sleep(_SETTLE_S)  # if the arm was just stopped, the next state shows the reason
             check_state(self._arm.state(), self._limits, clock.now())
             raise
 
@@ -220,7 +226,7 @@ class PressLoop:
             self._poll()
 
     def _await_reading(self, time_s: float) -> None:
-        """Record until there is a reading taken after a time."""
+        """Record until a reading after a time has arrived."""
         deadline_s = clock.now() + _READING_DEADLINE_S
         self._poll()
         while not self._count_after(time_s):
@@ -230,7 +236,7 @@ class PressLoop:
             self._poll()
 
     def _await_disk(self, synced: Future[Any]) -> None:
-        """Record until a call of the disk thread is done; what is recorded meanwhile may wait."""
+        """Record until a call of the disk thread is done, without waiting for calls queued after it."""
         deadline_s = clock.now() + _DISK_DEADLINE_S
         while not wait([synced], POLL_S).done:
             if clock.now() >= deadline_s:
@@ -240,7 +246,7 @@ class PressLoop:
         synced.result()
 
     def _poll(self) -> None:
-        """Check that all is well, before anything else; then read the devices, and have that recorded."""
+        """Check signals, arm and disk; then read the devices and queue the data for the disk."""
         self._interrupts.check()
         check_state(self._arm.state(), self._limits, clock.now())
         self._disk.check()
@@ -280,7 +286,7 @@ class PressLoop:
             raise raised from error
 
     def _stop_and_retreat(self) -> str | None:
-        """Stop the arm and lift the tool off the pad; return why it may still press the pad, if it may."""
+        """Stop the arm and lift the tool off the pad; return what prevented that, None if the tool is off the pad."""
         stop_error = ""
         try:
             self._arm.stop()
@@ -316,7 +322,7 @@ def check_plan(plan: PressPlan, rig: RigSettings) -> None:
 
 
 def _with_retreat(error: BaseException, obstacle: str | None) -> BaseException:
-    """Return what to raise for an error, after a retreat that an obstacle may have prevented."""
+    """Return the exception to raise for an error, with the outcome of the retreat; `obstacle` is what prevented it."""
     if isinstance(error, OSError):
         error = RigFault("disk", f"the recording cannot be written ({error.strerror or error})")
     if obstacle is None and not (isinstance(error, RigFault) and error.cause == "force"):

@@ -1,6 +1,6 @@
-"""Safety of the arm: limits, checks of a target before it moves and of its state while it moves, and the retreat.
+"""Safety of the arm: limits, checks of a target before a move and of states during it, and the retreat.
 
-Nothing moves to a target that `check_target` has not passed. Every move is waited for by `wait_until_still`, which
+The arm moves only to targets that `check_target` has passed. `wait_until_still` waits for the end of every move; it
 checks every state and stops the arm before it raises. After a fault `retreat` lifts the stopped tool off the pad.
 """
 
@@ -18,34 +18,35 @@ Range = tuple[float, float]
 Vector = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
 DOWN: Vector = (0.0, math.pi, 0.0)  # rotation vector of a tool that points straight down
-MAX_LEAN_DEG = 10.0  # of the expected tool axis from straight down: depths are measured along the base's z axis
+MAX_LEAN_DEG = 10.0  # between the expected tool axis and straight down, since depths are measured along the base's z
 MAX_TILT_DEG = 2.0  # between the expected tool axis and a target's
-MAX_TURN_DEG = 45.0  # about that axis, from how the arm holds the tool before the first move
+MAX_TURN_DEG = 45.0  # about that axis, between the first target and the tool before the first move
 TCP_TOLERANCE_MM = 0.1
 MAX_STATE_AGE_S = 0.5
-STILL_MM_S = 1.0
-DEPTH_TOLERANCE_MM = 0.3  # how much deeper than allowed a moving tip may read: noise and overshoot, no wrong target
-POLL_S = 0.004
+STILL_MM_S = 1.0  # maximum speed of an arm at rest
+DEPTH_TOLERANCE_MM = 0.3  # excess of a moving tip over the maximum depth, by noise and overshoot
+POLL_S = 0.004  # between two states
 
 RETREAT_MM_S = 10.0
-RETREAT_MM = 10.0  # height above the pad, or above the place where the force was too great
-FALL_START_S, FALL_END_S = 0.2, 1.0  # by when such a force has to begin to fall, and to be below its limit
-FRESH_S = 1.0  # longest wait for a state before the retreat: a link that was silent for a moment may recover
-MAX_RISE_N = 5.0  # of such a force above its minimum: the error of force sensors
-EDGE_MM = 1.0  # how far outside the box a tool may stand that was sent to its edge: arms stop near their target
+RETREAT_MM = 10.0  # height above the pad, or above the position where the force was too high
+FALL_START_S = 0.2  # time in the retreat after which an excessive force has to fall
+FALL_END_S = 1.0  # time after which it has to be below its limit
+FRESH_S = 1.0  # longest wait for a state before the retreat: a link that fell silent may recover
+MAX_RISE_N = 5.0  # of an excessive force above its minimum so far: the error of force sensors
+EDGE_MM = 1.0  # distance outside the box at which the tool may stand before the retreat: arms stop near their target
 
 
 @dataclass(frozen=True)
 class Limits:
-    """What the arm may do; lengths in the base frame. Raises ValueError for a limit that limits nothing."""
+    """Limits of the arm's motion, in the base frame. Raises ValueError for a limit that is not positive and finite."""
 
-    box_mm: tuple[Range, Range, Range]  # lowest and highest x, y, z of the tip
-    contact_mm: float | None  # z of the pad's surface; while it is None no target is safe
+    box_mm: tuple[Range, Range, Range]  # minimum and maximum of x, y and z of the tip
+    contact_mm: float | None  # z of the pad's surface; no target is safe if it is None
     max_depth_mm: float  # of the tip below the surface
     max_speed_mm_s: float = 250.0
     max_acceleration_mm_s2: float = 1200.0
-    tool: Vector = DOWN  # rotation vector of the tool as it should be held
-    max_force_n: float | None = 50.0  # on the tool, in any direction; None if no force is watched
+    tool: Vector = DOWN  # expected rotation vector of the tool
+    max_force_n: float | None = 50.0  # on the tool, in any direction; None if the force is not watched
     deadline_s: float = 30.0  # of a move
 
     @classmethod
@@ -83,19 +84,19 @@ class Limits:
 
 
 def tilt_deg(tool: Sequence[float], expected: Sequence[float]) -> float:
-    """Return the angle in degrees between the axes of two tools given by their rotation vectors."""
+    """Return the angle in degrees between the axes of two tools, given by their rotation vectors (swing)."""
     w, x, y, z = _rotation(tool, expected)
     return math.degrees(2 * math.atan2(math.hypot(x, y), math.hypot(w, z)))
 
 
 def turn_deg(tool: Sequence[float], expected: Sequence[float]) -> float:
-    """Return the angle in degrees, 0 to 180, by which two tools, rotation vectors, differ about their axis (twist)."""
+    """Return the angle in degrees, 0 to 180, between two tools about their axis (twist)."""
     w, _, _, z = _rotation(tool, expected)
     return math.degrees(2 * math.atan2(abs(z), abs(w)))
 
 
 def _rotation(start: Sequence[float], end: Sequence[float]) -> Quaternion:
-    """Return the rotation from one tool to another, in the frame of the first."""
+    """Return the rotation from one tool to another in the frame of the first, conj(q1) q2."""
     (w, x, y, z), (p, q, r, s) = _quaternion(start), _quaternion(end)
     return (
         w * p + x * q + y * r + z * s,
@@ -108,8 +109,8 @@ def _rotation(start: Sequence[float], end: Sequence[float]) -> Quaternion:
 def _quaternion(rotation: Sequence[float]) -> Quaternion:
     """Convert a rotation vector to a unit quaternion, its scalar first."""
     angle = math.hypot(*rotation)
-    share = math.sin(angle / 2) / angle if angle else 0.0
-    x, y, z = (share * value for value in rotation)
+    scale = math.sin(angle / 2) / angle if angle else 0.0
+    x, y, z = (scale * value for value in rotation)
     return math.cos(angle / 2), x, y, z
 
 
@@ -125,14 +126,14 @@ def check_finite_move(pose: Sequence[float], speed_mm_s: float, acceleration_mm_
 
 
 def check_probe(rig: RigSettings) -> None:
-    """Raise RigFault("refused") unless `[rig]` says where the tip of a printer's probe is."""
+    """Raise RigFault("refused") unless `[rig]` has the position of the tip of a printer's probe."""
     if rig.tcp_mm is None:
         message = "[rig] tcp_mm is unknown, allowed are x, y and z of the probe's tip from the nozzle"
         raise RigFault("refused", message, "measure them with the probe in place")
 
 
 def check_target(pose: Sequence[float], speed_mm_s: float, acceleration_mm_s2: float, limits: Limits) -> None:
-    """Raise RigFault("refused") if a target is out of limits: what, its value and what is allowed."""
+    """Raise RigFault("refused") if a target is beyond the limits."""
     check_finite_move(pose, speed_mm_s, acceleration_mm_s2)
     if limits.contact_mm is None:
         _refuse("the height of the pad's surface unknown", "a measured height")
@@ -150,7 +151,7 @@ def check_target(pose: Sequence[float], speed_mm_s: float, acceleration_mm_s2: f
 
 
 def check_start_state(state: ArmState, limits: Limits) -> None:
-    """Raise RigFault("refused") if the first move would turn tool and cable too far, or the force cannot be watched."""
+    """Raise RigFault("refused") if the first move would turn tool and cable too far, or the arm measures no force."""
     if not (turn := turn_deg(state.pose[3:], limits.tool)) <= MAX_TURN_DEG:
         _refuse(f"the tool is held {turn:.0f} degrees away from [rig] tool_rad", f"at most {MAX_TURN_DEG:g}")
     if state.force_n is None and limits.max_force_n is not None:
@@ -158,7 +159,7 @@ def check_start_state(state: ArmState, limits: Limits) -> None:
 
 
 def check_tcp(tcp_mm: Vector | None, arm: Mapping[str, Any]) -> None:
-    """Raise RigFault("refused") unless `[rig]` tcp_mm, the tool centre point, is the arm's; printers keep none."""
+    """Raise RigFault("refused") unless `[rig]` tcp_mm is the tool centre point of the arm, if that stores one."""
     if "tcp" not in arm:
         return
     measured = tuple(round(float(value), 3) for value in arm["tcp"][:3])
@@ -170,7 +171,7 @@ def check_tcp(tcp_mm: Vector | None, arm: Mapping[str, Any]) -> None:
 
 
 def check_state(state: ArmState, limits: Limits, now_s: float, until_s: float = math.inf) -> None:
-    """Raise RigFault if the latest state during a move, which has to be over at `until_s`, is beyond the limits."""
+    """Raise RigFault if the latest state during a move is beyond the limits, or the move not over at `until_s`."""
     advice = "look at the arm, unlock it at the pendant, then connect again"
     if state.emergency_stop:
         raise RigFault("emergency_stop", "the arm is in an emergency stop", advice)
@@ -193,11 +194,17 @@ def check_state(state: ArmState, limits: Limits, now_s: float, until_s: float = 
 def wait_until_still(
     arm: Arm,
     limits: Limits,
-    meanwhile: Callable[[], None] = lambda: None,
+    on_wait: Callable[[], None] = lambda: None,
 ) -> ArmState:
-    """Wait until the arm has ended its move; whatever goes wrong, it is stopped before that is raised.
+    """Wait until the arm has ended its move, and return its state; the arm is stopped before any exception is raised.
 
-    Checks the limits at every state, and calls `meanwhile` between two of them. Raises RigFault, see `check_state`.
+    Args:
+        arm: a moving arm.
+        limits: limits that every state is checked against.
+        on_wait: called between two states.
+
+    Raises:
+        RigFault: see `check_state`.
     """
     until_s = clock.now() + limits.deadline_s
     try:
@@ -206,7 +213,7 @@ def wait_until_still(
             check_state(state, limits, clock.now(), until_s)
             if not state.moving and state.speed_mm_s <= STILL_MM_S:
                 return state
-            meanwhile()
+            on_wait()
             clock.sleep(POLL_S)
     except BaseException:
         with suppress(RigFault):
@@ -215,18 +222,18 @@ def wait_until_still(
 
 
 def retreat(arm: Arm, limits: Limits, acceleration_mm_s2: float) -> None:
-    """Lift the tool straight up, unless it is above the pad already and no force is too great.
+    """Lift the tool straight up, unless it is above the pad already and the force is within its limit.
 
-    Everything is checked as in any move, except that a force or depth beyond its limit has to decrease, and that the
-    tool may stand at the edge of the box. The arm is stopped, and RigFault("force") raised, if it does not decrease.
+    The move is checked like any other, with three exceptions: the tool may start at the edge of the box or too deep,
+    and a force beyond its limit has to fall. If it does not, the arm is stopped and RigFault("force") raised.
     """
     state = _await_state(arm)
-    if state.force_n is None:  # the sensor may have failed in a press, and the tool has to come off all the same
+    if state.force_n is None:  # the sensor may have failed during a press, and the tool must be lifted nevertheless
         limits = replace(limits, max_force_n=None)
     if limits.contact_mm is None:
         return
-    z, max_n = state.pose[2], limits.max_force_n
-    overloaded = max_n is not None and (state.total_force_n or 0.0) > max_n
+    z, max_n, force_n = state.pose[2], limits.max_force_n, state.total_force_n or 0.0
+    overloaded = max_n is not None and force_n > max_n
     sides = ((low - EDGE_MM, high + EDGE_MM) for low, high in limits.box_mm[:2])
     relaxed = replace(
         limits,
@@ -242,12 +249,12 @@ def retreat(arm: Arm, limits: Limits, acceleration_mm_s2: float) -> None:
     speed_mm_s = min(RETREAT_MM_S, limits.max_speed_mm_s)
     check_target(up, speed_mm_s, acceleration_mm_s2, relaxed)
     arm.move(up, speed_mm_s, acceleration_mm_s2)
-    meanwhile = _falling_force_check(arm, state.total_force_n or 0.0, max_n) if overloaded and max_n else lambda: None
-    check_state(wait_until_still(arm, relaxed, meanwhile), limits, clock.now())
+    on_wait = _FallingForceCheck(arm, force_n, max_n) if overloaded and max_n else lambda: None
+    check_state(wait_until_still(arm, relaxed, on_wait), limits, clock.now())
 
 
 def _await_state(arm: Arm) -> ArmState:
-    """Return the first state that is not stale; raises the RigFault of `arm.state` if none comes in time."""
+    """Return the first state that is not stale, or the latest after `FRESH_S`; raises the RigFault of `arm.state`."""
     deadline_s = clock.now() + FRESH_S
     while True:
         try:
@@ -261,21 +268,22 @@ def _await_state(arm: Arm) -> ArmState:
         clock.sleep(POLL_S)
 
 
-def _falling_force_check(arm: Arm, first_n: float, max_n: float) -> Callable[[], None]:
-    """Return a check that raises RigFault("force") unless the force falls from now on."""
-    start_s, min_n = clock.now(), first_n
+class _FallingForceCheck:
+    """A check, called repeatedly, that raises RigFault("force") unless the force on the tool falls."""
 
-    def check() -> None:
-        nonlocal min_n
-        force_n = arm.state().total_force_n or 0.0
-        min_n = min(min_n, force_n)
-        # The allowed force falls along a line, from the first one to the limit, and stays near its minimum so far.
-        remaining = min((start_s + FALL_END_S - clock.now()) / (FALL_END_S - FALL_START_S), 1.0)
-        if not force_n <= max(max_n, min(min_n + MAX_RISE_N, max_n + (first_n + MAX_RISE_N - max_n) * remaining)):
+    def __init__(self, arm: Arm, first_n: float, max_n: float) -> None:
+        self._arm, self._first_n, self._max_n = arm, first_n, max_n
+        self._start_s, self._min_n = clock.now(), first_n
+
+    def __call__(self) -> None:
+        force_n = self._arm.state().total_force_n or 0.0
+        self._min_n = min(self._min_n, force_n)
+        # The allowed force falls linearly from the first one to the limit, and is at most MAX_RISE_N above the minimum.
+        remaining = min((self._start_s + FALL_END_S - clock.now()) / (FALL_END_S - FALL_START_S), 1.0)
+        line_n = self._max_n + (self._first_n + MAX_RISE_N - self._max_n) * remaining
+        if not force_n <= max(self._max_n, min(self._min_n + MAX_RISE_N, line_n)):
             raise RigFault("force", f"the force does not fall, it is {force_n:.1f} N", "free the tool by hand")
 
-    return check
 
-
-def _refuse(what: str, allowed: str) -> NoReturn:
-    raise RigFault("refused", f"no move: {what}; allowed {allowed}")
+def _refuse(problem: str, allowed: str) -> NoReturn:
+    raise RigFault("refused", f"no move: {problem}; allowed {allowed}")

@@ -1,4 +1,4 @@
-"""A simulated pad that a finger presses at random, in real time: a board to watch without hardware."""
+"""A board without hardware: a simulated pad that a finger presses at random positions, in real time."""
 
 import math
 from collections.abc import Mapping
@@ -26,9 +26,14 @@ from padforge.sense.simulation.simulated_recording import sample_positions
 class SimulatedBoard:
     """A board that samples a simulated pad at `[rig] rate_hz`; implements `Board`.
 
-    The pad is the one that `simulate` records with the same arguments, down to the readings of its fibres at rest.
-    Presses come as often and are held as long as there, at other positions, and as deep as `[rig]` says, its depths in
-    turn.
+    The pad, with the baselines of its fibres, is the one that `simulate` makes of the same arguments. Presses have the
+    same timing, other positions, and the depths of `[rig]` in turn.
+
+    Args:
+        pad: the pad.
+        rig: rate, timing and depths of the presses, and seed.
+        contact: contact of the presses.
+        size: sensed area and keep-outs; those of the pad if None.
     """
 
     def __init__(
@@ -38,11 +43,10 @@ class SimulatedBoard:
         contact: Contact,
         size: PadSettings | None = None,
     ) -> None:
-        """Make the pad; sampling starts with `connect`. `size` has sensed area and keep-outs, the pad's own if None."""
         rig = rig.for_contact(contact)
         rng = np.random.default_rng(rig.seed)
         if rig.plan_file is None:
-            make_plan(pad, rig, rng, size)  # the presses of the recording are drawn before the pad is
+            make_plan(pad, rig, rng, size)  # `simulate`, too, draws the plan before the pad
         self._model = LivePad(pad, contact, rig, rig.rate_hz, rng)
         self._pad, self._contact, self._rig = pad, contact, rig
         self._depths_mm = rig.press_depths_mm
@@ -54,7 +58,7 @@ class SimulatedBoard:
 
     def connect(self) -> Mapping[str, Any]:
         """Start sampling; see `Board`."""
-        self._model.prepare()  # before it has to keep up
+        self._model.prepare()  # slow, so done before real time begins
         self._start_s, self._n_samples = clock.now(), 0
         fibres = len(self._pad.knots)
         identity = {"name": "simulated", "channels": fibres, "inputs": list(range(fibres))}
@@ -73,20 +77,20 @@ class SimulatedBoard:
         return BoardSamples(self._start_s + elapsed_s, volts, np.zeros(len(elapsed_s), np.int64))
 
     def close(self) -> None:
-        """Do nothing, for nothing is open; see `Board`."""
+        """Do nothing; see `Board`."""
 
     def _touch(self, time_s: float) -> tuple[Array, float]:
-        """Return the finger's position and depth, mm: it is down in the second half of every cycle."""
+        """Return the finger's position and depth, mm; it presses in the second half of every cycle."""
         cycle_s = self._rig.readings_per_press / self._rig.rate_hz
         press, elapsed_s = divmod(time_s, cycle_s)
         if press > self._press:
             self._press, self._position_mm = press, sample_positions(self._pad, 1, self._position_rng, self._size)[0]
-        share = min((elapsed_s - cycle_s / 2) / TRAVEL_S, 1.0, (cycle_s - elapsed_s) / TRAVEL_S)
-        return self._position_mm, self._depths_mm[int(press) % len(self._depths_mm)] * max(share, 0.0)
+        relative_depth = min((elapsed_s - cycle_s / 2) / TRAVEL_S, 1.0, (cycle_s - elapsed_s) / TRAVEL_S)
+        return self._position_mm, self._depths_mm[int(press) % len(self._depths_mm)] * max(relative_depth, 0.0)
 
 
 def simulated_board_of(model: Path) -> SimulatedBoard:
-    """Return the simulated pad whose recording a model folder was trained on; InputError if there is none."""
+    """Return the simulated pad on whose recording the model in a folder was trained; InputError if there is none."""
     path = model / RECORDED / START
     if not path.is_file():
         raise InputError(f"{path}: not there, though it says which pad to simulate; name a model of `padforge run`")
@@ -98,7 +102,7 @@ def simulated_board_of(model: Path) -> SimulatedBoard:
     try:
         pad = Morphology.from_dict(source["morphology"])
         contact, rig = dict(source["contact"]), dict(source["rig"])
-        rig.pop("channels", None)  # a simulated pad has no inputs of a board
+        rig.pop("channels", None)  # a simulated pad is not wired to inputs
         size = {key: source[key] for key in ("sensed_mm", "keep_out_mm") if key in source}
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(f"{path}: says of no pad that can be simulated ({error})") from error

@@ -1,4 +1,4 @@
-"""Streams of live readings: a board's samples averaged to the rate of the readings, or a recording that is replayed."""
+"""Streams of live readings: a board's samples averaged to the rate of readings, or the replay of a recording."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
@@ -17,22 +17,22 @@ from padforge.sense.rig import clock
 from padforge.sense.rig.devices import Board, BoardSamples
 from padforge.sense.settings import RigSettings
 
-HISTORY = SLOW[-1]  # readings before a press that the history features look back at
-SLACK = 4096  # readings beyond HISTORY, as a press is detected some readings after it began
+HISTORY = SLOW[-1]  # readings before a press that the history features depend on
+SLACK = 4096  # readings beyond HISTORY, since a press is detected some readings after its start
 PAUSE_S = 0.01  # between two polls of a board, or of the clock of a replay
-MAX_BLOCK = 64  # readings that are replayed at a time, so that a fast replay can be watched
+MAX_BLOCK = 64  # readings in a block of a replay, so that a fast one can be watched
 RECORDED = "recording"  # name of the training recording in the folder of a model
 
 Block = tuple[Array, Array]  # times (n,) in s, and readings (n, C) in V
 
 
 class RingBuffer:
-    """The latest rows of a stream, at least HISTORY + SLACK of them."""
+    """The latest rows of a stream, at least HISTORY + SLACK of them; they are indexed from the start of the stream."""
 
     def __init__(self, n_columns: int) -> None:
         self._rows = np.empty((2 * (HISTORY + SLACK), n_columns))
         self._filled = 0
-        self.end = 0  # number of rows so far, which is the index of the next one
+        self.end = 0  # index of the next row
 
     def append(self, row: Array) -> None:
         """Add a row (columns,)."""
@@ -53,15 +53,15 @@ class RingBuffer:
         return interpolate_gaps(self.rows(index + REST[0], index)[:, 1:]).mean(axis=0)
 
     def command_index(self, reading: int, delay_s: float) -> int:
-        """Return the index of the reading at which the probe was sent, if `reading`, `delay_s` later, shows it."""
+        """Return the index of the first reading at most `delay_s` before `reading`: when a probe was commanded."""
         times_s = self.rows(0, reading + 1)[:, 0]
         return reading + 1 - len(times_s) + int(np.searchsorted(times_s, times_s[-1] - delay_s))
 
 
 class Averager:
-    """Mean of every `ratio` samples, by the count of the board, so that a lost sample shifts nothing.
+    """Averages blocks of `ratio` samples. Lost samples are counted, so that they do not shift the blocks.
 
-    A mean is over those samples of its block that arrived; a block without any gives no reading.
+    A reading is the mean of the samples of its block that arrived; a block without any gives no reading.
     """
 
     def __init__(self, ratio: int, n_channels: int) -> None:
@@ -70,7 +70,7 @@ class Averager:
         self.n_missing = 0  # samples that never arrived
 
     def feed(self, samples: BoardSamples) -> Block:
-        """Return times (n,) and volts (n, C) of the blocks that are complete now; keep the other samples."""
+        """Return times (n,) and volts (n, C) of the completed blocks; samples of an incomplete block are stored."""
         if len(samples.times_s) == 0:
             return np.empty(0), np.empty((0, self._pending.shape[1] - 2))
         counts = self._index + np.arange(len(samples.times_s)) + np.cumsum(samples.missing)
@@ -98,7 +98,7 @@ class ReadingStream:
 
 
 def stream_board(board: Board, rate_hz: float) -> ReadingStream:
-    """Connect a board, and stream its samples averaged to about `rate_hz`, without end or until it raises RigFault."""
+    """Connect a board, and return the endless stream of its samples, averaged to about `rate_hz`."""
     identity = board.connect()
     ratio = max(1, round(identity["rate_hz"] / rate_hz))
     averager = Averager(ratio, identity["channels"])
@@ -112,7 +112,7 @@ def stream_board(board: Board, rate_hz: float) -> ReadingStream:
 
 
 def stream_recording(recording: Recording, speed: float) -> ReadingStream:
-    """Replay a recording, `speed` > 0 times as fast as it was recorded; InputError for another speed."""
+    """Return the replay of a recording, `speed` > 0 times as fast as it was recorded; InputError for other speeds."""
     speed = check_float("speed", speed, 1e-9, np.inf)
     due_s = (recording.times_s - recording.times_s[0]) / speed
 
@@ -130,10 +130,10 @@ def stream_recording(recording: Recording, speed: float) -> ReadingStream:
 
 
 def is_pad_mirrored(model: Path, rig: RigSettings) -> bool:
-    """Return whether the pad lies with its tracks up, so that x and y of its plan are right-handed with z into it.
+    """Return whether the pad lies with its tracks up, so that x, y of its plan and z into it are right-handed.
 
-    `[rig]` says so. Where it leaves that open, the pad lies as it did in the training recording: in a holder, perhaps,
-    which only the recording mentions; InputError if that is damaged.
+    If `[rig]` does not say, the pad lies as in the training recording, perhaps in a holder, which only the recording
+    mentions; InputError if that is damaged.
     """
     if rig.mirrored is not None:
         return rig.mirrored

@@ -11,9 +11,9 @@ Position = tuple[float, float, float]  # x, y and z, mm
 class TrapezoidalProfile:
     """Distance and speed of a move from rest to rest over time."""
 
-    length: float  # distance of the move, >= 0; mm, m or rad
-    max_speed: float  # in these units a second, > 0
-    acceleration: float  # at the start and at the end, > 0
+    length: float  # distance from start to end, >= 0; mm, m or rad
+    max_speed: float  # cruising speed if the move is long enough, > 0; that unit per s
+    acceleration: float  # of the ramps at both ends, > 0; that unit per s²
 
     @property
     def duration_s(self) -> float:
@@ -41,9 +41,9 @@ class TrapezoidalProfile:
 class StraightMove:
     """A straight move of a nozzle."""
 
-    start: Position  # position before it
-    end: Position  # position after it
-    speed: float  # at most, > 0, mm/s
+    start: Position
+    end: Position
+    speed: float  # maximum, > 0, mm/s
     acceleration: float  # > 0, mm/s²
 
     @property
@@ -64,10 +64,10 @@ class StraightMove:
         """Return the same move, slowed down until no axis exceeds its own speed and acceleration."""
         if not self.length_mm:
             return self
-        shares = [abs(b - a) / self.length_mm for a, b in zip(self.start, self.end, strict=True)]
+        direction = [abs(b - a) / self.length_mm for a, b in zip(self.start, self.end, strict=True)]
         speed, acceleration = (
-            min([wanted, *(limit / share for limit, share in zip(limits, shares, strict=True) if share)])
-            for wanted, limits in ((self.speed, max_speeds), (self.acceleration, max_accelerations))
+            min([requested, *(limit / cosine for limit, cosine in zip(limits, direction, strict=True) if cosine)])
+            for requested, limits in ((self.speed, max_speeds), (self.acceleration, max_accelerations))
         )
         return replace(self, speed=speed, acceleration=acceleration)
 
@@ -75,14 +75,13 @@ class StraightMove:
         """Return the position `t_s` seconds after the start; `start` before the move, `end` after it."""
         if t_s >= self.duration_s:
             return self.end
-        share = self._profile.evaluate(t_s)[0] / self.length_mm
-        x, y, z = (a + share * (b - a) for a, b in zip(self.start, self.end, strict=True))
+        fraction = self._profile.evaluate(t_s)[0] / self.length_mm
+        x, y, z = (a + fraction * (b - a) for a, b in zip(self.start, self.end, strict=True))
         return x, y, z
 
     def distance_mm(self, position: Position) -> float:
         """Return the distance of a position from the path."""
         path, offset = ([b - a for a, b in zip(self.start, end, strict=True)] for end in (self.end, position))
-        square = self.length_mm**2
-        share = sum(a * b for a, b in zip(path, offset, strict=True)) / square if square else 0.0
-        share = min(max(share, 0.0), 1.0)
-        return math.dist(offset, [share * value for value in path])
+        fraction = sum(a * b for a, b in zip(path, offset, strict=True)) / self.length_mm**2 if self.length_mm else 0.0
+        fraction = min(max(fraction, 0.0), 1.0)  # of the path, at the foot of the perpendicular
+        return math.dist(offset, [fraction * value for value in path])

@@ -1,12 +1,11 @@
 """A 3D printer with Marlin as an arm: a probe clamped beside its nozzle presses, G-code over a serial port moves it.
 
-Poses are of the probe's tip, in the printer's own frame: the nozzle's position plus `[rig] tcp_mm`. The tip cannot
+Poses are those of the probe's tip in the printer's own frame: the nozzle's position plus `[rig] tcp_mm`. The tip cannot
 turn, and a printer measures no force.
 
-A thread has the port. It moves the nozzle and asks for its position again and again. A firmware with a real-time
-position (`M114 R`) reports where the nozzle is; others report the end of the move, and during it the position is that
-of the commanded move. A move is over when the firmware says that nothing is left of it (`M400`) and the nozzle stands
-where it was sent.
+A thread owns the port. It moves the nozzle and polls its position. A firmware with a real-time position (`M114 R`)
+reports where the nozzle is. Others report the end of the move; during a move the position is then computed from the
+commanded motion. A move has ended when the firmware has emptied its queue (`M400`) and the nozzle stands at its target.
 """
 
 import math
@@ -39,18 +38,18 @@ from padforge.sense.rig.safety import check_finite_move, check_probe
 from padforge.sense.settings import RigSettings
 
 CONNECT_S = 3.0  # longest wait for a printer that restarts as its port is opened
-STALE_S = 0.5
+STALE_S = 0.5  # maximum age of a state
 SETTINGS = ("G21", "G90", "M220 S100", "M211 S1", "M84 S0")
 """Millimetres, absolute positions, speeds at 100 %, software endstops on, motors always energized."""
 
-_POLL_S = 0.03  # pause between two questions for the position
-_TOLERANCE_MM = 0.05  # of a position at rest: its last decimal, and a step of the motors
-_MAX_STATES = 100_000
-_MOVE_S = 0.8
-_STOP_S = 0.3
-_START_S = 0.1  # a firmware waits this long for further moves before it starts the first
-_MAX_LATE_S = 1.2  # beyond the duration that the axes' limits give
-_MAX_OFFSET_MM = 1.0  # from the straight path during a move
+_POLL_S = 0.03  # pause between two requests for the position
+_TOLERANCE_MM = 0.05  # of a position at rest: its last decimal and one motor step
+_MAX_STATES = 100_000  # states buffered for `drain`
+_MOVE_TIMEOUT_S = 0.8
+_STOP_TIMEOUT_S = 0.3
+_START_S = 0.1  # time for which a firmware waits for further moves before it starts the first
+_MAX_DELAY_S = 1.2  # beyond the duration that the axes' limits give
+_MAX_OFFSET_MM = 1.0  # distance from the straight path during a move
 _MAX_IMPLAUSIBLE = 3  # implausible positions in a row; fewer are noise
 
 
@@ -58,10 +57,10 @@ _MAX_IMPLAUSIBLE = 3  # implausible positions in a row; fewer are noise
 class NozzleState:
     """State of the nozzle at one moment."""
 
-    time_s: float  # when the printer reported it
-    position: Position  # of the nozzle, mm
+    time_s: float  # host time of the printer's report
+    position: Position  # mm
     speed_mm_s: float  # >= 0
-    moving: bool  # whether a move is under way
+    moving: bool  # whether a move is in progress
 
 
 class NozzleThread(threading.Thread):
@@ -72,15 +71,15 @@ class NozzleThread(threading.Thread):
         self._link, self._max_mm_s, self._max_mm_s2 = link, max_mm_s, max_mm_s2
         self._position = position  # at rest
         self._move: StraightMove | None = None
-        self._start_s, self._acceleration, self._n_implausible = 0.0, 0.0, 0
+        self._move_start_s, self._acceleration, self._n_implausible = 0.0, 0.0, 0
         self._commands: queue.Queue[tuple[Callable[[], None], Future[None]]] = queue.Queue()
         self._states: deque[NozzleState] = deque(maxlen=_MAX_STATES)
         self._ending = threading.Event()
-        self.fault: RigFault | None = None  # why the position is unknown; None while all is well
-        self.latest = NozzleState(clock.now(), position, 0.0, False)  # the last state
+        self.fault: RigFault | None = None  # why the position is unknown, if it is
+        self.latest = NozzleState(clock.now(), position, 0.0, False)
 
     def run(self) -> None:
-        """Poll, and execute commands, until the end or a fault."""
+        """Poll the position and execute commands until `end` is called or a fault occurs."""
         try:
             while not self._ending.is_set():
                 try:
@@ -99,15 +98,15 @@ class NozzleThread(threading.Thread):
         return [self._states.popleft() for _ in range(len(self._states))]
 
     def move(self, end: Position, speed_mm_s: float, acceleration_mm_s2: float) -> None:
-        """Start a straight move; return, or raise RigFault, as soon as the firmware has confirmed its end position."""
-        self._submit(lambda: self._start_move(end, speed_mm_s, acceleration_mm_s2), _MOVE_S)
+        """Start a straight move; return as soon as the firmware has confirmed its target, or raise RigFault."""
+        self._submit(lambda: self._start_move(end, speed_mm_s, acceleration_mm_s2), _MOVE_TIMEOUT_S)
 
     def stop(self) -> None:
-        """End the move under way; if no quick stop is confirmed, halt the printer and raise RigFault("lost")."""
+        """Stop the current move; if the quick stop is not confirmed, halt the printer and raise RigFault("lost")."""
         if self._move is None or self._link.halted:
             return
         try:
-            self._submit(self._quick_stop, _STOP_S)
+            self._submit(self._quick_stop, _STOP_TIMEOUT_S)
         except RigFault:
             self._link.send_unnumbered("M112")
             self._move = None
@@ -129,7 +128,7 @@ class NozzleThread(threading.Thread):
         while not result.done() and clock.now() < deadline_s:
             wait([result], _POLL_S)
         if not result.done():
-            result.cancel()  # or it would be executed later, when nobody waits for its end
+            result.cancel()  # otherwise it could run later, when nobody waits for it
             raise self.fault or RigFault("deadline", f"the printer did not answer within {timeout_s} s")
         result.result()
 
@@ -152,13 +151,13 @@ class NozzleThread(threading.Thread):
         move = move.limit_axes(self._max_mm_s, self._max_mm_s2)
         if not move.length_mm:
             return
-        self._move = move  # before anything is sent, as `stop` has nothing to do without a move
+        self._move = move  # set before anything is sent, since `stop` does nothing without a move
         if move.acceleration != self._acceleration:
             self._link.execute(f"M204 P{move.acceleration:.1f} T{move.acceleration:.1f}")
             self._acceleration = move.acceleration
         self._link.execute(format_move(end, move.speed))
-        self._start_s = clock.now()
-        # Without R the firmware reports the end of its moves: software endstops may have clipped this one.
+        self._move_start_s = clock.now()
+        # M114 without R reports the planned target, which the software endstops may have clipped.
         if math.dist(planned := self._ask_position("M114", end), end) > _TOLERANCE_MM:
             self._quick_stop()
             self._raise_displaced(f"is about to go to {_format(planned)}", end)
@@ -172,7 +171,7 @@ class NozzleThread(threading.Thread):
             return
         position = self._ask_position("M114 R", None)
         now_s = clock.now()
-        elapsed_s = now_s - self._start_s
+        elapsed_s = now_s - self._move_start_s
         if math.dist(position, move.end) <= _TOLERANCE_MM:
             if elapsed_s >= move.duration_s:
                 self._add_state(now_s, position)
@@ -180,8 +179,8 @@ class NozzleThread(threading.Thread):
                 self._check_at_rest(move.end)
                 self._stop_at(move.end)
                 return
-            position = move.position(elapsed_s - _START_S)  # without a real-time position only the end is reported
-        late = elapsed_s > move.duration_s + _MAX_LATE_S
+            position = move.position(elapsed_s - _START_S)  # the firmware reports no real-time position
+        late = elapsed_s > move.duration_s + _MAX_DELAY_S
         implausible = late or move.distance_mm(position) > _MAX_OFFSET_MM
         self._n_implausible = self._n_implausible + 1 if implausible else 0
         if self._n_implausible >= _MAX_IMPLAUSIBLE:
@@ -203,14 +202,12 @@ class NozzleThread(threading.Thread):
             self._raise_displaced(f"stands at {_format(position)}", expected)
 
     def _ask_position(self, command: str, expected: Position | None) -> Position:
-        """Ask for the nozzle's position; ask again where the answer is damaged or not as expected."""
+        """Return the nozzle's position; repeat the request if the answer is damaged or not the expected position."""
         position = None
         for _ in range(_MAX_IMPLAUSIBLE):
-            positions = [
-                reported for line in self._link.execute(command) if (reported := parse_position(line)) is not None
-            ]
-            position = positions[-1] if positions else position
-            if positions and (expected is None or math.dist(positions[-1], expected) <= _TOLERANCE_MM):
+            for line in self._link.execute(command):
+                position = parse_position(line) or position
+            if position and (expected is None or math.dist(position, expected) <= _TOLERANCE_MM):
                 break
         if position is None:
             advice = "its link may be noisy: check its cable"
@@ -235,8 +232,8 @@ def _format(position: Position) -> str:
 class Printer:
     """The printer at `[rig] printer_port`; implements `Arm`.
 
-    It is never homed from here, for the probe would hit the bed: a person does that. If this process ends, the printer
-    ends the one move that is under way and stands.
+    The driver never homes the printer, since the probe would hit the bed; a person homes it. If this process ends, the
+    printer completes its current move and stops.
     """
 
     def __init__(self, rig: RigSettings) -> None:
@@ -251,10 +248,13 @@ class Printer:
         return cls(rig)
 
     def connect(self) -> Mapping[str, Any]:
-        """Open the port and set the printer up; nothing moves.
+        """Open the port and set the printer up, without moving it.
 
-        RigFault("refused") where there is no printer with Marlin, it has not been homed, it restarts as its port is
-        opened, or its axes are too slow for the presses. Without `tcp_mm`, poses are of the nozzle and nothing moves.
+        Without `[rig] tcp_mm`, poses are those of the nozzle and `move` is refused.
+
+        Raises:
+            RigFault: "refused" if no printer with Marlin answers, it has not been homed, it restarts as its port is
+                opened, or its axes are too slow for the presses.
         """
         self.close()
         rig = self._rig
@@ -292,7 +292,7 @@ class Printer:
         return self._to_arm_state(state)
 
     def drain(self) -> Array:
-        """Return the (n, 10) states since the last call; those before a fault come before it."""
+        """Return the (n, 10) states since the last call; a fault is raised once those before it are returned."""
         states = self._thread.drain() if self._thread else []
         if not states:
             self._connected()
@@ -300,7 +300,7 @@ class Printer:
         return np.array([self._to_arm_state(state).to_row() for state in states])
 
     def move(self, pose: Sequence[float], speed_mm_s: float, acceleration_mm_s2: float) -> None:
-        """Start a straight move from rest, as fast as the axes can; RigFault("refused") also for a turn of the tool."""
+        """Start a straight move from rest, slowed to the limits of the axes; a turn of the tool is refused, too."""
         check_finite_move(pose, speed_mm_s, acceleration_mm_s2)
         check_probe(self._rig)
         if not np.allclose(pose[3:], self._rig.tool_rad, atol=1e-6):
@@ -309,7 +309,7 @@ class Printer:
         self._connected().move((x, y, z), speed_mm_s, acceleration_mm_s2)
 
     def stop(self) -> None:
-        """Stop the printer, for good if it does not confirm it; see `Arm.stop`."""
+        """Stop the printer, and halt it for good if it does not confirm the stop; see `Arm.stop`."""
         if self._thread is not None:
             self._thread.stop()
 
@@ -336,7 +336,7 @@ class Printer:
         return ArmState(state.time_s, pose, state.speed_mm_s, None, False, False, state.moving)
 
     def _check_press_time(self, max_mm_s: Position, max_mm_s2: Position) -> None:
-        """Refuse presses that would be over before the tip is down."""
+        """Raise RigFault("refused") if a press would end before the tip has reached its depth."""
         rig = self._rig
         depth_mm = rig.clearance_mm + max(rig.press_depths_mm)
         down = StraightMove((0, 0, depth_mm), (0, 0, 0), rig.press_mm_s, rig.acceleration_mm_s2)
@@ -351,12 +351,12 @@ class Printer:
 
 
 def _identify(link: MarlinLink) -> dict[str, Any]:
-    """Return what the printer is; RigFault("refused") unless its firmware is Marlin 2."""
+    """Return the printer's identity; RigFault("refused") unless its firmware is Marlin 2."""
     lines = link.execute("M115")
     firmware = parse_identity(lines, "FIRMWARE_NAME")
     if FIRMWARE not in firmware:
         raise RigFault("refused", f"the firmware is {firmware or 'of no name'!r}, allowed is Marlin")
-    if re.match(r"Marlin (bugfix-)?1\.", firmware):  # answers M114 only once all moves are over
+    if re.match(r"Marlin (bugfix-)?1\.", firmware):  # it answers M114 only after all moves
         message = f"the firmware is {firmware!r}, which reports its position only once it stands"
         raise RigFault("refused", message, "allowed is Marlin 2")
     machine, halts_at_once = parse_identity(lines, "MACHINE_TYPE"), "Cap:EMERGENCY_PARSER:1" in lines
@@ -372,7 +372,7 @@ def _read_axis_limits(link: MarlinLink) -> tuple[Position, Position]:
 
 
 def _ask_home_position(link: MarlinLink) -> Position:
-    """Return the position of the nozzle; RigFault("refused") where it has not been homed."""
+    """Return the position of the nozzle; RigFault("refused") if the printer has not been homed."""
     answers = [position for _ in range(3) for line in link.execute("M114") if (position := parse_position(line))]
     if not answers:
         raise RigFault("refused", "the printer does not report its position (M114)")

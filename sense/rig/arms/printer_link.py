@@ -1,4 +1,4 @@
-"""Marlin's G-code over a serial port: lines are numbered, checked, and executed once, whatever noise there is."""
+"""Marlin's G-code over a noisy serial port: numbered lines with checksums, each executed exactly once."""
 
 import re
 from collections import deque
@@ -21,15 +21,15 @@ HOMING_ADVICE = "home it at its display with the probe off, put the probe on aga
 _NUMBER = r"(-?\d+(?:\.\d+)?)"
 _POSITION = re.compile(rf"^X:{_NUMBER} Y:{_NUMBER} Z:{_NUMBER}(?: |$)")
 _RESEND = re.compile(r"^(?:Resend:|rs) ?N?(\d+)$")
-_READ_S = 0.01
-_RESEND_S = 0.08
-_SILENCE_S = 0.03  # after which no more answers to repeated lines come
+_READ_S = 0.01  # longest wait for bytes
+_RESEND_S = 0.08  # time without a line after which the command is sent again
+_SILENCE_S = 0.03  # silence after which all answers to repeated lines have come
 _MAX_HISTORY = 8  # lines that can be sent again
-_MAX_BAD_RESENDS = 4  # requests for a line that was never sent; fewer are noise
+_MAX_BAD_RESENDS = 4  # requests for lines outside the history; fewer are noise
 
 
 def checksum(text: bytes) -> int:
-    """Return the exclusive or of all bytes, which ends a numbered line after a star."""
+    """Return Marlin's checksum of a numbered line: the exclusive or of all bytes before the star."""
     return reduce(xor, text)
 
 
@@ -46,32 +46,32 @@ def format_move(end: Position, speed_mm_s: float) -> str:
 
 
 def parse_resend(line: str) -> int | None:
-    """Return the number of the line that the printer asks for again; None for any other line."""
+    """Return the number of the line that the printer requests again; None if `line` is no such request."""
     match = _RESEND.match(line)
     return int(match[1]) if match else None
 
 
 def parse_position(line: str) -> Position | None:
-    """Return the nozzle's position in an answer to M114; None for any other line."""
+    """Return the nozzle's position, mm, from an answer to M114; None if `line` has none."""
     match = _POSITION.match(line)
     return (float(match[1]), float(match[2]), float(match[3])) if match else None
 
 
 def parse_axis_limits(lines: list[str], code: str) -> Position | None:
-    """Return the limits of x, y and z after M203 (mm/s) or M201 (mm/s²) in the answer to M503; None without."""
+    """Return the limits of x, y and z after M203 (mm/s) or M201 (mm/s²) in the answer to M503; None if missing."""
     match = re.search(rf"\b{code} X{_NUMBER} Y{_NUMBER} Z{_NUMBER}", "\n".join(lines))
     values = (float(match[1]), float(match[2]), float(match[3])) if match else None
     return values if values and min(values) > 0 else None
 
 
 def parse_identity(lines: list[str], name: str) -> str:
-    """Return a field of the answer to M115, such as FIRMWARE_NAME; "" without."""
+    """Return a field of the answer to M115, such as FIRMWARE_NAME; "" if missing."""
     match = re.search(rf"{name}:(.*?)(?: [A-Z_]+:|$)", "\n".join(lines), re.MULTILINE)
     return match[1].strip() if match else ""
 
 
 def is_halt(line: str) -> bool:
-    """Return whether the line says that the firmware has stopped for good."""
+    """Return whether a line reports that the firmware has halted."""
     return line.startswith("Error:") and any(words in line for words in HALTED)
 
 
@@ -80,10 +80,13 @@ def _is_confirmation(line: str) -> bool:
 
 
 class MarlinLink:
-    """An open port. Its methods raise RigFault("lost") once the printer is gone, has restarted or has halted."""
+    """An open port. Methods raise RigFault("lost") once the printer is gone or has restarted.
+
+    After a halt of the firmware they raise RigFault("emergency_stop").
+    """
 
     def __init__(self, port: str, baud: int) -> None:
-        """Open `port` exclusively; raises RigFault("refused") where that fails."""
+        """Open `port` exclusively; raises RigFault("refused") if that fails."""
         self._port = port
         self._stream = SerialStream(port, baud, _READ_S, "printer")
         _keep_running(self._stream.serial)
@@ -91,10 +94,10 @@ class MarlinLink:
         self._number = 0
         self._history: deque[bytes] = deque(maxlen=_MAX_HISTORY)
         self._connected = False
-        self.halted = False  # or restarted: nothing moves any more
+        self.halted = False  # or restarted: the printer takes no moves any more
 
     def handshake(self, timeout_s: float) -> None:
-        """Wait until the printer answers, and count its lines from 0; RigFault("refused") without one."""
+        """Wait until the printer answers, and reset its line number to 0; RigFault("refused") if none answers."""
         deadline = clock.now() + timeout_s
         while clock.now() < deadline:
             self._stream.send(b"\n" + number_line(0, "M110 N0"))
@@ -105,9 +108,10 @@ class MarlinLink:
         raise RigFault("refused", f"{self._port}: no printer answers", advice)
 
     def execute(self, command: str, timeout_s: float = ANSWER_S) -> list[str]:
-        """Have a command executed once; return the lines of its answer, none where noise took it.
+        """Execute a command exactly once and return the lines of its answer, [] if noise destroyed them.
 
-        RigFault("stale") where it is not answered in time.
+        Raises:
+            RigFault: "stale" after `timeout_s` without an answer; "lost" if the printer requests unknown lines.
         """
         self._number += 1
         self._history.append(number_line(self._number, command))
@@ -152,26 +156,26 @@ class MarlinLink:
         self._stream.close()
 
     def _resend_before(self, number: int) -> bool:
-        """Send the lines from `number` up to the latest, without it; return whether they are in the history."""
-        back = self._number - number
-        if not 0 <= back < len(self._history):
+        """Send the lines from `number` to the one before the latest; return whether they are in the history."""
+        n_lines = self._number - number
+        if not 0 <= n_lines < len(self._history):
             return False
-        for line in list(self._history)[len(self._history) - 1 - back : -1]:
+        for line in list(self._history)[-1 - n_lines : -1]:
             self._stream.send(line)
             list(self._read_until_silent())
         return True
 
     def _read_until_silent(self) -> Iterator[str]:
-        """Yield lines until none come, for `ANSWER_S` at most: what never falls silent is no printer."""
-        latest = clock.now() + ANSWER_S
-        end = clock.now() + _SILENCE_S
-        while clock.now() < min(end, latest):
+        """Yield lines until none come, for `ANSWER_S` at most: a device that never falls silent is no printer."""
+        deadline = clock.now() + ANSWER_S
+        silent_at = clock.now() + _SILENCE_S
+        while clock.now() < min(silent_at, deadline):
             for line in self._receive():
-                end = clock.now() + _SILENCE_S
+                silent_at = clock.now() + _SILENCE_S
                 yield line
 
     def _receive(self) -> list[str]:
-        """Return the lines that have come, after waiting for at most `_READ_S`."""
+        """Return the lines received within `_READ_S`."""
         *lines, self._text = (self._text + self._stream.receive()[1]).split(b"\n")
         texts = [line.decode("ascii", "replace").strip() for line in lines]
         for text in texts:
@@ -191,12 +195,12 @@ class MarlinLink:
 
 
 def _keep_running(serial: Any) -> None:
-    """Leave the control line as it is when the port closes, so that the next opening restarts no board."""
+    """Keep the DTR line asserted when the port closes (no HUPCL), so that opening it again does not reset the board."""
     try:
         import termios
     except ModuleNotFoundError:  # Windows
         return
-    with suppress(OSError, termios.error):  # a port without such a line
+    with suppress(OSError, termios.error):  # the port has no such line
         settings = termios.tcgetattr(serial.fileno())
         settings[2] &= ~termios.HUPCL
         termios.tcsetattr(serial.fileno(), termios.TCSANOW, settings)

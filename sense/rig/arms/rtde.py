@@ -12,11 +12,12 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-RTDE_PORT, DASHBOARD_PORT = 30004, 29999
-VERSION, CONTROLLER, OUTPUTS, START, DATA = b"VvOSU"
-PROTOCOL = 2  # the only version of the protocol that is used here
-RUNNING = 7  # robot mode of an arm that is powered on and has its brakes released
-STOPPED, PLAYING = 1, 2  # runtime states of the program; a paused one has another
+RTDE_PORT = 30004
+DASHBOARD_PORT = 29999
+VERSION, CONTROLLER, OUTPUTS, START, DATA = b"VvOSU"  # types of frames
+PROTOCOL = 2  # version of the protocol
+RUNNING = 7  # robot mode: the arm is powered on and its brakes are released
+STOPPED, PLAYING = 1, 2  # runtime states of the program; others are paused, pausing and so on
 PROTECTIVE_BITS = 1 << 2 | 1 << 3 | 1 << 4 | 1 << 8 | 1 << 9 | 1 << 10
 """Protective and safeguard stop, recovery, violation, fault: the controller does not move the arm."""
 EMERGENCY_BITS = 1 << 5 | 1 << 6 | 1 << 7
@@ -30,12 +31,12 @@ VARIABLES = {
     "safety_status_bits": "UINT32",
     "output_int_register_2": "INT32",
 }
-"""What the reader asks for, and of which type it is; the register is that of the moves of ur-rtde's program."""
+"""Requested variables and their types; in the register ur-rtde's program reports the progress of moves."""
 FORCE_SERIES = 5  # first major version of PolyScope whose arms have a force sensor at the tool
-MAX_CLOCK_SKEW = 2e-4  # relative difference of the controller's clock and the host's
+MAX_CLOCK_SKEW = 2e-4  # relative rate difference between the controller's clock and the host's
 
-_HEADER = struct.Struct(">HB")
-_LAYOUT = struct.Struct(">19diIIi")  # the values of `VARIABLES`, which follow the number of their recipe
+_HEADER = struct.Struct(">HB")  # size of the frame, with its header, and type
+_LAYOUT = struct.Struct(">19diIIi")  # the values of `VARIABLES`; a byte, the number of the recipe, precedes them
 
 
 def pack_frame(kind: int, payload: bytes = b"") -> bytes:
@@ -64,7 +65,7 @@ class FrameSplitter:
 
 
 def ask_dashboard(host: str, questions: Sequence[str], timeout_s: float) -> list[str]:
-    """Return one line of answer to each question; OSError if the dashboard does not answer each in time."""
+    """Return the answer, one line, to each question; OSError if the dashboard is unreachable or one is late."""
     with socket.create_connection((host, DASHBOARD_PORT), timeout_s) as link, link.makefile("rb") as lines:
         lines.readline()
         answers = []
@@ -77,7 +78,7 @@ def ask_dashboard(host: str, questions: Sequence[str], timeout_s: float) -> list
 
 
 def stop_program(host: str, timeout_s: float) -> bool:
-    """Stop the arm's program by the dashboard, for good; return whether no program runs any more."""
+    """Stop the arm's program through the dashboard; return whether the dashboard confirms that none runs."""
     try:
         return ask_dashboard(host, ["stop", "running"], timeout_s)[1].lower().endswith("false")
     except OSError:
@@ -86,21 +87,21 @@ def stop_program(host: str, timeout_s: float) -> bool:
 
 @dataclass(frozen=True)
 class RtdeState:
-    """A state as the controller sends it."""
+    """A state of the arm, in the controller's units."""
 
-    time_s: float  # when it was measured, on the host's monotonic clock
-    pose: tuple[float, ...]  # m and rad
+    time_s: float  # time of the measurement, host's monotonic clock
+    pose: tuple[float, ...]  # of the tool, m and rad
     speed: float  # of the tool, m/s
     force_n: float | None  # on the tool along z; None without a sensor
     sideways_n: float  # force across z; 0 without a sensor
     mode: int  # robot mode
-    runtime: int  # state of the program
-    safety: int  # status bits
-    progress: int  # register of moves of the arm's program
+    runtime: int  # runtime state of the program
+    safety: int  # safety status bits
+    progress: int  # register in which ur-rtde's program reports its moves
 
 
 class HostClock:
-    """Converts controller time to host time by the shortest delay so far, so that late arrivals are no late states."""
+    """Converts controller time to host time by the minimum delay so far, which excludes the jitter of the network."""
 
     def __init__(self) -> None:
         self._offset = float("inf")
@@ -118,10 +119,11 @@ class HostClock:
 class RtdeReader:
     """A link to the RTDE port that reads every state of the arm.
 
-    ur-rtde's own receiver has the latest state alone: whoever polls it misses states, and takes a silent arm for a
-    connected one.
+    ur-rtde's own receiver stores the latest state only: a program that polls it misses states and cannot tell that the
+    arm has fallen silent.
 
-    Methods raise OSError if there is no link or it ends, TimeoutError if nothing comes, ValueError for what is damaged.
+    Methods raise OSError if the link cannot be opened or ends, TimeoutError if nothing arrives, and ValueError for
+    damaged frames.
     """
 
     def __init__(self, host: str, timeout_s: float) -> None:
@@ -133,8 +135,8 @@ class RtdeReader:
         self._clock = HostClock()
         if self._request(VERSION, struct.pack(">H", PROTOCOL)) != b"\x01":
             raise ValueError(f"the controller does not speak RTDE {PROTOCOL}")
-        self.version: tuple[int, ...] = _unpack(struct.Struct(">4I"), self._request(CONTROLLER))  # of the controller
-        self.rate_hz = 500 if self.version[0] >= FORCE_SERIES else 125  # control cycles, and states, a second
+        self.version: tuple[int, ...] = _unpack(struct.Struct(">4I"), self._request(CONTROLLER))  # of PolyScope
+        self.rate_hz = 500 if self.version[0] >= FORCE_SERIES else 125  # one state per control cycle
         self._start()
 
     def read(self, timeout_s: float) -> RtdeState:
@@ -158,7 +160,7 @@ class RtdeReader:
         )
 
     def _start(self) -> None:
-        """Agree on the variables with the controller, and let it stream them."""
+        """Request the variables and start the stream."""
         answer = self._request(OUTPUTS, struct.pack(">d", self.rate_hz) + ",".join(VARIABLES).encode())
         types = answer[1:].decode().split(",")
         if missing := [name for name, kind in zip(VARIABLES, types, strict=False) if kind == "NOT_FOUND"]:
@@ -175,7 +177,7 @@ class RtdeReader:
                     return answer
 
     def _read_frames(self) -> list[tuple[int, bytes]]:
-        """Wait for bytes; queue the packages among the frames that they complete and return the other frames."""
+        """Wait for bytes; queue the data packages that they complete and return the other frames."""
         data = self._link.recv(65536)
         if not data:
             raise ConnectionError("the controller closed the link")

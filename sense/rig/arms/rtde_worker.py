@@ -1,9 +1,9 @@
-"""The worker process that controls a UR arm: commands on stdin, states and replies on stdout.
+"""The worker process that controls a UR arm: commands on stdin, states and replies on stdout, as JSON lines.
 
-Run as `python -m padforge.sense.rig.arms.rtde_worker HOST`; ur-rtde, which it calls, can hang and crash. All are JSON
-lines; an empty one is a heartbeat. The arm's watchdog is kicked from here alone, so the arm stops by itself if this
-process ends or hangs. It also stops if the parent ends, or gives no sign of life during a move. Nothing here unlocks,
-powers or starts an arm.
+It is run as `python -m padforge.sense.rig.arms.rtde_worker HOST`, since ur-rtde can hang and crash. An empty line on
+stdin is a heartbeat of the parent. Only this process kicks the arm's watchdog, so the arm stops if this process ends or
+hangs. The arm is also stopped if the parent ends, or sends nothing for `HEARTBEAT_TIMEOUT_S` during a move. This
+process never unlocks, powers or starts an arm.
 """
 
 import contextlib
@@ -23,17 +23,17 @@ from padforge.sense.rig.arms.rtde import RtdeReader, RtdeState
 from padforge.sense.rig.arms.ur_rtde import UrRtdeControl
 
 KICK_S = 0.04  # a sixth of the time after which the watchdog stops the arm
-HEARTBEAT_TIMEOUT_S = 0.3  # silence of the parent during a move; its heart beats six times as often
-STREAM_TIMEOUT_S = 0.25  # silence of the arm
-FIRST_STATE_S = 0.05  # wait for the first state after a stop, so that nobody takes an older one for it
-HALT_S = 0.15  # wait for the arm, and then for the parent, when this process has to end
-ANSWER_S = 1.0  # wait for an answer of the arm while connecting
-SESSION_END_S = 1.0  # wait for another session that is about to end: its watchdog needs a quarter of a second
+HEARTBEAT_TIMEOUT_S = 0.3  # maximum silence of the parent during a move; six times the period of its heartbeats
+STREAM_TIMEOUT_S = 0.25  # maximum silence of the arm
+FIRST_STATE_S = 0.05  # longest wait for a state after a stop, so that the parent does not act on an older one
+HALT_S = 0.15  # longest wait for the arm, and then for the parent, before this process ends
+ANSWER_S = 1.0  # longest wait for an answer of the arm while connecting
+SESSION_END_S = 1.0  # longest wait for the end of another session, whose watchdog takes 0.25 s
 UNLOCK_ADVICE = "look at the arm, unlock it at the pendant, then connect again"
 
 
 class CommandRejected(Exception):  # noqa: N818  the parent raises it as a RigFault
-    """A command that fails: cause, message and advice of the fault that the parent raises."""
+    """A rejected command; the arguments are cause, message and advice of the fault that the parent raises."""
 
 
 def _check_ready(state: RtdeState) -> None:
@@ -47,7 +47,7 @@ def _check_ready(state: RtdeState) -> None:
 
 
 def _wait_until_idle(reader: RtdeReader, state: RtdeState) -> RtdeState:
-    """Return the first state without a program on the arm; a program is someone else's, perhaps in mid-press."""
+    """Return the first state in which no program runs on the arm; a running one belongs to another session."""
     deadline = time.monotonic() + SESSION_END_S
     while state.runtime > rtde.STOPPED:
         if time.monotonic() > deadline:
@@ -58,9 +58,10 @@ def _wait_until_idle(reader: RtdeReader, state: RtdeState) -> RtdeState:
 
 
 def lock_arm(host: str) -> socket.socket:
-    """Keep other programs on this computer, whoever started them, off the arm until this process ends.
+    """Lock the arm against other processes and users of this computer until this process ends.
 
-    The name of a local socket is a lock that leaves nothing behind; Linux alone has such names, and ur-rtde wheels.
+    The lock is the name of an abstract Unix socket, which leaves no file behind. Only Linux has such names; ur-rtde has
+    no wheels for other POSIX systems.
     """
     address = socket.getaddrinfo(host, None)[0][4][0]
     lock = socket.socket(socket.AF_UNIX)
@@ -83,7 +84,7 @@ def lock_arm(host: str) -> socket.socket:
 class WorkerProcess:
     """Executes the parent's commands and reports every state of the arm.
 
-    Three threads: the main one reads stdin, one calls the driver, and one reads the states.
+    The main thread reads stdin, a second one calls the driver, and a third one reads the states.
     """
 
     def __init__(self, host: str, out: int) -> None:
@@ -115,7 +116,7 @@ class WorkerProcess:
                 self._commands.put(json.loads(line))
 
     def _execute_commands(self) -> None:
-        """Call the driver, which is not made for several threads."""
+        """Execute the commands in one thread, since the driver is not thread-safe."""
         while True:
             try:
                 command = self._commands.get(timeout=KICK_S)
@@ -123,7 +124,7 @@ class WorkerProcess:
                 command = {"id": 0, "command": "kick", "arguments": ()}
             try:
                 result = getattr(self, f"_do_{command['command']}")(*command["arguments"])
-                if command["id"]:
+                if command["id"]:  # 0: a command of this process itself, without a reply
                     self._send({"id": command["id"], "result": result})
             except CommandRejected as fault:
                 self._send({"id": command["id"], "fault": fault.args})
@@ -168,7 +169,7 @@ class WorkerProcess:
         )
 
     def _ask_identity(self) -> dict[str, str]:
-        """Ask the dashboard what the arm is; reject an arm that a person controls."""
+        """Return the arm's identity by its dashboard; reject an arm that is not in remote control."""
         polyscope, model = rtde.ask_dashboard(self._host, ["PolyscopeVersion", "get robot model"], ANSWER_S)
         remote, serial = rtde.ask_dashboard(self._host, ["is in remote control", "get serial number"], ANSWER_S)
         if remote == "false":
@@ -203,7 +204,7 @@ class WorkerProcess:
             control.end()
 
     def _playing(self) -> UrRtdeControl | None:
-        """Return the control if its program runs."""
+        """Return the control if its program is running, otherwise None."""
         is_playing = self._latest is not None and self._latest.runtime == rtde.PLAYING
         return self._control if is_playing else None
 
@@ -211,7 +212,7 @@ class WorkerProcess:
         return self._control is not None and self._control.moving
 
     def _report_states(self, reader: RtdeReader, state: RtdeState) -> None:
-        """Send every state to the parent; end before ur-rtde can reconnect and repeat an old command."""
+        """Send every state to the parent; on a lost link end before ur-rtde can reconnect and repeat a command."""
         while True:
             self._latest = state
             self._update(state)
@@ -230,7 +231,7 @@ class WorkerProcess:
         if self._control is not None:
             self._control.update(state.progress, stopped)
         if stopped and not self._stopped_by_arm:
-            # A paused program would go on with the old move as soon as a person unlocks the arm and presses play.
+            # A paused program would resume the old move as soon as a person unlocks the arm and presses play.
             threading.Thread(target=rtde.stop_program, args=(self._host, ANSWER_S), daemon=True).start()
         elif self._stopped_by_arm and not stopped:
             self._exit("lost", "the arm was stopped and unlocked, which ends its program", "connect again")
@@ -255,7 +256,7 @@ class WorkerProcess:
         }
 
     def _halt(self, cause: str, message: str) -> None:
-        """Stop the arm and end; if the driver does not stop it, the watchdog does."""
+        """Stop the arm and end this process; if the driver does not stop the arm, the watchdog does."""
         self._halting = True
         self._commands.put({"id": 0, "command": "stop", "arguments": ()})
         self._halted.wait(HALT_S)
@@ -268,7 +269,7 @@ class WorkerProcess:
                 data = data[os.write(self._out, data) :]
 
     def _exit(self, cause: str, message: str, advice: str) -> NoReturn:
-        """Report the reason, if the parent listens; end without ur-rtde's own clean-up, which waits and can crash."""
+        """Report the reason to the parent and end without ur-rtde's clean-up, which waits and can crash."""
         report = threading.Thread(target=self._send, args=({"exit": (cause, message, advice)},), daemon=True)
         report.start()
         report.join(HALT_S)
@@ -276,7 +277,7 @@ class WorkerProcess:
 
 
 def main() -> None:
-    """Keep stdout for the parent alone: what ur-rtde prints goes to stderr."""
+    """Run the worker; stdout is reserved for the parent, and ur-rtde prints to stderr."""
     out = os.dup(1)
     os.dup2(2, 1)
     with contextlib.suppress(KeyboardInterrupt):

@@ -1,4 +1,4 @@
-"""A Universal Robots arm, driven by ur-rtde from a process that can be killed, since it can hang and crash."""
+"""A Universal Robots arm, driven by ur-rtde in a child process, since ur-rtde can hang and crash."""
 
 import importlib.util
 import itertools
@@ -21,23 +21,23 @@ from padforge.sense.rig.devices import ArmState, Array, Cause, Pose, RigFault, s
 from padforge.sense.rig.safety import check_finite_move
 from padforge.sense.settings import RigSettings
 
-MAX_STATES = 300_000  # states kept for `drain`: 10 minutes at 500 Hz
-HEARTBEAT_S = 0.05
-SUPERVISION_S = 2.0  # how long heartbeats go on after the program last asked for a state
-CONNECT_S = 4.5
-MOVE_S = 1.0
-STALE_S = 0.5
-CONFIRM_S = 0.25  # longest wait for the worker to confirm a stop; the dashboard is asked after that
+MAX_STATES = 300_000  # states buffered for `drain`: 10 minutes at 500 Hz
+HEARTBEAT_S = 0.05  # period
+SUPERVISION_S = 2.0  # heartbeats end this long after the program last asked for a state
+CONNECT_S = 4.5  # longest wait for the link
+MOVE_S = 1.0  # longest wait for the arm to accept a move
+STALE_S = 0.5  # maximum age of a state
+CONFIRM_S = 0.25  # longest wait for the worker to confirm a stop; then the dashboard is asked
 DASHBOARD_S = 0.2  # longest wait for the dashboard to confirm a stop
 
 
 class RtdeWorker:
-    """The worker process of the driver, seen from its parent: requests have a deadline, and it can be killed."""
+    """The parent's side of the driver's worker process: requests have a deadline, and the process can be killed."""
 
     def __init__(self, host: str) -> None:
         self._host = host
         self.fault: RigFault | None = None  # why the worker has ended; None while it runs
-        self.latest: ArmState | None = None  # last state of the arm
+        self.latest: ArmState | None = None
         self.stopped = False  # whether the arm's dashboard confirmed a stop after the worker's end
         self._replies: dict[int, dict[str, Any]] = {}
         self._ids = itertools.count(1)
@@ -53,7 +53,7 @@ class RtdeWorker:
             thread.start()
 
     def request(self, command: str, *arguments: Any, timeout_s: float) -> Any:
-        """Send a command and return its result; RigFault if it fails, the worker ends, or it is late."""
+        """Send a command and return its result; RigFault if it fails, takes too long, or the worker ends."""
         number = next(self._ids)
         self._write(json.dumps({"id": number, "command": command, "arguments": arguments}).encode())
         with self._received:
@@ -65,8 +65,8 @@ class RtdeWorker:
             raise RigFault(*reply["fault"])
         return reply["result"]
 
-    def supervise(self) -> None:
-        """Note that the program looks at the arm, so that a move may go on."""
+    def renew_watch(self) -> None:
+        """Continue the heartbeats for `SUPERVISION_S`; to be called whenever the program asks for states."""
         self._supervised_s = clock.now()
 
     def drain(self) -> list[ArmState]:
@@ -88,7 +88,7 @@ class RtdeWorker:
                 pipe.close()
 
     def stop_program(self) -> bool:
-        """Stop the arm by its dashboard once the worker has ended; return whether that is confirmed."""
+        """Stop the arm through its dashboard once the worker has ended; return whether the stop is confirmed."""
         self.stopped = self.stopped or stop_program(self._host, DASHBOARD_S)
         return self.stopped
 
@@ -111,7 +111,7 @@ class RtdeWorker:
         for line in self.process.stdout:
             try:
                 message = json.loads(line)
-            except ValueError:  # it ended in the middle of a line
+            except ValueError:  # the worker ended in the middle of a line
                 break
             with self._received:
                 if "state" in message:
@@ -135,7 +135,7 @@ class UR5:
 
     During a move `state` or `drain` must be called at least every 2 s, or the arm is stopped; it also stops within
     0.5 s if this process ends or is suspended. A protective or emergency stop ends the move for good: a person has to
-    unlock the arm, and `connect` starts anew. Nothing here unlocks, powers or starts an arm.
+    unlock the arm, then `connect` opens a new link. The driver never unlocks, powers or starts an arm.
     """
 
     def __init__(self, host: str) -> None:
@@ -150,11 +150,12 @@ class UR5:
         return cls(rig.host)
 
     def connect(self) -> Mapping[str, Any]:
-        """Open the link, ending an earlier one of this object.
+        """Open the link; an earlier link of this object is closed first.
 
-        RigFault("refused") if ur-rtde is not installed, there is no arm, it is not in remote control or not powered,
-        another program uses it, on this computer or elsewhere, or it lacks what ur-rtde needs; "protective_stop",
-        "emergency_stop"; "deadline" after 4.5 s.
+        Raises:
+            RigFault: "refused" if ur-rtde is not installed, no arm answers, the arm is not powered or not in remote
+                control, another program uses it, on this computer or elsewhere, or it lacks what ur-rtde needs;
+                "protective_stop" or "emergency_stop" if it is stopped; "deadline" after 4.5 s.
         """
         if importlib.util.find_spec("rtde_control") is None:
             advice = "it has wheels for Linux on x86-64 and Windows, Python 3.11 and 3.12: pip install 'padforge[rig]'"
@@ -175,7 +176,7 @@ class UR5:
     def state(self) -> ArmState:
         """Return the latest state; also RigFault("deadline") if nobody asked for one for 2 s during a move."""
         worker = self._connected()
-        worker.supervise()
+        worker.renew_watch()
         state = worker.latest
         age_s = np.inf if state is None else clock.now() - state.time_s
         if state is None or age_s > STALE_S:
@@ -183,20 +184,20 @@ class UR5:
         return replace(state, moving=state.moving or state.time_s < self._move_s)
 
     def drain(self) -> Array:
-        """Return the (n, 10) states since the last call; those before the link was lost come before the fault."""
+        """Return the (n, 10) states since the last call; a fault is raised once those before it are returned."""
         states = self._worker.drain() if self._worker else []
         if not states:
             self._connected()
             return np.empty((0, len(STATE_COLUMNS)))
         if self._worker:
-            self._worker.supervise()
+            self._worker.renew_watch()
         return np.array([state.to_row() for state in states])
 
     def move(self, pose: Sequence[float], speed_mm_s: float, acceleration_mm_s2: float) -> None:
-        """Start a straight move from rest; RigFault("refused") if it is none or the arm does not accept it."""
+        """Start a straight move from rest; RigFault("refused") if it is not finite or the arm does not accept it."""
         check_finite_move(pose, speed_mm_s, acceleration_mm_s2)
         worker = self._connected()
-        worker.supervise()
+        worker.renew_watch()
         try:
             worker.request("move", [float(value) for value in pose], speed_mm_s, acceleration_mm_s2, timeout_s=MOVE_S)
         except RigFault as fault:
@@ -206,7 +207,7 @@ class UR5:
         self._move_s = clock.now()
 
     def stop(self) -> None:
-        """Stop the arm by its driver, or else by dashboard and watchdog; RigFault("lost") if unconfirmed."""
+        """Stop the arm by its driver, otherwise by its dashboard; RigFault("lost") if neither confirms the stop."""
         if self._worker is None or self._worker.stopped:
             return
         try:
@@ -231,7 +232,7 @@ class UR5:
         return self._worker
 
     def _abandon(self) -> bool:
-        """Kill the worker, so that the watchdog is kicked no more; return whether the dashboard confirms the stop."""
+        """Kill the worker, which ends the watchdog's kicks; return whether the dashboard confirms the stop."""
         if self._worker is None:
             return False
         self._worker.kill()

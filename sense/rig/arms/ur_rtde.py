@@ -4,15 +4,18 @@ from collections.abc import Sequence
 from importlib.metadata import version
 from typing import Any
 
-WATCHDOG_HZ = 4.0
-STOP_M_S2 = 5.0
-OPERATION, UNDER_WAY = 0x7F << 24, 1 << 15  # of ur-rtde's register of moves
+WATCHDOG_HZ = 4.0  # minimum rate of kicks; the arm stops if they come more slowly
+STOP_M_S2 = 5.0  # deceleration
+OPERATION = 0x7F << 24  # bits of ur-rtde's progress register: number of the operation
+UNDER_WAY = 1 << 15  # bit of the same register: the operation is in progress
 
 
 class UrRtdeControl:
-    """ur-rtde's program at work; its methods raise an error if the arm is lost. Lengths are m.
+    """A connection to ur-rtde's program on the arm. Methods raise an error if the link is lost; lengths are m.
 
-    `moving` tells whether the last move is under way, `identity` the version of the driver.
+    Attributes:
+        moving: whether the last move is in progress.
+        identity: version of the driver.
     """
 
     def __init__(self, host: str) -> None:
@@ -20,7 +23,8 @@ class UrRtdeControl:
         import rtde_control
 
         self.moving = False
-        self._progress = self._previous_operation = 0  # number of the operation before the move under way
+        self._progress = 0  # latest value of the register
+        self._previous_operation = 0  # number of the operation before the current move
         self._control: Any = rtde_control.RTDEControlInterface(host)
         if not self._control.setWatchdog(WATCHDOG_HZ):
             raise RuntimeError("it does not take a watchdog")
@@ -31,14 +35,14 @@ class UrRtdeControl:
         return self._control.getTCPOffset()
 
     def update(self, progress: int, is_stopped: bool) -> None:
-        """Note the newest register of progress, and whether a protective or emergency stop holds the arm."""
+        """Update `moving` from the progress register; a protective or emergency stop (`is_stopped`) ends the move."""
         self._progress = progress
         has_arrived = progress & OPERATION != self._previous_operation and not progress & UNDER_WAY
         if has_arrived or is_stopped:
             self.moving = False
 
     def kick(self) -> None:
-        """Kick the watchdog, which stops the arm after 0.25 s without."""
+        """Kick the watchdog, which stops the arm 0.25 s after the last kick."""
         self._control.kickWatchdog()
 
     def move(self, pose: Sequence[float], speed: float, acceleration: float) -> bool:

@@ -1,4 +1,4 @@
-"""What a board needs besides its protocol: its port, a thread that drains it, and host times of the samples."""
+"""Shared parts of the boards: the serial port, a thread that drains it, and the host times of samples."""
 
 import threading
 from abc import ABC, abstractmethod
@@ -13,16 +13,15 @@ from padforge.sense.rig import clock
 from padforge.sense.rig.devices import RigFault, SerialStream
 
 POLL_S = 0.1  # longest wait for bytes
-SETTLE_S = 0.5
-"""Time of blocks before the first samples are returned, so that their times rest on more than one arrival."""
+SETTLE_S = 0.5  # time of blocks before the first samples are returned, so that times depend on several arrivals
 BUFFER_S = 60.0  # time of samples that are buffered for a program that does not read
 
-_START_S = 1.5
-_STALL_S = 1.0
-_BUCKET_S = 1.0  # of the arrivals in a bucket only the one with the least delay is kept
+_START_S = 1.5  # longest wait for settled times
+_STALL_S = 1.0  # maximum silence of a board
+_BUCKET_S = 1.0  # of the arrivals in a bucket only the one with the minimum delay counts
 _MAX_BUCKETS = 60
-_MIN_STEP, _MAX_STEP = 0.5, 1.5  # between two returned times, in periods, while a changed line is caught up with
-
+_MIN_STEP = 0.5  # between two returned times while the fitted line changes, in periods
+_MAX_STEP = 1.5  # the same
 
 Arrivals = list[tuple[float, Any]]
 """Blocks of samples with their host times; the length of a block is the number of its samples."""
@@ -32,7 +31,13 @@ class BlockReader(threading.Thread):
     """A thread that drains a port into a buffer, until it is stopped or something fails."""
 
     def __init__(self, port: str, receive: Callable[[], tuple[float, list[Any]]], rate_hz: float) -> None:
-        """Prepare the thread; `receive` waits shortly for blocks and returns host time and blocks, or ends it."""
+        """Prepare the thread.
+
+        Args:
+            port: name of the port, for messages.
+            receive: waits up to about `POLL_S` for blocks and returns host time and blocks; its error ends the thread.
+            rate_hz: samples a second.
+        """
         super().__init__(name=f"reader of {port}", daemon=True)
         self._port, self._receive = port, receive
         self._capacity = round(BUFFER_S * rate_hz)
@@ -43,7 +48,7 @@ class BlockReader(threading.Thread):
         self._fault: RigFault | None = None
 
     def start_settled(self) -> None:
-        """Start, and return after `SETTLE_S` of blocks; RigFault("stale") without."""
+        """Start the thread, and return after `SETTLE_S` of blocks; RigFault("stale") if too few arrive."""
         self.start()
         deadline = clock.now() + _START_S
         while self._buffered_s() < SETTLE_S:
@@ -53,7 +58,7 @@ class BlockReader(threading.Thread):
             clock.sleep(POLL_S)
 
     def run(self) -> None:
-        """Fill the buffer."""
+        """Fill the buffer until `stop` is called or a fault occurs."""
         try:
             self._fill()
         except RigFault as fault:
@@ -62,7 +67,7 @@ class BlockReader(threading.Thread):
             self._fault = RigFault("lost", f"{self._port}: the reader has failed ({error!r})")
 
     def drain(self) -> Arrivals:
-        """Return the buffered blocks with their arrival times; raise the thread's fault once there are none."""
+        """Return the buffered blocks with their arrival times; if there are none, raise the thread's fault, if any."""
         with self._lock:
             arrivals = list(self._arrivals)
             self._arrivals.clear()
@@ -89,7 +94,7 @@ class BlockReader(threading.Thread):
         silent_s, last_s = 0.0, clock.now()
         while not self._stopped.is_set():
             now_s, blocks = self._receive()
-            silent_s += min(now_s - last_s, 2 * POLL_S)  # time in which the host slept is no silence of the board
+            silent_s += min(now_s - last_s, 2 * POLL_S)  # the board is not blamed for time in which the host slept
             last_s = now_s
             for block in blocks:
                 silent_s = 0.0
@@ -103,13 +108,13 @@ class BlockReader(threading.Thread):
 
 
 class SerialBoard(ABC):
-    """A board at a serial port, whose protocol a subclass knows.
+    """A board at a serial port; its subclasses implement the protocols.
 
     Args:
-        port: its name; nothing is opened before `connect`.
+        port: name of the port, which `connect` opens.
         baud: speed of the port.
         rate_hz: samples a second.
-        inputs: of the board, one a fibre, from 0; () for all.
+        inputs: input of each fibre, from 0; () for all inputs in order.
     """
 
     def __init__(self, port: str, baud: int, rate_hz: float, inputs: Sequence[int] = ()) -> None:
@@ -118,7 +123,7 @@ class SerialBoard(ABC):
         self._reader: BlockReader | None = None
 
     def connect(self) -> dict[str, Any]:
-        """Open the port, and return the board's identity once times are settled; see `Board`."""
+        """Open the port, and return the board's identity once its times have settled; see `Board`."""
         self.close()
         self._stream = SerialStream(self._port, self._baud, POLL_S)
         try:
@@ -140,14 +145,14 @@ class SerialBoard(ABC):
         """Start `_reader` on the open port, and return the board's identity."""
 
     def _drain(self) -> Arrivals:
-        """Return the blocks that have come; RigFault("refused") before `connect`."""
+        """Return the received blocks; RigFault("refused") before `connect`."""
         if self._reader is None:
             raise RigFault("refused", f"{self._port}: not connected")
         return self._reader.drain()
 
 
 def select_inputs(inputs: Sequence[int], n_inputs: int) -> tuple[int, ...]:
-    """Return the inputs to read, all in order if empty; RigFault("refused") for one that the board lacks."""
+    """Return the inputs to read, all in order if `inputs` is empty; RigFault("refused") for a missing input."""
     for fibre, number in enumerate(inputs, start=1):
         if not 0 <= number < n_inputs:
             message = f"[rig] channels: fibre {fibre} is on input {number}, the board has 0 to {n_inputs - 1}"
@@ -159,16 +164,19 @@ Point = tuple[float, float]
 
 
 class SampleClock:
-    """Converts a board's sample index or clock to host time, from the arrivals of its blocks.
+    """Converts a board's sample index or clock to host time, from the arrival times of its blocks.
 
-    A block cannot arrive before its last sample was measured, and now and then one arrives with hardly any delay. The
-    time of a sample is therefore a straight line below all arrivals of the last minute, as high as possible: late
-    blocks do not matter, and the slope is the board's clock against the host's. A delay that all blocks have in common
-    cannot be observed and stays in the times.
+    A block cannot arrive before its last sample was measured, and some blocks arrive with hardly any delay. The host
+    time is therefore modelled as the highest straight line below all arrivals of the last minute: late blocks have no
+    influence, and the slope is the relative rate of the board's clock. A delay common to all blocks cannot be observed
+    and remains in the times.
+
+    Args:
+        period_s: nominal period of one count of the board.
+        max_skew: maximum relative error of that period.
     """
 
     def __init__(self, period_s: float, max_skew: float) -> None:
-        """Start without arrivals; the period is of one count of the board, the skew its largest relative error."""
         self._period_s, self._max_skew = period_s, max_skew
         self._origin: tuple[int, float] | None = None
         self._bucket_min: Point | None = None
@@ -197,24 +205,31 @@ class SampleClock:
         self._offset = min(self._offset, residual)
 
     def times(self, indices: Indices) -> Array:
-        """Return ascending host times, s, of ascending indices, later than all before; at least one block has come."""
+        """Return ascending host times (n,), s, of ascending indices (n,), later than all returned before.
+
+        Times follow a changed line by steps of `_MIN_STEP` to `_MAX_STEP` periods. Raises ValueError before the first
+        `observe`.
+        """
         if self._origin is None:
             raise ValueError("no block has been observed")
         start, start_s = self._origin
         first, last = int(indices[0]), int(indices[-1])
         nominal_s = (last - start) * self._period_s
         end_s = start_s + nominal_s * (1 + self._slope) + self._offset
-        before, before_s = self._last or (first - 1, end_s - (last - first + 1) * self._period_s)
-        span_s = (last - before) * self._period_s
-        end_s = min(max(end_s, before_s + _MIN_STEP * span_s), before_s + _MAX_STEP * span_s)
+        previous, previous_s = self._last or (first - 1, end_s - (last - first + 1) * self._period_s)
+        span_s = (last - previous) * self._period_s
+        end_s = min(max(end_s, previous_s + _MIN_STEP * span_s), previous_s + _MAX_STEP * span_s)
         self._last = (last, end_s)
-        steps = (indices - before).astype(np.float64)
-        return before_s + steps * ((end_s - before_s) / (last - before))
+        steps = (indices - previous).astype(np.float64)
+        return previous_s + steps * ((end_s - previous_s) / (last - previous))
 
 
 def _fit_lower_line(points: list[Point], max_slope: float) -> tuple[float, float]:
-    """Return offset and slope of the line below all `points`, by ascending x, that is highest at their mean x."""
-    hull: list[Point] = []  # lower convex hull
+    """Return offset and slope of the line below all `points`, in ascending x, that is highest at their mean x.
+
+    Without the limit of the slope, it is the edge of the lower convex hull at the mean x.
+    """
+    hull: list[Point] = []  # lower convex hull, by Andrew's monotone chain
     for point in points:
         while len(hull) > 1 and _slope(hull[-2], point) <= _slope(hull[-2], hull[-1]):
             hull.pop()

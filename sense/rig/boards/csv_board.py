@@ -1,7 +1,7 @@
-"""A board that prints its own lines of numbers, as most sketches do: no header, no check, times by their arrival.
+"""A board that prints plain lines of numbers, as most Arduino sketches do, without header and check.
 
-Weaker than the line protocol: a damaged number passes for another, a line that is lost is not missed, and the rate is
-measured.
+This is weaker than the line protocol: a damaged number can pass for another, a lost line is not noticed, and rate and
+times come from the arrival of the lines.
 """
 
 import re
@@ -18,36 +18,38 @@ from padforge.sense.rig.boards.line_board import describe_lines, find_line_port
 from padforge.sense.rig.devices import BoardSamples, RigFault, SerialStream
 from padforge.sense.settings import RigSettings
 
-LISTEN_S = 2.0  # in which the columns and the rate are found
-_START_S = 1.5  # opening their port resets many boards, which print of their start first
-_RATE_TOLERANCE = 0.05  # of a measured rate
-_MIN_LINES = 10
-_COUNTS_V = 50.0  # numbers beyond are counts of a converter
+LISTEN_S = 2.0  # time in which columns and rate are measured
+_START_S = 1.5  # lines of this time are ignored: opening the port resets many boards, which print a greeting
+_RATE_TOLERANCE = 0.05  # relative, of a measured rate
+_MIN_LINES = 10  # within `LISTEN_S`
+_COUNTS_V = 50.0  # higher readings are probably counts of a converter
 _LABEL = re.compile(rb"[A-Za-z_]\w*[:=]")
 _SEPARATOR = re.compile(rb"[,;\t ]+")
 
 
 def parse_numbers(line: bytes) -> list[float] | None:
-    """Return the numbers of a line, between commas, semicolons or blanks, with or without labels; None of others."""
+    """Return the numbers of a line, separated by commas, semicolons or blanks, with or without labels.
+
+    Returns None if there is no number, or anything else.
+    """
+    cells = _SEPARATOR.split(_LABEL.sub(b"", line).strip(b" ,;\t\r"))
     try:
-        return [
-            float(cell) for cell in _SEPARATOR.split(_LABEL.sub(b"", line).strip(b" ,;\t\r")) if cell != b""
-        ] or None
+        return [float(cell) for cell in cells if cell] or None
     except ValueError:
         return None
 
 
 class CsvBoard(SerialBoard):
-    """A board at a serial port that prints lines of numbers; implements `Board`. About `rate_hz` of them must come.
+    """A board at a serial port that prints lines of numbers; implements `Board`.
 
-    A first column that only ascends is the board's time, and no input.
+    A first column that always ascends is taken for the board's time, and is not an input.
 
     Args:
-        port: its name; nothing is opened before `connect`.
+        port: name of the port, which `connect` opens.
         baud: speed of the port.
-        rate_hz: lines a second.
-        inputs: column of each fibre, from 0, without that of the time; () for all.
-        count_v: volts of 1.
+        rate_hz: lines a second; `connect` fails if the measured rate differs by more than 5 %.
+        inputs: column of each fibre, from 0, not counting the time; () for all columns.
+        count_v: factor from printed numbers to volts.
     """
 
     def __init__(self, port: str, baud: int, rate_hz: float, inputs: Sequence[int] = (), count_v: float = 1.0) -> None:
@@ -124,7 +126,7 @@ class CsvBoard(SerialBoard):
         }
 
     def _decode(self, data: bytes) -> list[list[float]]:
-        """Return the numbers of the lines that `data` completes; [] of a line of something else."""
+        """Return the numbers of the lines that `data` completes; [] for a line of anything else."""
         *lines, self._tail = (self._tail + data).split(b"\n")
         return [parse_numbers(line) or [] for line in lines if line.strip()]
 
@@ -135,7 +137,7 @@ class CsvBoard(SerialBoard):
 
 
 def _measure_rate(arrivals_s: Array) -> float:
-    """Return lines a second by the arrivals (n,) of lines, of which several may come at once."""
+    """Return lines a second from the arrival times (n,) of lines, which may arrive in blocks."""
     last_of_block = np.flatnonzero(np.append(np.diff(arrivals_s) > 0, True))
     first, last = last_of_block[0], last_of_block[-1]
     return float((last - first) / (arrivals_s[last] - arrivals_s[first])) if last > first else 0.0

@@ -1,4 +1,4 @@
-"""An Arduino Due with padforge's firmware: a line board that is found by its USB identity."""
+"""An Arduino Due with padforge's firmware: a line board whose port is recognised by its USB identity."""
 
 from collections.abc import Sequence
 
@@ -7,7 +7,7 @@ from padforge.sense.rig.devices import RigFault, host_ports
 from padforge.sense.settings import RigSettings
 
 _VENDORS = (0x2341, 0x2A03)
-_PRODUCTS = (0x003E, 0x003D)  # the native port, and the programming port, which cannot carry the data
+_PRODUCTS = (0x003E, 0x003D)  # native port; programming port, which cannot carry the data
 
 
 class DueBoard(LineBoard):
@@ -20,7 +20,7 @@ class DueBoard(LineBoard):
 
 
 def find_due_port(rig: RigSettings) -> str:
-    """Return the board's port: that of `[rig]`, or the first Due if it is "auto"; RigFault("refused") if none is."""
+    """Return the port of `[rig]`, or that of the first Due if it is "auto"; RigFault("refused") if there is none."""
     if rig.port != "auto":
         return rig.port
     if not (ports := list_due_ports()):
@@ -29,6 +29,6 @@ def find_due_port(rig: RigSettings) -> str:
 
 
 def list_due_ports() -> list[str]:
-    """Return the ports of this host that look like a Due, native ones first; RigFault("refused") without pyserial."""
+    """Return the ports that look like a Due by their USB identity, native ones first; RigFault without pyserial."""
     ports = [port for port in host_ports() if port.vid in _VENDORS and port.pid in _PRODUCTS]
     return [port.device for port in sorted(ports, key=lambda port: (_PRODUCTS.index(port.pid), port.device))]

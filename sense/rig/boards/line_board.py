@@ -1,4 +1,4 @@
-"""A board that sends lines of text, so plain that any board can be programmed to; see docs/howto-boards.md."""
+"""A board that sends samples in a plain line protocol, which any board can implement; see docs/howto-boards.md."""
 
 from binascii import crc32
 from collections import Counter
@@ -15,26 +15,28 @@ from padforge.sense.rig.devices import BoardSamples, RigFault, SerialStream, hos
 from padforge.sense.settings import RigSettings
 
 HEADER_REQUEST = b"?"
-MIN_RATE_HZ, MAX_RATE_HZ = 10.0, 10_000.0
 RESONATOR_SKEW = 5e-3  # relative error of a ceramic resonator, which small boards have instead of a quartz
 
-_MAGIC, _VERSION = "# padforge-line", "1"
-_LIMITS = {
-    "rate_hz": (MIN_RATE_HZ, MAX_RATE_HZ),
+_MAGIC = "# padforge-line"
+_VERSION = "1"
+_LIMITS = {  # of header fields; integer limits mean an integer field
+    "rate_hz": (10.0, 10_000.0),
     "bits": (1, 24),
     "reference_v": (0.1, 100),
     "channels": (1, MAX_FIBRES),
 }
-_ANSWER_S = 3.0  # opening their port resets many boards, and some wait for a new program before they start
-_RESEND_S = 0.5
-_RATE_TOLERANCE = 1e-3
-_MAX_RECEIVED = 1000  # bytes by which is judged what comes
-_MAX_SHOWN = 60  # characters of a line
-_MIN_TEXT = 0.9  # share of printable characters in what is text at the right speed
-_BAD_S, _MIN_BAD_LINES = 0.5, 5  # so much of nothing but damaged lines is no noise; reported before it is silence
-_MAX_GAP_US = 2_000_000  # a board that is silent for a second is stale, so no valid time jumps so far
-_SLOT_GAIN = 0.1  # share by which the slots to come follow a line that is a little early or late
-_MAX_MISPLACED, _FORGIVEN = 8, 0.1  # misplaced lines that are a fault; a line in its slot makes up for a tenth of one
+_ANSWER_S = 3.0  # longest wait for a header: opening the port resets many boards, and their boot loaders wait first
+_RESEND_S = 0.5  # period of the requests for it
+_RATE_TOLERANCE = 1e-3  # relative, between header and `[rig]`
+_MAX_RECEIVED = 1000  # latest bytes from which the content of a wrong stream is described
+_MAX_SHOWN = 60  # characters of a line in a message
+_MIN_TEXT = 0.9  # fraction of printable characters in text at the right speed
+_BAD_S = 0.5  # time of damaged lines only that is a fault; below the time after which a board is stale
+_MIN_BAD_LINES = 5  # damaged lines in that time; fewer are noise
+_MAX_GAP_US = 2_000_000  # between valid lines: a board is stale after 1 s of silence
+_SLOT_GAIN = 0.1  # fraction of a line's deviation from its slot by which the next slots are shifted
+_MAX_MISPLACED = 8  # misplaced lines that are a fault
+_FORGIVEN = 0.1  # misplaced lines that each line in its slot compensates
 
 
 @dataclass(frozen=True)
@@ -42,31 +44,31 @@ class LineHeader:
     """The header of a board."""
 
     rate_hz: float  # samples a second
-    bits: int  # of a count
-    reference_v: float  # voltage of the highest count
+    bits: int  # resolution of the counts
+    reference_v: float  # voltage at the maximum count
     channels: int  # number of inputs
     checked: bool = True  # whether its lines have a check
-    extra: tuple[tuple[str, str], ...] = ()  # the board's own words and their values
+    extra: tuple[tuple[str, str], ...] = ()  # further fields and their values
 
     @property
     def full_scale(self) -> int:
-        """The highest count."""
+        """The maximum count."""
         return 2**self.bits - 1
 
 
 @dataclass(frozen=True)
 class LineSample:
-    """A sample: the board's time in us, wrapped or not, and (C,) counts."""
+    """A sample: the board's time in us, which may wrap at 32 bits, and (C,) counts."""
 
     time_us: int
     counts: tuple[int, ...]
 
 
 class LineDecoder:
-    """Decodes headers and samples from a stream of bytes that comes in any portions."""
+    """Decodes headers and samples from a stream of bytes that arrives in arbitrary chunks."""
 
     def __init__(self) -> None:
-        self.header: LineHeader | None = None  # the latest; before the first there are no samples
+        self.header: LineHeader | None = None  # the latest; samples before the first are ignored
         self._errors: Counter[str] = Counter()
         self._tail = b""
 
@@ -77,13 +79,12 @@ class LineDecoder:
 
     @property
     def error(self) -> str:
-        """What was wrong with most of them."""
-        return max(self._errors, key=lambda text: self._errors[text], default="")
+        """The most frequent error of these lines, or ""."""
+        return max(self._errors, key=self._errors.__getitem__, default="")
 
     def decode(self, data: bytes) -> list[LineHeader | LineSample]:
         """Return the headers and samples that `data` completes, in order."""
-        *lines, tail = (self._tail + data).split(b"\n")
-        self._tail = tail
+        *lines, self._tail = (self._tail + data).split(b"\n")
         return [item for line in lines if (item := self._decode_line(line.removesuffix(b"\r"))) is not None]
 
     def _decode_line(self, line: bytes) -> LineHeader | LineSample | None:
@@ -102,7 +103,7 @@ class LineDecoder:
 
 
 def _verify(line: bytes) -> bytes:
-    """Return the line without its check, if it has one; ValueError if that does not fit."""
+    """Return the line without its check (CRC-32), if it has one; ValueError if the check does not fit."""
     body, star, check = line.rpartition(b"*")
     if not star:
         return line
@@ -148,7 +149,7 @@ def _parse_sample(line: bytes, header: LineHeader) -> LineSample:
 
 
 def describe_lines(received: bytes) -> tuple[str, str]:
-    """Say what a port sends that is not the line protocol, and what to do about it."""
+    """Describe a stream that is not the line protocol; return problem and advice."""
     if not received:
         return "nothing comes from it", "check that it is the board's port, its cable, and that its program runs"
     text = sum(byte in b"\t\r\n" or 32 <= byte < 127 for byte in received)
@@ -161,7 +162,7 @@ def describe_lines(received: bytes) -> tuple[str, str]:
 
 
 def find_line_port(rig: RigSettings) -> str:
-    """Return the board's port: that of `[rig]`, or the only one on USB; RigFault("refused") if that is not one."""
+    """Return the port of `[rig]`, or the only one on USB if it is "auto"; RigFault("refused") unless there is one."""
     if rig.port != "auto":
         return rig.port
     ports = [port.device for port in host_ports() if port.vid is not None]
@@ -172,12 +173,13 @@ def find_line_port(rig: RigSettings) -> str:
 
 
 class LineBoard(SerialBoard):
-    """A board at a serial port that sends samples as lines; implements `Board`. Its header must state `rate_hz`.
+    """A board at a serial port that sends samples as lines; implements `Board`.
 
-    The host time of a sample is when it was measured by the board's clock, but for the least delay of the port.
+    Its header must state the `rate_hz` of `[rig]`. The host time of a sample is its time by the board's clock, plus the
+    minimum delay of the port.
     """
 
-    _assembler: "LineAssembler"  # once it is connected
+    _assembler: "LineAssembler"  # set by `connect`
 
     @classmethod
     def from_settings(cls, rig: RigSettings, inputs: Sequence[int]) -> "LineBoard":
@@ -185,9 +187,12 @@ class LineBoard(SerialBoard):
         return cls(find_line_port(rig), rig.baud, rig.board_rate_hz, inputs)
 
     def read(self) -> BoardSamples:
-        """Return all samples since the last call, volts; see `Board`. RigFault("data") if overfull or out of step."""
-        arrivals = self._drain()
-        return self._assembler.assemble(arrivals)
+        """Return all samples since the last call, volts; see `Board`.
+
+        Raises:
+            RigFault: "data" if the buffer overflowed, or the board was reset or sends impossible times.
+        """
+        return self._assembler.assemble(self._drain())
 
     def _start(self, stream: SerialStream) -> dict[str, Any]:
         self._decoder, self._settled = LineDecoder(), False
@@ -234,7 +239,7 @@ class LineBoard(SerialBoard):
         now_s, data = stream.receive()
         items = self._decoder.decode(data)
         headers = [item for item in items if isinstance(item, LineHeader)]
-        if headers and (self._settled or headers[-1] != header):  # before, it answers a request that was repeated
+        if headers and (self._settled or headers[-1] != header):  # an equal one at first answers a repeated request
             raise RigFault("data", f"{self._port}: the board was reset", "see why and connect again")
         if self._decoder.n_errors >= _MIN_BAD_LINES and now_s - self._last_sample_s > _BAD_S:
             raise RigFault("data", f"{self._port}: {self._decoder.error}", "line after line; look at the board")
@@ -246,10 +251,10 @@ class LineBoard(SerialBoard):
 
 
 class LineAssembler:
-    """Makes `BoardSamples` of lines: host times by a `SampleClock`, volts by fibre, missing samples by the times.
+    """Converts lines to `BoardSamples`: host times by a `SampleClock`, voltages of the fibres, numbers of lost samples.
 
-    Every sample has its slot, a period after the one before; the slots follow the board, whose rate need not be quite
-    that of its header. A line whose time fits into no slot is no sample.
+    Every sample has a time slot, one period after the previous one; empty slots are lost samples. The slots track the
+    board's actual rate, which may differ slightly from its header's. A line that fits no slot is dropped.
     """
 
     def __init__(self, header: LineHeader, inputs: Sequence[int]) -> None:
@@ -262,7 +267,7 @@ class LineAssembler:
         self._n_misplaced = 0.0
 
     def assemble(self, arrivals: Iterable[tuple[float, list[LineSample]]]) -> BoardSamples:
-        """Return the samples of lines with their arrival times; RigFault("data") if their times are impossible."""
+        """Return the samples of lines with their arrival times; RigFault("data") for repeated impossible times."""
         times_us, rows, gaps = [], [], []
         for arrival_s, block in arrivals:
             for sample in block:
@@ -279,11 +284,11 @@ class LineAssembler:
         )
 
     def _place(self, time_us: int) -> int | None:
-        """Return how many samples are missing before one of this time; None if the time is impossible."""
+        """Return the number of samples lost before one of this time; None if the time is impossible."""
         if self._last_us is None:
             self._last_us, self._slot_us = time_us, float(time_us)
             return 0
-        elapsed_us = (time_us - self._last_us + 2**31) % 2**32 - 2**31
+        elapsed_us = (time_us - self._last_us + 2**31) % 2**32 - 2**31  # the board's time wraps at 32 bits
         now_us = self._last_us + elapsed_us
         steps = round((now_us - self._slot_us) / self._period_us)
         if not 0 < elapsed_us <= _MAX_GAP_US or steps < 1:
