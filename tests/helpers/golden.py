@@ -161,11 +161,7 @@ def figure_text(figure: Figure) -> str:
             values = collection.get_array()
             shown = "" if values is None else f", {collection.get_cmap().name} {_numbers(collection.get_clim())}: "
             shown += "" if values is None else _summary(np.asarray(values, dtype=float).reshape(-1, 1))
-            faces = (
-                sorted({to_hex(colour) for colour in np.reshape(collection.get_facecolor(), (-1, 4)).tolist()})
-                if values is None
-                else []
-            )
+            faces = _colours(collection.get_facecolor()) if values is None else []
             kind = type(collection).__name__
             lines.append(f"  {kind} {collection.get_label()!r} {' '.join(faces)}: {_summary(data)}{shown}")
         for image in axes.images:
@@ -180,6 +176,10 @@ def figure_text(figure: Figure) -> str:
         if legend := axes.get_legend():
             lines.append(f"  legend {[text.get_text() for text in legend.get_texts()]}")
     return "\n".join(lines)
+
+
+def _colours(colours: Any) -> list[str]:
+    return sorted({to_hex(colour) for colour in colours})
 
 
 def _legend_text(legend: Any) -> list[str]:
