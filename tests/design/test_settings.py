@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from padforge import InputError, Spec, design
-from padforge.common.settings import commented_toml
+from padforge.common.settings import commented_toml, settings_schema
 from padforge.design import Contact, Morphology, PadSettings, RulesSettings, SearchSettings, signals
 from padforge.design.published.objective import information
 from padforge.design.settings import (
@@ -22,6 +22,7 @@ from padforge.design.settings import (
     sensed_rectangle,
 )
 from tests.helpers.golden import Golden
+from tests.helpers.json_text import json_text
 from tests.helpers.limits import require_ends
 
 MODELS = {model.section(): model for model in (PadSettings, Contact, SearchSettings, RulesSettings)}
@@ -35,6 +36,10 @@ def test_commented_toml_round_trip(stated, request, golden: Golden) -> None:
         assert spec.section(model) == stated.get(name, model())
     differing = [line for line in text.splitlines() if line not in commented_toml(MODELS).splitlines()]
     golden(f"design/pad_{request.node.callspec.id}.txt", "\n".join(differing) if stated else text)
+
+
+def test_schema_states_defaults_and_limits(golden: Golden) -> None:
+    golden("design/schema.json", json_text(settings_schema(MODELS)))
 
 
 def test_overrides_win_over_the_file() -> None:
@@ -245,7 +250,7 @@ def test_settings_accept_numpy_numbers(model, arrays, plain):
     assert model(**arrays).model_dump_json() == model(**plain).model_dump_json()
 
 
-def test_default_contact_is_measured_or_published(little_scored):
+def test_default_contact_is_measured_or_published():
     pad, presses = Morphology.random(1, 3, seed=0), [[1.2, 0.7], [0.5, 0.8]]
     np.testing.assert_array_equal(signals(pad, presses), signals(pad, presses, Contact()))
     np.testing.assert_array_equal(design.signals_sparse(pad, presses).toarray(), signals(pad, presses))
