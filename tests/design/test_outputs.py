@@ -119,9 +119,8 @@ def test_design(run, golden: Golden) -> None:
 def test_summaries_of_searches(golden: Golden) -> None:
     """One that was stopped and breaks many rules, one that finds nothing, and one without rules."""
     broken = [Violation("max_length_mm", (fibre,), 600.0, 500.0) for fibre in range(1, 13)]
-    errors, straight = (
-        {f"expected_error_mm_{n}": mm for n, mm in enumerate(x)} for x in ((0.5, 1, 2), (0.52, 1.06, 3))
-    )
+    names = [f"expected_error_mm_{n}" for n in (0, 1, 2)]
+    errors, straight = (dict(zip(names, values, strict=True)) for values in ((0.5, 1.0, 2.0), (0.52, 1.06, 3.0)))
     stopped = SearchResult(
         Morphology.straight(6), errors, broken, "start 1", straight, seconds=61.25, stopped="out of time"
     )
