@@ -41,8 +41,8 @@ def bent_pad() -> Morphology:
 def twin(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Of a pad of grid 2 and pitch 10 mm, pressed somewhat beyond its outer fibres."""
     path = tmp_path_factory.mktemp("twin") / "twin.json"
-    gains = enumerate(((2, -0.1), (0, -0.1), (1, 0.4)))
-    channels = tuple(TwinChannel(channel, fibre, gain, abs(gain) / 5, 0.9) for channel, (fibre, gain) in gains)
+    read = enumerate(((2, -0.1, 0.02), (0, -0.1, 0.02), (1, 0.4, 0.3)))  # the last is louder, and noisier still
+    channels = tuple(TwinChannel(channel, fibre, gain, noise, 0.9) for channel, (fibre, gain, noise) in read)
     reach = np.array([0.0, 2, 5, 8, 11, 15]), np.array([1, 0.95, 0.6, 0.25, 0.05, 0])
     line = np.array([[-15.0, -5], [15, -5]])
     known = PlanTransform(), *reach, (line, line, line[:, ::-1], None), 0.03, (18.0, 31.5), 500

@@ -13,6 +13,7 @@ import pytest
 import shapely
 
 from padforge import InputError, Spec
+from padforge.common.server import page_text as served_page
 from padforge.design import Contact, Morphology, PadSettings, RulesSettings, SearchOptions, flatten, search
 from padforge.design import cli as commands
 from padforge.design import compare as comparison
@@ -25,7 +26,7 @@ from padforge.design.objectives.rules import Violation
 from padforge.design.optimize.search import SearchResult
 from padforge.design.settings import PUBLISHED_CONTACT, SearchSettings
 from tests.helpers.door import call
-from tests.helpers.golden import Golden
+from tests.helpers.golden import Golden, page_text
 from tests.helpers.json_text import json_text
 from tests.helpers.less import compare_little
 
@@ -118,7 +119,8 @@ def test_design(run, golden: Golden) -> None:
 def test_summaries_of_searches(golden: Golden) -> None:
     """One that was stopped and breaks many rules, one that finds nothing, and one without rules."""
     broken = [Violation("max_length_mm", (fibre,), 600.0, 500.0) for fibre in range(1, 13)]
-    errors, straight = ({f"expected_error_mm_{n}": factor + n for n in (0, 1, 2)} for factor in (0.5, 0.52))
+    names = [f"expected_error_mm_{n}" for n in (0, 1, 2)]
+    errors, straight = (dict(zip(names, values, strict=True)) for values in ((0.5, 1.0, 2.0), (0.52, 1.06, 3.0)))
     stopped = SearchResult(
         Morphology.straight(6), errors, broken, "start 1", straight, seconds=61.25, stopped="out of time"
     )
@@ -200,7 +202,10 @@ def test_edit(run, golden: Golden, monkeypatch: pytest.MonkeyPatch) -> None:
     golden("design/edit_view.json", json_text(view | {"maps": summary}), forget=[r'(?<="session": ")\w+'], rtol=1e-4)
     editor.save(b"{}")
     editor.end()
+    golden("design/edit_morphology.json", json_text(document_of("pad-edited.json")), forget=[VERSIONS])
     names = ("number", "message", "ended", "unsaved", "can_undo", "can_redo", "selected")
+    words = page_text(served_page("padforge.design.editor", "editor.html", "editor.css", "drawing.js", "editor.js"))
+    golden("design/edit_page.txt", words)
     golden("design/edit_messages.json", json_text([{name: view[name] for name in names} for view in views[1:]]))
 
 

@@ -31,7 +31,7 @@ ERRORS_MM = {
 def design_document(enforce: bool = True) -> dict[str, Any]:
     """The design.json of a pad of 2 + 3 fibres that breaks two rules, unless there are none."""
     sections = (
-        PadSettings(horizontals=2, verticals=3, pitch_mm=(8.0, 15.0)),
+        PadSettings(horizontals=2, verticals=3, pitch_mm=(8.25, 15.5)),
         SearchSettings(scatter=0.184, noise=0.0123),
         RulesSettings(enforce=enforce, max_crossings=4),
         PRESS,

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from padforge import InputError, Spec, design
-from padforge.common.settings import commented_toml
+from padforge.common.settings import commented_toml, settings_schema
 from padforge.design import Contact, Morphology, PadSettings, RulesSettings, SearchSettings, signals
 from padforge.design.published.objective import information
 from padforge.design.settings import (
@@ -22,6 +22,7 @@ from padforge.design.settings import (
     sensed_rectangle,
 )
 from tests.helpers.golden import Golden
+from tests.helpers.json_text import json_text
 from tests.helpers.limits import require_ends
 
 MODELS = {model.section(): model for model in (PadSettings, Contact, SearchSettings, RulesSettings)}
@@ -37,73 +38,56 @@ def test_commented_toml_round_trip(stated, request, golden: Golden) -> None:
     golden(f"design/pad_{request.node.callspec.id}.txt", "\n".join(differing) if stated else text)
 
 
+def test_schema_states_defaults_and_limits(golden: Golden) -> None:
+    golden("design/schema.json", json_text(settings_schema(MODELS)))
+
+
 def test_overrides_win_over_the_file() -> None:
     found = Spec({"search": {"knots": 7, "seed": 3}}).section(SearchSettings, knots=2, seed=None)
     assert (found.knots, found.seed) == (2, 3)
 
 
-REFUSED = [
-    (PadSettings, {"grid": 0}),
-    (PadSettings, {"gird": 4}),
-    (PadSettings, {"horizontals": 0, "verticals": 0}),
-    (PadSettings, {"pitch_mm": float("nan")}),
-    (PadSettings, {"pitch_mm": [8, 0]}),
-    (PadSettings, {"horizontals": 2, "pitch_mm": [8, 15], "sensed_mm": [40, 46]}),
-    (PadSettings, {"grid": 2, "pitch_mm": 10, "sensed_mm": [31, 5]}),
-    (PadSettings, {"keep_out_mm": "hole"}),
-    (PadSettings, {"keep_out_mm": [[0, 0, 5, 3]]}),
-    (PadSettings, {"keep_out_mm": [[0, 0, 0]]}),
-    (PadSettings, {"keep_out_mm": [[20, 0, 3], [27, 0, 2, 4]]}),
-    (PadSettings, {"keep_out_mm": [[0, 0]]}),
-    (PadSettings, {"size_mm": [120, 30], "pitch_mm": 8}),
-    (PadSettings, {"size_mm": [120, 0.2]}),
-    (PadSettings, {"size_mm": [120]}),
-    (PadSettings, {"size_mm": [120, 0]}),
-    (PadSettings, {"size_mm": "large"}),
-    (PadSettings, {"bent_radius_mm": "round"}),
-    (Contact, {"weight": "cubic"}),
-    (Contact, {"sensitivity_profile": [[0, 1], [1, 0]]}),
-    (Contact, {"sensitivity_profile": [[0, 1], [1, 0.5], [1, 0]]}),
-    (Contact, {"sensitivity_profile": [[0, 1], [1, 0.5], [2, 0.1]]}),
-    (Contact, {"model": "half-space"}),
-    (Contact, {"tool": "cone"}),
-    (Contact, {"depth_mm": 6}),
-    (Contact, {"thickness_mm": 4}),
-    (Contact, {"fibre_depths_mm": [1, 6.5]}),
-    (Contact, {"fibre_depths_mm": [1, 0]}),
-    (Contact, {"squeeze": 0, "stretch": 0}),
-    (Contact, {"length": "manhattan"}),
-    (Contact, {"model": "layer", "radius": 0.9}),
-    (Contact, {"radius": 0.9, "depth_mm": 2}),
-    (Contact, {"model": "profile", "scale": 2}),
-    (Contact, {"sensitivity_profile": [], "tool": "ball"}),
-    # profiles whose splines leave their points
-    (Contact, {"sensitivity_profile": [[0, 10], [9, 10], [10, 0]]}),
-    (Contact, {"sensitivity_profile": [[0, -1], [0.2, 1], [1, 0]]}),
-    # whose messages name the whole path of a key
-    (SearchSettings, {"contacts": [{"radius": 0.9}, {"radius": -1}]}),
-    (SearchSettings, {"contacts": [{"radius": 0.9, "height": 1}]}),
-    (SearchSettings, {"contacts": [{"model": "layer", "radius": 0.9}]}),
-    (SearchSettings, {"contacts": [{"fibre_depths_mm": [1, 0]}]}),
-    (SearchSettings, {"contacts": 3}),
-    (SearchSettings, {"contacts": "likely"}),
-    (SearchSettings, {"weights": [1, "x", 1]}),
-    (SearchSettings, {"max_failures": [0, 0]}),
-    (RulesSettings, {"max_crossings": "none"}),
-    (RulesSettings, {"max_common_track_mm": 0.8}),
-]
+REFUSED = {
+    PadSettings: [
+        *({"grid": 0}, {"gird": 4}, {"horizontals": 0, "verticals": 0}, {"bent_radius_mm": "round"}),
+        *({"pitch_mm": float("nan")}, {"pitch_mm": [8, 0]}),
+        {"horizontals": 2, "pitch_mm": [8, 15], "sensed_mm": [40, 46]},
+        {"grid": 2, "pitch_mm": 10, "sensed_mm": [31, 5]},
+        *(
+            {"keep_out_mm": shape}
+            for shape in ("hole", [[0, 0, 5, 3]], [[0, 0, 0]], [[20, 0, 3], [27, 0, 2, 4]], [[0, 0]])
+        ),
+        {"size_mm": [120, 30], "pitch_mm": 8},
+        *({"size_mm": size} for size in ([120, 0.2], [120], [120, 0], "large")),
+    ],
+    Contact: [
+        *({"weight": "cubic"}, {"model": "half-space"}, {"tool": "cone"}, {"depth_mm": 6}, {"thickness_mm": 4}),
+        *({"fibre_depths_mm": [1, 6.5]}, {"fibre_depths_mm": [1, 0]}, {"squeeze": 0, "stretch": 0}),
+        *({"length": "manhattan"}, {"model": "layer", "radius": 0.9}, {"radius": 0.9, "depth_mm": 2}),
+        *({"model": "profile", "scale": 2}, {"sensitivity_profile": [], "tool": "ball"}),
+        *({"sensitivity_profile": [[0, 1], *rest]} for rest in ([[1, 0]], [[1, 0.5], [1, 0]], [[1, 0.5], [2, 0.1]])),
+        # whose splines leave their points
+        *({"sensitivity_profile": points} for points in ([[0, 10], [9, 10], [10, 0]], [[0, -1], [0.2, 1], [1, 0]])),
+    ],
+    SearchSettings: [  # whose messages name the whole path of a key
+        *({"contacts": [{"radius": 0.9}, {"radius": -1}]}, {"contacts": [{"radius": 0.9, "height": 1}]}),
+        *({"contacts": [{"model": "layer", "radius": 0.9}]}, {"contacts": [{"fibre_depths_mm": [1, 0]}]}),
+        *({"contacts": 3}, {"contacts": "likely"}, {"weights": [1, "x", 1]}, {"max_failures": [0, 0]}),
+    ],
+    RulesSettings: [{"max_crossings": "none"}, {"max_common_track_mm": 0.8}],
+}
 
 
 def test_refusals_name_key_value_and_limits(golden: Golden) -> None:
     """In one line, of a file and of a model alike."""
     lines = []
-    for model, table in REFUSED:
+    for model, table in ((model, table) for model, tables in REFUSED.items() for table in tables):
         with pytest.raises(InputError, match=r"^pad\.toml: [^\n]*$") as refused:
             Spec({model.section(): table}, "pad.toml", sections=MODELS).section(model)
         lines.append(str(refused.value))
     golden("design/settings_refusals.txt", "\n".join(lines))
     with pytest.raises(InputError, match=r"^\[search\] contacts\[1\]\.radius: got -1, .*greater"):
-        SearchSettings(**REFUSED[36][1])
+        SearchSettings(**REFUSED[SearchSettings][0])
 
 
 def test_wrong_override_is_not_blamed_on_the_file():
@@ -245,7 +229,7 @@ def test_settings_accept_numpy_numbers(model, arrays, plain):
     assert model(**arrays).model_dump_json() == model(**plain).model_dump_json()
 
 
-def test_default_contact_is_measured_or_published(little_scored):
+def test_default_contact_is_measured_or_published():
     pad, presses = Morphology.random(1, 3, seed=0), [[1.2, 0.7], [0.5, 0.8]]
     np.testing.assert_array_equal(signals(pad, presses), signals(pad, presses, Contact()))
     np.testing.assert_array_equal(design.signals_sparse(pad, presses).toarray(), signals(pad, presses))
