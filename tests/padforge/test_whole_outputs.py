@@ -25,7 +25,7 @@ def command_names(command: click.Command) -> Iterator[tuple[str, ...]]:
 
 @pytest.mark.parametrize("word", cli.commands)
 def test_helps(word: str, tmp_path: Path, golden, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Click keeps the names of a group's help option as they are when it is first asked, in a test by itself as well."""
+    """Click keeps the names of a help option as they are when it is first asked for, so they are left out."""
     monkeypatch.setenv("COLUMNS", "100")
     texts = [called(word, *words, "--help", cwd=tmp_path).out for words in command_names(cli.commands[word])]
     golden(f"padforge/help/{word}.txt", "\n\n".join(texts), forget=[r"(?:-h, )?--help +(?=Show)"])
