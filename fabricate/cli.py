@@ -153,7 +153,7 @@ def check(ctx: click.Context, mesh_or_morphology: Path, spec: Path | None, pictu
 
 def _line(finding: dict[str, Any]) -> str:
     """Format a finding with the first three of its positions."""
-    positions = [f"({x:.1f}, {y:.1f})" for x, y in finding["positions_mm"]]
+    positions = [f"({x:z.1f}, {y:z.1f})" for x, y in finding["positions_mm"]]
     others = len(positions) - 3
     more = f" and {others} more place{'s' * (others > 1)}" if others > 0 else ""
     where = f" at {' '.join(positions[:3])}{more}" if positions else ""

@@ -314,7 +314,7 @@ class Plan:
         """
         if self.clashes and self.settings.mould.levels == "two":
             listed = ", ".join(
-                f"{c.first + 1} x {c.second + 1} at ({x:.1f}, {y:.1f}) mm"
+                f"{c.first + 1} x {c.second + 1} at ({x:z.1f}, {y:z.1f}) mm"
                 for c, (x, y) in zip(self.clashes, self.clash_positions_mm.tolist(), strict=True)
             )
             raise InputError(

@@ -190,7 +190,7 @@ def _check_common_tracks(plan: Plan) -> list[Finding]:
     positions = [track.position_mm for track in tracks if track.length_mm > limit]
     message = (
         f"tracks lie over deeper ones for {worst.length_mm:.2f} mm at most, fibre {worst.shallow + 1} over"
-        f" {worst.deep + 1} at ({worst.position_mm[0]:.1f}, {worst.position_mm[1]:.1f}) mm"
+        f" {worst.deep + 1} at ({worst.position_mm[0]:z.1f}, {worst.position_mm[1]:z.1f}) mm"
     )
     return [check_result("common_tracks", "warn" if positions else "pass", worst.length_mm, limit, message, positions)]
 
@@ -238,6 +238,8 @@ def _check_tray_wall(plan: Plan) -> Finding:
     gap = min(part.distance(wall) - half for part in near or middles)
     positions = [ops.nearest_points(part, wall)[0].coords[0] for part in near]
     message = f"ridges between their ends come within {gap:.2f} mm of the tray's wall"
+    if gap <= 0:
+        message = f"ridges run into the tray's wall between their ends, by {-gap:.2f} mm"
     return check_result("tray_wall", grade(gap, limit), gap, limit, message, positions)
 
 

@@ -475,7 +475,7 @@ def _crossing_lines(document: Document) -> Iterator[str]:
         yield ""
         rows = []
         for track in tracks[:_MAX_ROWS]:
-            lengths_mm = (f"{mm:.1f} mm" for mm in (*track["position_mm"], track["length_mm"]))
+            lengths_mm = (f"{mm:z.1f} mm" for mm in (*track["position_mm"], track["length_mm"]))
             rows.append((f"{track['shallow']} over {track['deep']}", *lengths_mm))
         yield from _table_lines(("tracks", "x", "y", "in common"), rows)
         if len(tracks) > _MAX_ROWS:
@@ -485,7 +485,7 @@ def _crossing_lines(document: Document) -> Iterator[str]:
     if is_short:
         number = {fibre["fibre"]: fibre["number"] for fibre in document["fibres"]}
         rows = [
-            (f"{number[one]} and {number[two]}", f"{x:.1f} mm", f"{y:.1f} mm", _depths(a, b), f"{gap:g} mm")
+            (f"{number[one]} and {number[two]}", f"{x:z.1f} mm", f"{y:z.1f} mm", _depths(a, b), f"{gap:g} mm")
             for one, two, x, y, a, b, gap in crossings["table"]
         ]
         yield from _table_lines(("fibres", "x", "y", "depths", "between them"), rows)

@@ -222,7 +222,7 @@ def _findings_table(findings: Sequence[Mapping[str, Any]]) -> str:
     """Return a table of findings with up to `_MAX_POSITIONS` of their positions."""
     rows = []
     for finding in findings:
-        positions = [f"({x:.1f}, {y:.1f})" for x, y in finding["positions_mm"]]
+        positions = [f"({x:z.1f}, {y:z.1f})" for x, y in finding["positions_mm"]]
         more = f" and {len(positions) - _MAX_POSITIONS} more" if len(positions) > _MAX_POSITIONS else ""
         name, where = finding["name"].replace("_", " "), " ".join(positions[:_MAX_POSITIONS]) + more
         rows.append([name, finding["status"], finding["message"], where])

@@ -3,6 +3,7 @@
 import math
 import re
 import tomllib
+from dataclasses import asdict
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from padforge.common.validation import InputError
 from padforge.design.morphology import Morphology
 from padforge.fabricate.materials import (
     FIBRES,
+    PUBLISHED,
     SILICONES,
     Fibre,
     FibreSettings,
@@ -22,6 +24,7 @@ from padforge.fabricate.materials import (
 from padforge.fabricate.plan import Plan
 from padforge.fabricate.settings import DEFAULTS, DispenserSettings, FabricationSettings, MouldSettings, PrinterSettings
 from tests.fabricate.planted import with_settings
+from tests.helpers.golden import json_text
 
 
 def test_defaults_survive_a_settings_file(tmp_path):
@@ -170,3 +173,13 @@ def test_divider_ohm_is_the_most_sensitive_of_the_series(fibre_ohm):
     found = divider_ohm(fibre_ohm)
     assert found == pytest.approx(max(sold, key=swing))
     assert swing(found) > 0.99 / 4
+
+
+def test_materials(golden):
+    """Moduli are those of the bulletins, in psi, to a kilopascal."""
+    psi = [8, 8, 10, 12, 22, 22, 22, 49, 86]
+    grades = [silicone for name, silicone in SILICONES.items() if name != PUBLISHED]
+    for grade, modulus in zip(grades, psi, strict=True):
+        assert grade.modulus_kpa == pytest.approx(6.894757 * modulus, abs=0.6)
+    tables = {"silicones": SILICONES, "fibres": FIBRES}
+    golden("fabricate/materials.json", json_text({n: {k: asdict(v) for k, v in t.items()} for n, t in tables.items()}))

@@ -127,6 +127,8 @@ def page_text(page: str) -> str:
             lines.append(" | ".join(" ".join(cell.text_content().split()) for cell in element))
         elif tag in ("p", "li", "pre", "summary", "figcaption", "button", "label", "title") and words:
             lines.append(f"{tag}: {words}")
+        elif tag == "div" and element.get("class") == "tile":
+            lines.append(f"tile: {words}")
         elif tag == "img":
             lines.append(f"img: {element.get('alt')}")
         elif tag == "svg":

@@ -1,60 +1,17 @@
 """`padforge design compare`: which pad to make."""
 
-import json
 import re
 from types import SimpleNamespace
 
 import pytest
 
 from padforge import Spec
-from padforge.common.plotting import save_figure
-from padforge.design import Contact, Morphology
+from padforge.design import Morphology
 from padforge.design import compare as comparison
-from padforge.design.contact import contact_press, fibre_strains, half_width_mm
 from padforge.design.settings import read_contact
 from padforge.fabricate import FabricationSettings
 from tests.helpers.door import called
-from tests.helpers.less import blank_pictures, compare_little, small_pictures
-
-
-def test_compare_evaluates_finished_pads(tmp_path, monkeypatch):
-    compare_little(monkeypatch)
-    small_pictures(monkeypatch)
-    drawn = []
-    monkeypatch.setattr(
-        comparison, "save_figure", lambda figure, path: drawn.append(figure) or save_figure(figure, path)
-    )
-    Morphology.straight((2, 3), (8.0, 15.0)).save(tmp_path / "plain.json")
-    Morphology.random(2, 3, seed=1).save(tmp_path / "bent.json")
-    result = called("design", "compare", "plain.json", "bent.json", "--out", "both", "--json", cwd=tmp_path)
-    assert result.code == 0, result.err
-    plain, bent = json.loads(result.out)["rows"]
-    assert (plain["name"], plain["fibres"], plain["crossings"]) == ("plain", [2, 3], 6)
-    assert plain["length_mm"] == pytest.approx(2 * 4 * 8 + 3 * 3 * 15)
-    assert plain["errors_mm"] == plain["straight_mm"] != bent["errors_mm"]
-    assert len(plain["errors_mm"]) == 4, "0 to 3 lost"
-    assert all(other["errors_mm"] == other["straight_mm"] for other in plain["others"].values())
-    assert [name.split(",")[0] for name in bent["others"]] == ["isotropic", "isotropic"]
-    assert plain["mould_ml"] > 0
-    assert plain["force_n"] == pytest.approx(contact_press(Contact()).force_n(), rel=1e-9)  # Ecoflex 00-20
-    assert plain["strain_percent"] == pytest.approx(100 * max(s for _, s in fibre_strains(Contact())))
-    assert (plain["straight_length_mm"], plain["straight_crossings"]) == (pytest.approx(plain["length_mm"]), 6)
-    assert plain["half_width_mm"] == pytest.approx(half_width_mm(Contact()))
-    assert plain["contact"]["model"] == "layer"
-    assert (tmp_path / "both" / "plain" / "mould.stl").exists()
-    assert (tmp_path / "both" / "comparison.png").stat().st_size > 3000
-    by_failures, by_length = drawn[0].axes
-    lines = [line.get_xydata().tolist() for line in by_failures.lines]
-    curves = [row[key] for row in (plain, bent) for key in ("errors_mm", "straight_mm")]
-    assert lines == [[[n, error] for n, error in enumerate(errors)] for errors in curves]
-    assert [line.get_linestyle() for line in by_failures.lines] == ["-", ":"] * 2
-    assert [text.get_text() for text in by_failures.get_legend().get_texts()] == ["plain", "bent"]
-    for row, (span, dot, square) in zip((plain, bent), zip(*[iter(by_length.lines)] * 3, strict=True), strict=True):
-        length_m, first, last = row["length_mm"] / 1000, row["errors_mm"][0], row["errors_mm"][-1]
-        assert span.get_xydata().tolist() == [[length_m, first], [length_m, last]]
-        assert (dot.get_marker(), dot.get_xydata().tolist()) == ("o", [[length_m, first]])
-        assert (square.get_marker(), square.get_xydata().tolist()) == ("s", [[length_m, last]])
-    assert [axes.get_xlabel() for axes in drawn[0].axes] == ["failed fibres", "length of fibre (m)"]
+from tests.helpers.less import blank_pictures, compare_little
 
 
 def test_comparison_is_a_table_in_metres_with_straight_fibres_below_a_pad_that_differs():

@@ -52,13 +52,6 @@ def test_bench_of_a_wheel_is_refused_in_one_line() -> None:
     assert "checkout" in result.stderr
 
 
-def test_command_without_arguments_shows_help(tmp_path: Path) -> None:
-    result = called(cwd=tmp_path)
-    assert result.code == 2
-    assert "Commands:\n" in result.err
-    assert "Usage: padforge [OPTIONS]" in result.err
-
-
 def test_init_writes_settings_that_every_command_reads(tmp_path: Path) -> None:
     assert called("init", cwd=tmp_path).code == 0
     text = (tmp_path / "pad.toml").read_text()

@@ -148,15 +148,3 @@ def test_profile_option_prints_to_stderr(tmp_path):
     skipped = told["imports"].split(" (not ")[0]
     assert all(name in skipped for name in ("build123d", "manifold3d", "pymoo", "h5py", "torch", "trimesh"))
     assert "numba" not in skipped
-
-
-def test_profile_lists_what_was_skipped():
-    with profiling.profiled() as profile:
-        profiling.add_count("few", 1, 10)
-        profiling.add_count("few", 2, 10)
-        profiling.add_count("many", 250, 1000)
-    lines = profile.lines()
-    assert lines[lines.index("what was skipped") + 1 :][:2] == [
-        f"  {'few':<24} 17 of 20",
-        f"  {'many':<24} 750 of 1000 (75.0%)",
-    ]

@@ -1,0 +1,129 @@
+"""The words, tables and pictures of a whole report, and of sections on documents of distinct numbers."""
+
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from padforge.common.files import provenance
+from padforge.common.page import PageSection
+from padforge.design.report import contact_lines, contact_sections, design_sections, draw_press, press_sections
+from padforge.design.settings import Contact, RulesSettings
+from padforge.report import write_report
+from padforge.sense.report.sections import calibration_sections, fibre_loss_sections, recording_sections
+from tests.helpers.golden import page_text
+from tests.helpers.less import blank_pictures
+from tests.padforge.report.conftest import contacts_document, design_document, errors, written
+
+VERSIONS = r"python \d[^|]*(?= \|)"
+MAX_PAGE_BYTES = 8_000_000
+
+
+def section_text(sections: list[PageSection]) -> str:
+    """The sections as a reader meets them, each with its key figures."""
+    texts = []
+    for section in sections:
+        tiles = [f"tile: {value} {name}" for value, name in section.figures]
+        texts += [f"## {section.title}", *tiles, page_text(f"<div>{''.join(section.body)}</div>")]
+    return "\n".join(texts)
+
+
+def test_page_of_all_stages(page: Path, golden) -> None:
+    text = page.read_text(encoding="utf-8")
+    golden("padforge/report.txt", page_text(text), forget=[VERSIONS])
+    for anchor in re.findall(r'<a href="#(.*?)"', text):
+        assert text.count(f'id="{anchor}"') == 1
+    assert text.count("data:image/") == 7  # plan, press, mould, tracks, orientation, crossing, and the study's figure
+    assert len(text) < MAX_PAGE_BYTES
+
+
+def test_page_with_a_study_of_lost_fibres_and_presses_of_known_force(pad: Path, golden) -> None:
+    """The errors of the study take the place of those of the calibration."""
+    start = json.loads((pad / "recording" / "start.json").read_text())
+    start["source"]["rig"]["depths_mm"] = [0.5, 5.0]
+    written(pad / "recording" / "start.json", start)
+    lines = [
+        {"event": "started", "press": 0, "reading": 1, "x_mm": 0, "y_mm": 0, "depth_mm": 0.5},
+        {"event": "done", "press": 0, "reading": 2, "at_mm": [0, 0, 0.45], "force_n": 1.25},
+        {"event": "started", "press": 1, "reading": 3, "x_mm": 0, "y_mm": 0, "depth_mm": 5.0},
+        {"event": "done", "press": 1, "reading": 4, "at_mm": [0, 0, 4.95]},
+    ]
+    (pad / "recording" / "journal.ndjson").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    network, retrained = {(): 1.0, (0,): 7.5, (1,): 3.0}, {(): 1.0, (0,): 2.0, (1,): 8.5}
+    methods = {"one network": errors(network), "retrained": errors(retrained)}
+    document = {"format": "padforge-fibre-loss/1", "methods": methods, "test_presses": 9, "provenance": provenance("x")}
+    written(pad / "fibre_loss.json", document)
+    text = page_text(write_report(pad).read_text(encoding="utf-8"))
+    golden("padforge/report_of_losses.txt", text[text.index("## Recording") : text.index("## Contact model")])
+
+
+def make_design_document() -> dict[str, Any]:
+    """Of 2 horizontals, 15 mm apart, and 3 verticals, 8 mm apart, that break a rule of a fibre and one of the pad."""
+    document = design_document()
+    settings = document["provenance"]["settings"]
+    settings["rules"] = RulesSettings().model_dump(mode="json")
+    settings["pad"] = {"horizontals": 2, "verticals": 3, "pitch_mm": [8.0, 15.0]}
+    settings["search"] |= {"scatter": 0.184, "noise": 0.0123}
+    violation = {"rule": "min_gap_mm", "fibres": [1, 3], "place_mm": [1.04, -2.0], "measured": 0.5, "limit": 2.0}
+    pad_rule = {"rule": "max_crossings", "fibres": [], "place_mm": None, "measured": 9, "limit": 4}
+    return document | {
+        "terms": {"expected_error_mm_1": 2.346, "expected_error_mm_0": 1.0, "sharpness": 0.25},
+        "straight": {"expected_error_mm_1": 4.0, "expected_error_mm_0": 12.34},
+        "descriptions": {"sharpness": "how sharp"},
+        "violations": [violation, pad_rule],
+    }
+
+
+def make_calibration_document() -> dict[str, Any]:
+    names = ("mean_mm", "std_mm", "max_mm", "median_mm", "p95_mm")
+    rows = [
+        {"n_failed": n, "subsets": 1 + 3 * n}
+        | {name: 1.0 + n + 0.1 * k for k, name in enumerate(names)}
+        | {"within_r50": 0.51 + 0.01 * n, "within_r90": 0.91 + 0.01 * n}
+        | {"depth_mean_mm": 0.21 + n, "depth_p95_mm": 0.43 + n, "depth_within_r90": 0.87 + 0.01 * n}
+        | {"force_mean_n": 3.1 + n, "force_p95_n": 6.2 + n, "force_within_r90": 0.77 + 0.01 * n}
+        for n in (0, 1)
+    ]
+    moments = [
+        {"since": since, "time_s": time_s, "n_failed": n, "mean_mm": time_s + n, "within_r90": 0.9 + 0.01 * n}
+        for since, time_s in (("touch", 0.25), ("lift", 0.5))
+        for n in (0, 1)
+    ]
+    return {"errors": rows, "by_moment": moments, "by_subset": [], "idle_share": [0.1, 0.256], "test_presses": 12}
+
+
+def test_sections_on_documents(golden, monkeypatch: pytest.MonkeyPatch) -> None:
+    blank_pictures(monkeypatch)
+    design = make_design_document()
+    sections = design_sections(Path("none"), design)
+    design["provenance"]["settings"]["rules"]["enforce"] = False
+    sections += design_sections(Path("none"), design | {"violations": []})
+    contact = Contact(depth_mm=2.0, thickness_mm=8.0, tool_radius_mm=10.0, fibre_depths_mm=(1.5, 0.5))
+    design["provenance"]["settings"]["contact"] = contact.model_dump(mode="json")
+    sections += [*press_sections(design, 0.1), *press_sections(design, None, ("Dragon Skin 30", 593.0))]
+    for source in (
+        {"kind": "simulated", "rig": {"rate_hz": 13.3, "depth_mm": 5.0}},
+        {"kind": "rig", "rig": {"rate_hz": 50, "depths_mm": [4.0, 1.5]}},
+        {"kind": "published", "file": "5.mat"},
+        {"kind": "simulated", "twin": {}},
+    ):
+        sections += recording_sections(Path("none"), {"source": source, "fibres": 7})
+    document = make_calibration_document()
+    rig = {"provenance": {"recording_kind": "rig"}, "split": "chronological"}
+    simulated = {"provenance": {"recording_kind": "simulated"}, "split": "random", "by_moment": []}
+    for more in (rig, simulated | {"errors": document["errors"][:1]}):
+        sections += calibration_sections(Path("none"), document | more)
+    errors_mm = {(): 1.0, (0,): 2.0, (1,): 4.0, (2,): 3.0, (0, 1): 10.0, (0, 2): 20.0, (1, 2): 5.0}
+    by_subset = [{"failed": list(failed), "mean_mm": error} for failed, error in errors_mm.items()]
+    sections += fibre_loss_sections(Path("none"), {"by_subset": by_subset})
+    contacts = contacts_document()
+    third = [{"contact": "half", "pad": pad, "errors_mm": [error]} for pad, error in (("designed", 2), ("straight", 7))]
+    sections += contact_sections(Path("none"), contacts)
+    lines = contact_lines(contacts | {"rows": contacts["rows"] + third})
+    golden("padforge/sections.txt", "\n".join([section_text(sections), "", *lines]))
+
+
+def test_press_as_it_is_drawn(golden) -> None:
+    golden("padforge/press.txt", draw_press(Contact(depth_mm=2.0, thickness_mm=8.0), 11.25))

@@ -1,0 +1,91 @@
+"""What padforge says of itself, and what it prints and writes for two finished pads, kept whole."""
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+
+import click
+import pytest
+
+from padforge.cli import PRESETS, cli
+from padforge.common import profiling
+from padforge.design import Contact, Morphology
+from padforge.design.contact import contact_press, fibre_strains, half_width_mm
+from tests.helpers.door import called
+from tests.helpers.golden import json_text
+from tests.helpers.less import blank_pictures, compare_little
+
+
+def command_names(command: click.Command) -> Iterator[tuple[str, ...]]:
+    """The words of a command, if it is a group, and of all below it."""
+    yield ()
+    for word in getattr(command, "commands", {}):
+        yield from ((word, *words) for words in command_names(command.commands[word]))
+
+
+@pytest.mark.parametrize("word", cli.commands)
+def test_helps(word: str, tmp_path: Path, golden, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Click keeps the names of a help option as they are when it is first asked for, so they are left out."""
+    monkeypatch.setenv("COLUMNS", "100")
+    texts = [called(word, *words, "--help", cwd=tmp_path).out for words in command_names(cli.commands[word])]
+    golden(f"padforge/help/{word}.txt", "\n\n".join(texts), forget=[r"(?:-h, )?--help +(?=Show)"])
+
+
+def test_help_of_padforge_itself(tmp_path: Path, golden) -> None:
+    """Also if nothing is asked of it."""
+    golden("padforge/help/padforge.txt", called("--help", cwd=tmp_path).out)
+    ended = called(cwd=tmp_path)
+    assert (ended.code, ended.out, ended.err) == (2, "", called("-h", cwd=tmp_path).out)
+
+
+def test_settings_files(tmp_path: Path, golden) -> None:
+    """Of presets those lines alone that differ."""
+    assert called("init", cwd=tmp_path).out == "settings -> pad.toml\n"
+    defaults = (tmp_path / "pad.toml").read_text(encoding="utf-8")
+    golden("padforge/pad.toml", defaults)
+    lines = []
+    for preset in PRESETS:
+        assert called("init", f"{preset}.toml", "--preset", preset, cwd=tmp_path).code == 0
+        section, known = "", set(defaults.splitlines())
+        lines.append(f"preset {preset}")
+        for line in (tmp_path / f"{preset}.toml").read_text(encoding="utf-8").splitlines():
+            section = line if line.startswith("[") else section
+            lines += [f"  {section} {line}"] if line not in known else []
+    golden("padforge/presets.txt", "\n".join(lines))
+
+
+def test_comparison_of_two_pads(tmp_path: Path, golden, figures, monkeypatch: pytest.MonkeyPatch) -> None:
+    compare_little(monkeypatch)
+    blank_pictures(monkeypatch)
+    Morphology.straight((2, 3), (8.0, 15.0)).save(tmp_path / "plain.json")
+    Morphology.random(2, 3, seed=1).save(tmp_path / "bent.json")
+    words = ("design", "compare", "plain.json", "bent.json", "--out", "both")
+    ended = called(*words, cwd=tmp_path)
+    golden("padforge/compared.txt", f"exit code {ended.code}\n{ended.err}{ended.out}")
+    document = json.loads((tmp_path / "both" / "comparison.json").read_text())
+    golden("padforge/comparison.json", json_text(document), forget=[r'(?<="versions": )\{[^}]*\}'])
+    [compared] = [figure for figure in figures if len(figure.axes) == 2 and "failed" in figure.axes[0].get_xlabel()]
+    golden("padforge/comparison.figure.txt", compared)
+    plain, bent = document["rows"]
+    assert plain["length_mm"] == pytest.approx(2 * 4 * 8 + 3 * 3 * 15)
+    assert plain["errors_mm"] == plain["straight_mm"] != bent["errors_mm"]
+    assert all(other["errors_mm"] == other["straight_mm"] for other in plain["others"].values())
+    assert plain["force_n"] == pytest.approx(contact_press(Contact()).force_n(), rel=1e-9)  # Ecoflex 00-20
+    assert plain["strain_percent"] == pytest.approx(100 * max(s for _, s in fibre_strains(Contact())))
+    assert plain["half_width_mm"] == pytest.approx(half_width_mm(Contact()))
+    mould = json.loads((tmp_path / "both" / "plain" / "fabrication.json").read_text())
+    assert (plain["mould_ml"], plain["silicone_ml"]) == (mould["mould_volume_ml"], mould["silicone_volume_ml"])
+
+
+def test_profile(golden, monkeypatch: pytest.MonkeyPatch) -> None:
+    now = [0.0]
+    monkeypatch.setattr(profiling.time, "perf_counter", lambda: now[0])
+    monkeypatch.setattr(profiling, "HEAVY", ("json", "absent"))
+    with profiling.profiled() as profile:
+        now[0] += 1
+        for name, seconds in (("checks", 2), ("search", 20), ("checks", 8)):
+            with profiling.stage(name):
+                now[0] += seconds
+        for name, evaluated, total in (("few", 1, 10), ("few", 2, 10), ("many", 250, 1000)):
+            profiling.add_count(name, evaluated, total)
+    golden("padforge/profile.txt", "\n".join(profile.lines()))
