@@ -1,7 +1,6 @@
 """The press loop in virtual time: every press is kept, whatever breaks, and the arm is stopped and lifted off first."""
 
 import contextlib
-import itertools
 import json
 import os
 import signal
@@ -17,9 +16,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from padforge.design.settings import PUBLISHED_CONTACT
+from padforge.sense.recording.block_file import read_blocks
 from padforge.sense.recording.press_plan import PressPlan
 from padforge.sense.recording.recording import Recording
-from padforge.sense.recording.run_directory import Recorder, read_journal
+from padforge.sense.recording.run_directory import STATE_COLUMNS, Recorder, read_journal
 from padforge.sense.rig import operation
 from padforge.sense.rig.arms.ur5 import UR5
 from padforge.sense.rig.config import RigConfig
@@ -352,18 +352,30 @@ def test_resumed_run_drops_what_came_while_it_connected(tmp_path):
     assert np.sort(np.diff(recording.times_s))[-2:] == pytest.approx([0.01, 1.01], abs=0.02)
 
 
-def test_run_records_depth_and_force(tmp_path):
-    arm, board, options = rig()
-    arm.hook = lambda arm: setattr(arm, "force_n", -7.5 if arm.pose[2] <= 46.001 else 0.0)
-    plan = PressPlan(PLAN.positions_mm[:2], np.array([4.0, 5.0]))
-    run(tmp_path / "run", arm, board, options, plan)
+def test_run_keeps_what_each_press_reached(tmp_path):
+    """As the states on the disk have it: where the tip stood at the end, and the median of the force at rest.
+
+    The arm stands beside where it was sent, and the force has spikes, so that its mean is above its median.
+    """
+    arm, board, options = rig(pad_angle_deg=30.0, press_mm_s=400.0)
+    move = arm.move
+    arm.move = lambda pose, *speeds: move((pose[0] + 0.01234, pose[1], pose[2] + 0.03456, *pose[3:]), *speeds)
+    arm.hook = lambda arm: setattr(arm, "force_n", -min(50 - arm.pose[2], 4.5) * (1 + (7 * arm.time() % 1) ** 6))
+    run(tmp_path / "run", arm, board, options, PressPlan(PLAN.positions_mm[:2], np.array([4.0, 5.0])))
     recording = Recording.open(tmp_path / "run")
+    _, states = read_blocks(tmp_path / "run" / "states.bin", len(STATE_COLUMNS) - 1)
+    journal = [json.loads(line) for line in (tmp_path / "run" / "journal.ndjson").read_text().splitlines()]
+    for press, done in enumerate(event for event in journal if event["event"] == "done"):
+        x, y, z, *_, force_n, _ = states[np.abs(states[:, 2] - 50.03456 + recording.depths_mm[press]) < 1e-6].T
+        turned = ((x[-1] + 1j * (y[-1] + 400)) * np.exp(-1j * np.pi / 6)).round(4)
+        assert done["at_mm"] == [turned.real, turned.imag, round(50 - z[-1], 4)]
+        n = len(force_n)  # but for those until the arm is known to rest, and one as it is sent up
+        assert done["force_n"] in [np.median(np.abs(force_n[a:b])) for a in (0, 1, 2) for b in (n - 1, n)]
+        assert abs(np.abs(force_n).mean() - done["force_n"]) > 0.05
     assert recording.depths_mm.tolist() == [4.0, 5.0]
-    assert recording.reached_mm == pytest.approx([4.0, 5.0], abs=0.1)
-    assert recording.forces_n == pytest.approx(7.5)
     arm, board, options = rig(max_force_n=None)
     arm.force_n = None  # no sensor
-    run(tmp_path / "without", arm, board, options, plan)
+    run(tmp_path / "without", arm, board, options, PressPlan(PLAN.positions_mm[:1], np.array([4.0])))
     assert np.isnan(Recording.open(tmp_path / "without").forces_n).all()
 
 
@@ -510,12 +522,3 @@ def test_emulated_arm_retreats_from_too_much_force_however_slow_the_disk(
     assert rows[-1, 7] == 0
     assert (rows[-3:, 1:4] == (0, -400, 60)).all()
     robots.free()
-
-
-def test_run_records_the_median_of_the_force(tmp_path):
-    """Every fifth state has a spike."""
-    arm, board, options = rig()
-    count = itertools.count()
-    arm.hook = lambda arm: setattr(arm, "force_n", 30.0 if next(count) % 5 == 0 else 7.5)
-    run(tmp_path / "run", arm, board, options, PressPlan(PLAN.positions_mm[:1], np.array([4.0])))
-    assert Recording.open(tmp_path / "run").forces_n.tolist() == [7.5]

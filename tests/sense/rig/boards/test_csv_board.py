@@ -12,7 +12,7 @@ import pytest
 from padforge.sense.rig import clock
 from padforge.sense.rig.boards import csv_board, line_board
 from padforge.sense.rig.boards.csv_board import CsvBoard, parse_numbers
-from padforge.sense.rig.boards.line_board import LineBoard, describe_lines
+from padforge.sense.rig.boards.line_board import LineBoard
 from padforge.sense.rig.devices import RigFault
 
 RATE_HZ = 200.0
@@ -78,14 +78,6 @@ def test_csv_board_finds_columns_and_rate(monkeypatch: pytest.MonkeyPatch) -> No
                 CsvBoard(port, 115200, 50).connect()
         finally:
             board.close()
-
-
-def test_describe_lines_tells_apart_what_comes() -> None:
-    assert describe_lines(b"")[0] == "nothing comes from it"
-    assert describe_lines(bytes(range(128, 228)))[0] == "100 of 100 bytes are no text"
-    message, advice = describe_lines(b"2,501\r\n10000,502,501\r\n2000")
-    assert message == "it sends lines such as '10000,502,501' without the header of docs/howto-boards.md"
-    assert 'board = "csv"' in advice
 
 
 def test_line_board_shows_a_line_without_header(monkeypatch: pytest.MonkeyPatch) -> None:
