@@ -213,7 +213,7 @@ def test_doctor_says_how_a_rig_is(bench: Bench, golden) -> None:
     bench.renew()
     bench(*DOCTOR[:1], *DOCTOR[3:], title="the board alone")
     bench.renew()
-    read = bench.board.model.volts
+    read = bench.board.volts
 
     def worn(positions_mm: np.ndarray, depths_mm: np.ndarray) -> np.ndarray:
         volts = read(positions_mm, depths_mm)
@@ -221,7 +221,7 @@ def test_doctor_says_how_a_rig_is(bench: Bench, golden) -> None:
         volts[:, 3] += 0.05 * np.random.default_rng(len(volts)).standard_normal(len(volts))
         return volts
 
-    bench.board.model.volts = worn
+    bench.board.volts = worn
     bench.board.lose = 7
     said = bench.board.connect() | {"rate_hz": 1020.0, "inputs": [14, 3, 0, 1], "warning": "its lines have no check"}
     bench.board.connect = lambda: said

@@ -493,7 +493,6 @@ def test_emulated_arm_retreats_from_too_much_force_however_slow_the_disk(
     slow = {"press_mm_s": 10.0, "clearance_mm": 2.0}
     options = RIG.model_copy(update={"max_force_n": 20.0, "readings_per_press": 20, **slow})
     board = FakeBoard(FakeArm(time.monotonic))  # pyright: ignore[reportArgumentType]
-    board.model.volts(np.zeros((2, 2)), np.array([0.0, 5.0]))  # compiles what the loop needs
     arm, stopped, fsync = UR5(host), threading.Event(), os.fsync
     arm_stop = arm.stop
 
