@@ -272,7 +272,7 @@ def test_session_restarts_a_confused_detector(hands, monkeypatch: pytest.MonkeyP
 
 def test_session_tells_what_to_do_and_keeps_what_was_done(hands, golden) -> None:
     """Half of the presses go wrong; the second that counts is taken back, and the fourth place is skipped."""
-    hand = hands(presses=5, mishaps=0.5, seed=3)
+    hand = hands(presses=5, mishaps=0.5, seed=3, plan="grid")
     schedule = {2: ["back"], 3: ["skip"]}
 
     def commands() -> list[str]:
