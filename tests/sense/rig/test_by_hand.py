@@ -39,7 +39,7 @@ from padforge.sense.settings import RigSettings
 from padforge.sense.signals.press_detection import PressDetector, PressEvent
 from tests.emulators.finger import SCATTER_MM, Finger
 from tests.helpers.page_names import names_in_view
-from tests.sense.conftest import QUICK
+from tests.sense.conftest import QUICK, few_moments
 from tests.sense.rig.fakes import Time
 
 IDENTITY = {"name": "board", "channels": 4, "rate_hz": 1000.0}
@@ -455,7 +455,8 @@ def test_validator_follows_the_drift_of_the_baseline(validator: PressValidator) 
 def test_calibrate_learns_from_a_recording_by_hand(hands) -> None:
     hand = hands(mishaps=0.2, presses=60)
     recording = hand.record()
-    _, evaluation = calibrate(recording, QUICK.model_copy(update={"members": 1, "epochs": 10}))
+    with few_moments():
+        _, evaluation = calibrate(recording, QUICK.model_copy(update={"members": 1, "epochs": 10}))
     scale_mm = np.linalg.norm(hand.targets - hand.targets.mean(axis=0), axis=1).mean()
     assert evaluation.errors[0]["mean_mm"] < 0.55 * scale_mm
 
