@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from padforge.common.validation import InputError
 from padforge.design import Contact, Morphology
 from padforge.design.settings import PadSettings
 from padforge.sense import Recorder, Recording
@@ -17,6 +16,7 @@ from padforge.sense.recording.doubts import area_mm, find_doubts, suggest_unit
 from padforge.sense.recording.press_plan import PressPlan, check_depths, describe_other_depth, make_plan, read_plan
 from padforge.sense.recording.recording import check_replaceable
 from padforge.sense.settings import RigSettings
+from tests.helpers.refusals import refusal_table
 
 KEEP_OUT = ((2.0, -6.0), (9.0, -6.0), (9.0, 6.0), (2.0, 6.0))
 SIZE = PadSettings(horizontals=3, verticals=2, pitch_mm=(8.0, 15.0), keep_out_mm=(KEEP_OUT,))
@@ -65,28 +65,11 @@ def test_run_directory_is_written_as_the_arrays_are(made: Recording, golden, tmp
     golden("recordings/measures.json", {**measures, "rate_hz": opened.rate_hz, "pad_digest": opened.pad_digest})
 
 
-def refusals(rows: dict[str, Callable[[], object]]) -> str:
-    lines = []
-    for name, call in rows.items():
-        said = "nothing is raised"
-        try:
-            call()
-        except InputError as error:
-            said = str(error)
-            assert "\n" not in said
-        lines.append(f"{name}:\n    {said}")
-    return "\n".join(lines)
-
-
-def with_value(array: np.ndarray, index: Any, value: float) -> np.ndarray:
-    array = array.astype(float)
-    array[index] = value
-    return array
-
-
 def test_arrays_and_plans_are_refused_in_these_words(made: Recording, golden, tmp_path: Path) -> None:
     def with_array(name: str, index: Any, value: float) -> Callable[[], object]:
-        return lambda: replace(made, **{name: with_value(getattr(made, name), index, value)})
+        array = getattr(made, name).astype(float)
+        array[index] = value
+        return lambda: replace(made, **{name: array})
 
     def plan_file(content: str) -> Callable[[], object]:
         def read() -> None:
@@ -135,7 +118,7 @@ def test_arrays_and_plans_are_refused_in_these_words(made: Recording, golden, tm
         "no place left": lambda: make_plan(PAD, RigSettings(), np.random.default_rng(0), covered),
         "through the pad": lambda: check_depths(np.array([1.0, 6.5]), 6.5, "pad.toml"),
     }
-    golden("recordings/refusals_of_arrays.txt", refusals(rows))
+    golden("recordings/refusals_of_arrays.txt", refusal_table(rows))
     layer = Contact(model="layer", depth_mm=2.0)
     said = [describe_other_depth(np.array(depths), layer) for depths in ([1.0], [3.0, 0.5], [2.0, 5.0])]
     assert said == [
@@ -209,7 +192,7 @@ def test_folders_are_refused_in_these_words_and_left_as_they_are(made: Recording
         "no depth": recorded(lambda r: r.begin((0.0, 0.0), 100, depth_mm=np.nan)),
         "before the first": recorded(lambda r: r.begin((0.0, 0.0), -1)),
     }
-    golden("recordings/refusals_of_folders.txt", refusals(rows), forget=[r"n{300}"])
+    golden("recordings/refusals_of_folders.txt", refusal_table(rows), forget=[r"n{300}"])
     kept = {path.name: path.read_bytes() for path in (tmp_path / "run").iterdir() if path.name in files}
     assert kept == files
     assert (tmp_path / "file").read_text() == "content"
@@ -234,7 +217,7 @@ def test_doubts(made: Recording, golden) -> None:
         "of one known position": unknown,
         "far": replace(long, presses_mm=one),
         "eight far": replace(long, presses_mm=eight),
-        "of few, none is far": replace(made, presses_mm=with_value(presses_mm, 1, 1500.0)),
+        "of few, none is far": replace(made, presses_mm=100 * presses_mm),
         "positions in m": replace(made, presses_mm=1e-3 * presses_mm),
         "positions in m, named": replace(made, presses_mm=1e-3 * presses_mm, source=columns),
         "positions in um": replace(made, presses_mm=1e3 * presses_mm),

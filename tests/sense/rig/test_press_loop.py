@@ -7,6 +7,7 @@ import signal
 import threading
 import time
 from contextlib import closing
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -155,35 +156,6 @@ def test_run_loses_no_finished_press_by_a_fault_of_the_arm(tmp_path, fault, time
     assert len(arm.moves) == 3 * (len(FOUR) - done)
 
 
-@pytest.mark.parametrize(
-    ("change", "cause", "message"),
-    [
-        ({"lost": True}, "lost", "."),
-        ({"stalled": True}, "stale", "."),
-        ({"rate_hz": 1e-3}, "deadline", r"no reading came within 3\.0 s"),  # it is silent, but raises nothing
-    ],
-)
-def test_run_stops_and_lifts_the_arm_at_a_fault_of_the_board(tmp_path, change, cause, message):
-    arm, board, options = rig()
-    arm.hook = lambda arm: vars(board).update(change) if arm.time() > 101.1 else None
-    assert fault_of(tmp_path / "run", arm, board, options, message) == cause
-    assert arm.stops >= 1
-    assert arm.moves[-1][2] == 50 + options.clearance_mm
-
-
-@pytest.mark.parametrize(
-    ("stays", "outcome", "end_mm"),
-    [(False, "was lifted off", 60), (True, "was not lifted off: the force does not fall", 50)],
-)
-def test_run_stops_and_retreats_at_too_much_force(tmp_path, stays, outcome, end_mm):
-    arm, board, options = rig()
-    arm.hook = lambda arm: setattr(arm, "force_n", 80.0 if arm.pose[2] < 48 or (stays and arm.force_n) else 0.0)
-    message = rf"80\.0 N; allowed 60 N; the tool {outcome}"
-    assert fault_of(tmp_path / "run", arm, board, options, message) == "force"
-    assert arm.stops >= 1
-    assert arm.pose[2] == pytest.approx(end_mm, abs=2)
-
-
 @pytest.mark.parametrize(("silent_s", "end_mm"), [(0.9, 60), (3.0, 46)])
 def test_run_retreats_as_soon_as_states_come_again(tmp_path, silent_s, end_mm):
     """A state that is too old ends the recording, and the tool is pressed into the pad."""
@@ -200,14 +172,6 @@ def test_run_retreats_as_soon_as_states_come_again(tmp_path, silent_s, end_mm):
     arm.state = last_state
     assert fault_of(tmp_path / "run", arm, board, options, "the last state is old") == "stale"
     assert arm.pose[2] == pytest.approx(end_mm)
-
-
-def test_run_stops_and_retreats_when_the_force_sensor_fails_in_a_press(tmp_path):
-    arm, board, options = rig()
-    arm.hook = lambda arm: setattr(arm, "force_n", None if arm.pose[2] < 48 or arm.force_n is None else 0.0)
-    message = "the arm measures no force any more; allowed 60 N; .*; the tool was lifted off"
-    assert fault_of(tmp_path / "run", arm, board, options, message) == "force"
-    assert arm.pose[2] == 60
 
 
 def both_vanish(arm, board):
@@ -228,19 +192,46 @@ def ctrl_c_at_a_protective_stop(arm, board):
         raise KeyboardInterrupt
 
 
-@pytest.mark.parametrize(
-    ("trouble", "error", "message"),
-    [
-        (both_vanish, RigFault, "the board is gone; the tool was not lifted off: the arm is gone"),
-        (no_stop_is_confirmed, RigFault, "the arm is gone; the tool was not lifted off: the arm did not confirm the"),
-        (ctrl_c_at_a_protective_stop, KeyboardInterrupt, "was not lifted off: the arm is in a protective stop"),
-    ],
-)
-def test_run_says_that_the_tool_stays_on_the_pad(tmp_path, trouble, error, message):
-    arm, board, options = rig()
-    arm.hook = lambda arm: trouble(arm, board)
-    with pytest.raises(error, match=message):
-        run(tmp_path / "run", arm, board, options)
+def board_lost(arm, board, **change):
+    vars(board).update(change if arm.time() > 101.1 else {})
+
+
+def pressed_hard(arm, board, stays):
+    arm.force_n = 80.0 if arm.pose[2] < 48 or (stays and arm.force_n) else 0.0
+
+
+def sensor_lost(arm, board):
+    arm.force_n = None if arm.pose[2] < 48 or arm.force_n is None else 0.0
+
+
+FAULTS = {
+    "the board vanishes": (partial(board_lost, lost=True), "lost", 60),
+    "the board stalls": (partial(board_lost, stalled=True), "stale", 60),
+    "the board is silent, but raises nothing": (partial(board_lost, rate_hz=1e-3), "deadline", 60),
+    "too much force": (partial(pressed_hard, stays=False), "force", 60),
+    "a force that stays": (partial(pressed_hard, stays=True), "force", 50),
+    "the force sensor fails in a press": (sensor_lost, "force", 60),
+    "both vanish": (both_vanish, "lost", None),
+    "no stop is confirmed": (no_stop_is_confirmed, "lost", None),
+    "Ctrl-C at a protective stop": (ctrl_c_at_a_protective_stop, None, None),
+}
+"""What breaks at every poll, the cause of the fault, and the height of the tool at the end if it can be lifted."""
+
+
+def test_run_stops_and_retreats_and_says_whether_the_tool_stays_on_the_pad(tmp_path, golden):
+    reports = []
+    for name, (trouble, cause, end_mm) in FAULTS.items():
+        arm, board, options = rig()
+        arm.hook = partial(trouble, board=board)
+        with pytest.raises((RigFault, KeyboardInterrupt)) as caught:
+            run(tmp_path / name, arm, board, options, FOUR)
+        assert getattr(caught.value, "cause", None) == cause, name
+        assert "was not lifted off" in str(caught.value) or end_mm == 60, name
+        if end_mm is not None:
+            assert arm.stops >= 1, name
+            assert arm.pose[2] == pytest.approx(end_mm, abs=2), name
+        reports.append(f"{name}, {n_done(tmp_path / name)} presses done:\n    [{cause}] {caught.value}")
+    golden("rig/faults.txt", "\n".join(reports))
 
 
 def test_run_loses_nothing_on_a_full_disk(tmp_path):

@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from padforge.common.validation import InputError
 from padforge.design import Contact, Morphology
 from padforge.design.settings import PUBLISHED_CONTACT
 from padforge.fabricate import build
@@ -45,6 +44,7 @@ from padforge.sense.settings import RigSettings
 from padforge.sense.simulation.simulated_recording import simulate
 from tests.emulators.boards import format_header, format_sample
 from tests.fabricate.planted import with_settings
+from tests.helpers.refusals import refusal_table
 from tests.sense.rig.fakes import PAD, RIG
 
 Rows = dict[str, Callable[[], object]]
@@ -52,21 +52,6 @@ POSE = (0.0, -400.0, 60.0, 0.0, np.pi, 0.0)
 X, Y, Z, *TOOL = POSE
 LIMITS = Limits.from_settings(RIG)
 STILL = ArmState(10.0, POSE, 0.0, 0.0, False, False, moving=False)
-
-
-def table(rows: Rows) -> str:
-    """Return what each call raises: its name, its cause if it is a fault, and its words."""
-    lines = []
-    for name, call in rows.items():
-        said = "nothing is raised"
-        try:
-            call()
-        except (InputError, RigFault, ValueError) as error:
-            kind = error.cause if isinstance(error, RigFault) else type(error).__name__
-            said = f"[{kind}] {error}"
-            assert "\n" not in said
-        lines.append(f"{name}:\n    {said}")
-    return "\n".join(lines)
 
 
 def rig(**settings: Any) -> RigSettings:
@@ -120,7 +105,7 @@ def test_limits_and_states_are_refused_in_these_words(golden) -> None:
         "too deep": state(pose=(X, Y, 50 - 6.31, *TOOL)),
         "too long": state(until_s=9.9),
     }
-    golden("rig/refusals_of_limits.txt", table(rows))
+    golden("rig/refusals_of_limits.txt", refusal_table(rows))
 
 
 UNO = SimpleNamespace(device="/dev/ttyACM2", vid=0x2341, pid=0x0043)
@@ -231,7 +216,7 @@ def test_devices_are_refused_in_these_words(golden, monkeypatch: pytest.MonkeyPa
         "times, ms": assembled(2e6 + np.arange(1, 20)),
         "times, too fast": assembled(2e6 + np.arange(1, 200) * 700),
     }
-    golden("rig/refusals_of_devices.txt", table(rows))
+    golden("rig/refusals_of_devices.txt", refusal_table(rows))
 
 
 def test_recordings_are_not_resumed_in_these_words(golden, tmp_path: Path) -> None:
@@ -289,7 +274,7 @@ def test_recordings_are_not_resumed_in_these_words(golden, tmp_path: Path) -> No
         "a model of a twin": model_of("twin", {**simulated, "twin": {"presses": 1500}}),
         "a model of no pad": model_of("nothing", {**simulated, "morphology": {}}),
     }
-    golden("rig/refusals_to_resume.txt", table(rows))
+    golden("rig/refusals_to_resume.txt", refusal_table(rows))
     assert plan_notice(replace(config, rig=rig(seed=9, presses=30))) == (
         f"{run}: goes on by the plan it was begun with, [rig] presses = 6, seed = 0"
     )
