@@ -90,6 +90,9 @@ def test_locate_on_bed_reads_the_holder(folder, with_frame):
     box = locate_on_bed(PRINTER.model_copy(update={"tcp_mm": (95.0, -90.0, -20.0)}), folder).box_mm
     assert box is not None
     assert (box[0], box[3]) == (95, 90)  # it ends where the nozzle does
+    box = locate_on_bed(PRINTER.model_copy(update={"tcp_mm": (-95.0, 95.0, -20.0)}), folder).box_mm
+    assert box is not None
+    assert (box[1], box[2]) == (105, 95)
     for angle_deg, (x, y) in ((0.0, (30.0, 10.0)), (90.0, (10.0, 30.0)), (180.0, (30.0, 10.0))):
         box = locate_on_bed(PRINTER, with_frame(pad_mm=[60.0, 20.0], angle_deg=angle_deg)).box_mm
         assert box is not None

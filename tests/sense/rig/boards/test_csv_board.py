@@ -84,3 +84,11 @@ def test_line_board_shows_a_line_without_header(monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setattr(line_board, "_ANSWER_S", 0.3)
     with printing(b"502,501") as port, pytest.raises(RigFault, match="it sends lines such as '502,501' without"):
         LineBoard(port, 115200, RATE_HZ).connect()
+
+
+def test_csv_board_asks_for_more_lines(monkeypatch: pytest.MonkeyPatch) -> None:
+    """200 come a second, which is enough but for a minimum that is raised here."""
+    for name, value in {"_START_S": 0.1, "LISTEN_S": 0.2, "_MIN_LINES": 100}.items():
+        monkeypatch.setattr(csv_board, name, value)
+    with printing(b"502,501") as port, pytest.raises(RigFault, match="numbers alone, 500 lines a second or more"):
+        CsvBoard(port, 115200, RATE_HZ).connect()
