@@ -475,9 +475,8 @@ def test_record_handles_a_second_ctrl_c_after_the_loop(tmp_path: Path, monkeypat
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("slow_s", [0.0, 1.0])
 def test_emulated_arm_retreats_from_too_much_force_however_slow_the_disk(
-    robots: Any, host: str, tmp_path, monkeypatch: pytest.MonkeyPatch, slow_s: float
+    robots: Any, host: str, tmp_path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """20 N/mm at 10 mm/s: a tenth of a second without a check costs 20 N, and the disk would take half a press."""
     robot = robots.get("e", pose=(0.0, -400.0, 60.0, 0.0, np.pi, 0.0), surface_mm=50, stiffness_n_mm=20.0)
@@ -492,7 +491,7 @@ def test_emulated_arm_retreats_from_too_much_force_however_slow_the_disk(
         stopped.set()
 
     def slow_fsync(file: int) -> None:
-        stopped.wait(slow_s)
+        stopped.wait(1.0)
         fsync(file)
 
     with closing(arm):
