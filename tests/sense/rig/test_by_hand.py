@@ -284,7 +284,8 @@ def test_session_tells_what_to_do_and_keeps_what_was_done(hands, golden) -> None
     prompts = [line for before, line in zip(["", *shown], shown, strict=False) if line != before]
     golden("rig/hand.txt", "\n".join([*view_lines(hand.views[60]), "", *prompts]))
     first = {view["phase"]: view for view in reversed(hand.views)}
-    golden("rig/hand_views.json", [first[phase] for phase in ("settle", "press", "hold", "lift", "wait", "done")])
+    shown = [first[phase] for phase in ("settle", "press", "hold", "lift", "wait", "done")]
+    golden("rig/hand_views.json", [*shown, next(view for view in hand.views if view["rejected"])])
     golden("rig/hand_journal.ndjson", (hand.out / "journal.ndjson").read_text())
     assert accepted_mm(recording).tolist() == np.delete(hand.targets, 3, axis=0).tolist()
     hand.record(resume=True)  # what was skipped is asked for again
