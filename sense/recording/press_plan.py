@@ -78,7 +78,9 @@ def fit_pad_settings(pad: Morphology, pad_settings: PadSettings | None = None) -
         sensed = shapely.box(left, low, right, high)
         share = sensed.difference(shapely.union_all(keep_outs(pad_settings))).area / sensed.area
         if share < MIN_PRESSABLE:
-            raise InputError(f"[pad] keep_out_mm leaves {share:.1%} of what is pressed, allowed is {MIN_PRESSABLE:.0%}")
+            raise InputError(
+                f"[pad] keep_out_mm leaves {share:.1%} of what is pressed, allowed is {MIN_PRESSABLE:.0%} or more"
+            )
     return pad_settings
 
 
@@ -214,7 +216,7 @@ def check_pressable(plan: PressPlan, path: Path, is_pressable: PositionTest) -> 
         press = int(np.argmin(valid))
         x, y = plan.positions_mm[press]
         raise InputError(
-            f"{path}: press {press + 1}, at ({x:g}, {y:g}) mm, lies in a keep-out, allowed are positions outside of "
+            f"{path}: press {press}, at ({x:g}, {y:g}) mm, lies in a keep-out, allowed are positions outside of "
             "those of [pad] keep_out_mm"
         )
     return plan

@@ -212,7 +212,7 @@ class Recording:
         readings, times = check_stream(times_s, readings)[::-1]
         source: dict[str, Any] = {"kind": "arrays"}
         if (down_s is None) != (up_s is None):
-            raise InputError("down_s and up_s are one of them, expected both or neither")
+            raise InputError("one of down_s and up_s is given, expected both or neither")
         if down_s is None or up_s is None:
             down, up = detect_commands(readings, times, source)
             source |= PRESSES_DETECTED

@@ -68,14 +68,16 @@ def examine_arm(arm: Arm, rig: RigSettings) -> list[Diagnosis]:
     gaps_s = np.diff(states[:, 0])
     is_stopped = state.protective_stop or state.emergency_stop
     safety = "emergency stop" if state.emergency_stop else "protective stop" if is_stopped else "normal"
-    rate_hz = 1 / float(np.median(gaps_s)) if len(gaps_s) else 0.0
     gap_s = float(gaps_s.max()) if len(gaps_s) else np.inf
+    rhythm = f"{len(states)} within {OBSERVE_S:g} s"
+    if len(gaps_s):
+        rhythm = f"{1 / float(np.median(gaps_s)):.0f} Hz, longest gap {1e3 * gap_s:.0f} ms"
     age_s = now_s - state.time_s
     position = ", ".join(f"{value:.1f}" for value in state.pose[:3])
     return [
         Diagnosis("arm", "ok", _identity_text(identity)),
         Diagnosis("safety", "fail" if is_stopped else "ok", safety),
-        Diagnosis("states", "ok" if gap_s < _LATE_S else "warn", f"{rate_hz:.0f} Hz, longest gap {1e3 * gap_s:.0f} ms"),
+        Diagnosis("states", "ok" if gap_s < _LATE_S else "warn", rhythm),
         Diagnosis("age", "ok" if age_s < _LATE_S else "warn", f"{1e3 * age_s:.1f} ms"),
         Diagnosis("tool", "ok", f"at {position} mm"),
         *_examine_tcp(identity, rig),

@@ -147,7 +147,7 @@ def check_target(pose: Sequence[float], speed_mm_s: float, acceleration_mm_s2: f
     if acceleration_mm_s2 > limits.max_acceleration_mm_s2:
         _refuse(f"acceleration {acceleration_mm_s2:g} mm/s²", f"at most {limits.max_acceleration_mm_s2:g} mm/s²")
     if not (tilt := tilt_deg(pose[3:], limits.tool)) <= MAX_TILT_DEG:
-        _refuse(f"the tool tilted by {tilt:.1f} degrees", f"at most {MAX_TILT_DEG:g}")
+        _refuse(f"the tool tilted by {tilt:.2f} degrees", f"at most {MAX_TILT_DEG:g}")
 
 
 def check_start_state(state: ArmState, limits: Limits) -> None:

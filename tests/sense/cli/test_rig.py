@@ -3,12 +3,11 @@
 import json
 import os
 import sys
-from collections.abc import Iterator, Mapping
-from contextlib import nullcontext
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
-from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -22,12 +21,12 @@ from padforge.sense import Recording
 from padforge.sense.formats.ros_recording import import_bag
 from padforge.sense.live import outputs
 from padforge.sense.rig import operation
-from padforge.sense.rig.doctor import Diagnosis
 from padforge.sense.settings import RigSettings
 from tests.emulators.boards import EmulatedLineBoard, emulated_header
 from tests.emulators.finger import Finger
 from tests.emulators.rigs import emulate_printer, printer_settings
 from tests.helpers.rigs import rig_toml
+from tests.sense.cli.conftest import Run
 from tests.sense.rig.fakes import PAD, RIG, FakeArm, FakeBoard, Time
 
 EMULATED = pytest.mark.skipif(not hasattr(os, "openpty"), reason="there are no pseudo-terminals here")
@@ -98,6 +97,7 @@ def test_record_simulates_a_twin(padforge_sense) -> None:
 
 
 @EMULATED
+@pytest.mark.usefixtures("steady")
 def test_record_with_a_printer(padforge_sense) -> None:
     fast = {"rate_hz": 50, "readings_per_press": 30, "clearance_mm": 1, "depth_mm": 1, "travel_mm_s": 400}
     pad = Morphology.straight(2)
@@ -111,31 +111,134 @@ def test_record_with_a_printer(padforge_sense) -> None:
     assert Recording.open("recording").source["rig"]["tcp_mm"] == [30.0, 0.0, -20.0]
 
 
-@pytest.mark.parametrize(
-    ("tcp_mm", "max_force_n", "code", "said"),
-    [
-        (None, 60.0, 2, "[rig] tcp_mm is unknown"),
-        ((0.0, 0.0, 0.0), 60.0, 2, "[rig] tcp_mm is [0.0, 0.0, 0.0]"),
-        ((0.0, 0.05, 150.0), 60.0, 0, ""),
-        ((0.0, 0.05, 150.0), None, 0, "no force stops the arm"),
-    ],
-)
-def test_record_checks_the_tcp_before_anything_moves(
-    padforge_sense, monkeypatch: pytest.MonkeyPatch, tcp_mm: object, max_force_n: object, code: int, said: str
-) -> None:
-    """The controller has the tip 150 mm from the flange; an unwatched force is announced."""
-    arm, session = FakeArm(Time()), Mock()
-    monkeypatch.setattr(arm, "connect", lambda: {"tcp": [0.0, 0.0, 150.0, 0.0, 0.0, 0.0]})
-    monkeypatch.setattr(operation, "opened_rig", lambda _, setup, *more: nullcontext((arm, FakeBoard(arm), setup.rig)))
-    monkeypatch.setattr(operation, "PressLoop", session)
-    rig = RIG.model_copy(update={"tcp_mm": tcp_mm, "max_force_n": max_force_n})
-    Path("rig.toml").write_text(rig_toml(rig, PAD.grid))
+class Bench:
+    """A fake arm and board in virtual time, in place of the devices that commands open; and what was said.
+
+    Args:
+        command: runs `padforge sense`.
+        patch: that ends with the test.
+    """
+
+    def __init__(self, command: Run, patch: pytest.MonkeyPatch) -> None:
+        self._command, self._patch, self.transcript = command, patch, list[str]()
+        self.renew()
+
+    def renew(self) -> None:
+        """Put new devices in their place."""
+        self.time = Time()
+        self.arm = FakeArm(self.time)
+        self.board = FakeBoard(self.arm)
+        self.arm.move = self._miss(self.arm.move)
+        self._patch.setattr(operation, "make_board", lambda rig, inputs: self.board)
+        self._patch.setattr(operation, "load_device", lambda group, name: lambda rig: self.arm)
+        self._patch.setattr(operation, "host_ports", lambda: PORTS)
+
+    @staticmethod
+    def _miss(move: Callable[..., None]) -> Callable[..., None]:
+        """The arm stands a little beside where it was sent."""
+        return lambda pose, *speeds: move((pose[0] + 0.01234, pose[1] - 0.05678, pose[2] + 0.03456, *pose[3:]), *speeds)
+
+    def __call__(self, *words: str, title: str) -> None:
+        """Run a command, and add what it prints to the transcript."""
+        with self.time.of_all():
+            code, out, err = self._command(*words)
+        said = [out.rstrip()] * bool(out) + [f"stderr: {line}" for line in err.splitlines()]
+        self.transcript += [f"# {title}", f"$ padforge sense {' '.join(words)}", *said, f"exit {code}", ""]
+
+
+PORTS = [
+    SimpleNamespace(device="/dev/ttyACM0", description="padforge-due", vid=0x2341),
+    SimpleNamespace(device="/dev/ttyS0", description="built in", vid=None),
+]
+IDENTITY = {"model": "UR5", "serial": "2018", "tcp": [0.0, 0.0, 150.0, 0.0, 0.0, 0.0]}
+
+
+@pytest.fixture
+def bench(padforge_sense: Run, monkeypatch: pytest.MonkeyPatch) -> Bench:
+    """It stands in the folder of pad.json and rig.toml."""
     PAD.save("pad.json")
-    words = ("record", "--rig", "ur5", "--dry-run", "--spec", "rig.toml", "--morphology", "pad.json")
-    ended, _, err = padforge_sense(*words)
-    assert (ended, err.count("\n"), session.called) == (code, bool(said), code == 0)
-    assert said in err
-    assert not Path("out").exists()
+    rig = RIG.model_copy(update={"tcp_mm": (0.0, 0.0, 150.0), "presses": 3, "plan": "serpentine", "max_force_n": 60.0})
+    Path("rig.toml").write_text(rig_toml(rig, PAD.grid))
+    bench = Bench(padforge_sense, monkeypatch)
+    monkeypatch.setattr(FakeArm, "connect", lambda arm: dict(IDENTITY))
+    return bench
+
+
+RECORD = ("record", "--rig", "ur5", "--spec", "rig.toml", "--morphology", "pad.json", "--out", "run")
+
+
+def test_record_says_and_keeps_what_an_arm_did(bench: Bench, golden) -> None:
+    """Over the pad without touching it, until the link is lost, and resumed by other settings; and then read back."""
+    bench(*RECORD, "--dry-run", title="above the pad")
+    assert not Path("run").exists()
+    bench.renew()
+    bench.arm.hook = lambda arm: setattr(arm, "lost", arm.time() > 101.4)
+    bench(*RECORD, title="the link is lost in the third press")
+    bench.renew()
+    bench(*RECORD, title="again")
+    assert bench.arm.moves == []
+
+    def press_back(arm: FakeArm) -> None:
+        """A spring that shakes, so that its mean is above its median."""
+        arm.force_n = -3.0 * max(50.0 - arm.pose[2], 0.0) * (1 + (7 * arm.time() % 1) ** 6)
+        bench.board.lose = 35 if 101.0 < arm.time() < 101.05 else 0
+
+    bench.arm.hook = press_back
+    bench(*RECORD, "--resume", "--presses", "5", "--seed", "4", title="resumed by another plan, which does not count")
+    golden("rig/record.txt", "\n".join(bench.transcript))
+    golden("rig/start.json", Path("run/start.json").read_text(), forget=[r'(?<="versions": )\{[^}]*\}'])
+    golden("rig/journal.ndjson", Path("run/journal.ndjson").read_text())
+
+
+def test_record_refuses_a_tip_that_is_not_the_controllers_before_anything_moves(bench: Bench, golden) -> None:
+    """The controller has it 150 mm from the flange; an unwatched force is announced."""
+    for tcp_mm, max_force_n in ((None, 60.0), ((0.0, 0.0, 0.0), 60.0), ((0.0, 0.05, 150.0), None)):
+        bench.renew()
+        rig = RIG.model_copy(update={"tcp_mm": tcp_mm, "max_force_n": max_force_n, "presses": 1})
+        Path("rig.toml").write_text(rig_toml(rig, PAD.grid))
+        bench(*RECORD, "--resume", title=f"tcp_mm {tcp_mm}, max_force_n {max_force_n}")
+        assert bool(bench.arm.moves) is (max_force_n is None)
+        assert Path("run").exists() is (max_force_n is None)
+    golden("rig/record_tcp.txt", "\n".join(bench.transcript))
+
+
+DOCTOR = ("doctor", "--rig", "ur5", "--spec", "rig.toml", "--morphology", "pad.json")
+
+
+def test_doctor_says_how_a_rig_is(bench: Bench, golden) -> None:
+    states_s = np.cumsum([99.0, *[0.008] * 60, 0.03, *[0.008] * 60])
+    states = np.column_stack([states_s, np.zeros((len(states_s), 9))])
+    bench.arm.drain = lambda: states
+    bench(*DOCTOR, title="all is well")
+    bench.renew()
+    bench(*DOCTOR[:1], *DOCTOR[3:], title="the board alone")
+    bench.renew()
+    read = bench.board.volts
+
+    def worn(positions_mm: np.ndarray, depths_mm: np.ndarray) -> np.ndarray:
+        volts = read(positions_mm, depths_mm)
+        volts[:, 0], volts[:, 1], volts[:, 2] = 0.0, 3.3, 1.5
+        volts[:, 3] += 0.05 * np.random.default_rng(len(volts)).standard_normal(len(volts))
+        return volts
+
+    bench.board.volts = worn
+    bench.board.lose = 7
+    said = bench.board.connect() | {"rate_hz": 1020.0, "inputs": [14, 3, 0, 1], "warning": "its lines have no check"}
+    bench.board.connect = lambda: said
+    states_s[60:] += 0.4
+    bench.arm.drain, bench.arm.protective_stop, bench.arm.force_n = lambda: states + 0.0, True, None
+    states[:, 0] = states_s
+    bench(*DOCTOR, title="little is well")
+    bench.renew()
+    bench.arm.emergency_stop, bench.arm.force_n = True, 3.26
+    rig = RIG.model_copy(update={"tcp_mm": (0.0, 0.0, 149.0), "max_force_n": None})
+    Path("rig.toml").write_text(rig_toml(rig, PAD.grid))
+    bench(*DOCTOR, "--json", title="another tip, and nobody watches the force")
+    bench.renew()
+    bench.board.lost = bench.arm.lost = True
+    bench(*DOCTOR, title="both are gone")
+    assert bench.arm.moves == []
+    golden("rig/doctor.txt", "\n".join(bench.transcript))
 
 
 @pytest.fixture
@@ -178,56 +281,13 @@ def test_record_by_hand(padforge_sense, finger: Finger, monkeypatch: pytest.Monk
     assert "never written over" in err
 
 
-def test_doctor_examines_each_device_without_the_other(padforge_sense) -> None:
-    Path("rig.toml").write_text(
-        '[rig]\nport = "no-such-port"\nprinter_port = "neither"\npad_mm = [0, 0]\ncontact_mm = 9\n'
-        "box_mm = [-9, 9, -9, 9, 0, 99]\n"
-    )
-    code, out, err = padforge_sense("doctor", "--rig", "printer", "--spec", "rig.toml")
-    assert (code, err) == (1, "")
-    assert "fail board: no-such-port: there is no such port" in out
-    assert "fail arm: neither: there is no such port" in out
-    assert "fail place: [rig] tcp_mm is unknown" in out
-    Path("rig.toml").write_text('[rig]\nport = "it"\nprinter_port = "it"\n')
-    assert (
-        "fail arm: [rig] port and printer_port are the same, it"
-        in padforge_sense("doctor", "--rig", "printer", "--spec", "rig.toml")[1]
-    )
-
-
-@EMULATED
-@pytest.mark.slow
-@pytest.mark.usefixtures("finger")
-def test_doctor_examines_the_board_alone(padforge_sense) -> None:
-    code, out, _ = padforge_sense("doctor")
-    assert code == 0
-    assert "name emulated" in out
-    assert "arm" not in out
-
-
-def test_doctor_prints_a_line_a_finding_and_ends_as_they_are(padforge_sense, monkeypatch: pytest.MonkeyPatch) -> None:
-    said = [Diagnosis("board", "ok", "name it"), Diagnosis("rate", "warn", "slow")]
-    examined = Mock(return_value=said)
-    monkeypatch.setattr(operation, "diagnose", examined)
-    Path("rig.toml").write_text("[pad]\ngrid = 2\n[rig]\nchannels = [3, 1, 4, 0]\n")
-    assert padforge_sense("doctor", "--rig", "ur5", "--spec", "rig.toml") == (
-        0,
-        "ok   board: name it\nwarn rate: slow\n",
-        "",
-    )
-    kind, _, inputs = examined.call_args.args
-    assert (kind, list(inputs)) == ("ur5", [3, 1, 4, 0])
-    said.append(Diagnosis("arm", "fail", "gone"))
-    code, out, _ = padforge_sense("doctor", "--rig", "hand", "--spec", "rig.toml", "--json")
-    assert (code, json.loads(out)["passed"]) == (1, False)
-    assert json.loads(out)["diagnoses"][2] == {"name": "arm", "status": "fail", "message": "gone"}
-    assert examined.call_args.args[0] == "hand"
-
-
-def test_record_by_hand_takes_no_arm(padforge_sense) -> None:
-    PAD.save("pad.json")
-    Path("model").mkdir()
-    for words in (("--dry-run",), ("--model", "model")):
-        code, out, err = padforge_sense("record", "--rig", "hand", "--morphology", "pad.json", *words)
-        assert (code, out) == (2, "")
-        assert err == "padforge: --dry-run and --model need an arm, allowed with --rig hand are --plan and --resume\n"
+def test_doctor_examines_each_device_without_the_other(padforge_sense, golden, monkeypatch) -> None:
+    monkeypatch.setattr(operation, "host_ports", list)
+    said = []
+    for ports in ('port = "no-such-port"\nprinter_port = "neither"', 'port = "it"\nprinter_port = "it"'):
+        places = "pad_mm = [0, 0]\ncontact_mm = 9\nbox_mm = [-9, 9, -9, 9, 0, 99]"
+        Path("rig.toml").write_text(f"[rig]\n{ports}\n{places}\n")
+        code, out, err = padforge_sense("doctor", "--rig", "printer", "--spec", "rig.toml")
+        assert (code, err) == (1, "")
+        said.append(out)
+    golden("rig/doctor_printer.txt", "\n".join(said))

@@ -109,8 +109,8 @@ def test_a_night_without_readings_makes_few_frames() -> None:
     np.testing.assert_allclose(frames.times_s[frames.down_command], times_s[[300, 1300]], atol=FRAME_S)
 
 
-def test_more_readings_of_the_same_locate_alike(localizer: LocalizerModel, recording: Recording) -> None:
-    once, often = repeated(recording, 1), repeated(recording, 6)
+def test_more_readings_of_the_same_locate_alike(localizer: LocalizerModel, brief: Recording) -> None:
+    once, often = repeated(brief, 1), repeated(brief, 6)
     at_once, at_often = localizer.predict(once), localizer.predict(often)
     np.testing.assert_allclose(at_often.positions_mm, at_once.positions_mm, atol=1e-4)
     np.testing.assert_allclose(at_often.r90_mm, at_once.r90_mm, atol=1e-4)

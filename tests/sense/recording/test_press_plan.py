@@ -1,11 +1,8 @@
 """Press plans of each kind over any pad, and from files."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
-from padforge import InputError
 from padforge.common.settings import validate
 from padforge.design import Morphology
 from padforge.design.settings import PadSettings
@@ -72,42 +69,9 @@ def test_make_plan_grid_has_one_step_along_both_axes(counts: tuple[int, int]) ->
             assert steps[0].mean() == pytest.approx(steps[1].mean(), rel=0.1)
 
 
-def test_make_plan_refuses_a_file_that_presses_a_keep_out(tmp_path: Path) -> None:
-    size = PadSettings(horizontals=3, verticals=2, pitch_mm=(8.0, 15.0), keep_out_mm=(KEEP_OUT,))
-    (tmp_path / "plan.csv").write_text("x_mm,y_mm\n-3,2\n4,1\n")
-    with pytest.raises(InputError, match=r"plan\.csv: press 2, at \(4, 1\) mm, lies in a keep-out"):
-        plan_of(size, plan=str(tmp_path / "plan.csv"))
-    everything = ((-20.0, -40.0), (20.0, -40.0), (20.0, 40.0), (-20.0, 40.0))
-    with pytest.raises(InputError, match=r"keep_out_mm leaves 0\.0% of what is pressed"):
-        plan_of(size.model_copy(update={"keep_out_mm": (everything,)}))
-
-
 @pytest.mark.parametrize("plan", ["grid", "serpentine"])
 def test_make_plan_depths_do_not_depend_on_the_position(plan):
     plan_ = plan_of(presses=361, plan=plan, depths_mm=[0.5, 1, 2, 3, 5])
     for axis in (0, 1):
         for value in np.unique(plan_.positions_mm[:, axis]):
             assert len(set(plan_.depths_mm[plan_.positions_mm[:, axis] == value])) == 5
-
-
-def test_make_plan_depths_alternate_along_rows_that_begin_with_the_next(tmp_path):
-    """A serpentine has the depths of the columns, whichever way it goes."""
-    grid, serpentine = (plan_of(presses=9, plan=kind, depths_mm=[1.0, 2.0, 3.0]) for kind in ("grid", "serpentine"))
-    assert grid.depths_mm.tolist() == [1, 2, 3, 2, 3, 1, 3, 1, 2]
-    assert serpentine.depths_mm.tolist() == [1, 2, 3, 1, 3, 2, 3, 1, 2]
-    assert plan_of(presses=5, plan="uniform", depths_mm=[1.0, 2.0]).depths_mm.tolist() == [1, 2, 1, 2, 1]
-
-
-@pytest.mark.parametrize(
-    ("content", "line"),
-    [
-        ("x,y\n1,2\n", "header"),
-        ("x_mm,y_mm,depth_mm\n1,2,-1\n", "depth -1 mm"),
-    ],
-)
-def test_read_plan_refuses_other_files(tmp_path, content, line):
-    (tmp_path / "plan.csv").write_text(content)
-    with pytest.raises(InputError, match=line) as refusal:
-        read_plan(tmp_path / "plan.csv", (3.0,))
-    assert "plan.csv" in str(refusal.value)
-    assert "\n" not in str(refusal.value)

@@ -1,6 +1,5 @@
 """Recordings and their run directory."""
 
-import json
 import tracemalloc
 from dataclasses import replace
 from pathlib import Path
@@ -9,7 +8,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from padforge.common.validation import InputError
 from padforge.sense import Recorder, Recording
 
 
@@ -30,56 +28,17 @@ def test_save_and_open_round_trip_and_torn_readings(recording: Recording, folder
     assert np.array_equal(opened.readings, recording.readings[: len(opened.readings)])
 
 
-def test_save_refuses_existing_and_unwritable_paths(recording: Recording, folder: Path, tmp_path: Path) -> None:
-    before = {path.name: path.read_bytes() for path in folder.iterdir()}
-    with pytest.raises(InputError, match="never written over"):
-        recording.save(folder, {})
-    assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
+def test_save_fills_an_empty_folder(recording: Recording, tmp_path: Path) -> None:
     (tmp_path / "empty").mkdir()
     recording.save(tmp_path / "empty", {})
     assert Recording.open(tmp_path / "empty") == recording
-    (tmp_path / "file").write_text("content")
-    for path in (tmp_path / "file", tmp_path / "file" / "below" / "run"):
-        for write in (lambda path: recording.save(path, {}), lambda path: Recorder(path, 3, {}, {})):
-            with pytest.raises(InputError, match="file is a file, expected a folder"):
-                write(path)
-    with pytest.raises(InputError, match=r"cannot be written \(File name too long\)"):
-        recording.save(tmp_path / ("n" * 300), {})
-    assert (tmp_path / "file").read_text() == "content"
-    assert {entry.name for entry in tmp_path.iterdir()} == {"run", "empty", "file"}
-
-
-@pytest.mark.parametrize("change", [{"fibres": 513}, {"source": [1]}, {"format": "padforge-recording/0"}])
-def test_open_refuses_other_values_in_the_start_document(folder: Path, change: dict[str, object]) -> None:
-    document = json.loads((folder / "start.json").read_text())
-    (folder / "start.json").write_text(json.dumps(document | change))
-    with pytest.raises(InputError, match=f"{next(iter(change))} is"):
-        Recording.open(folder)
+    assert [entry.name for entry in tmp_path.iterdir()] == ["empty"]
 
 
 def with_value(array: np.ndarray, index: Any, value: float) -> np.ndarray:
     array = array.copy()
     array[index] = value
     return array
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        (lambda r: {"readings": np.full_like(r.readings, np.nan)}, "readings are all missing"),
-        (lambda r: {"presses_mm": with_value(r.presses_mm, (3, 1), np.nan)}, "press 3 has one of x and y"),
-        (lambda r: {"times_s": with_value(r.times_s, 9, 0.0)}, "do not ascend at reading 9"),
-        (lambda r: {"down_command": with_value(r.down_command, 2, 70)}, "press 2 goes from"),
-        (lambda r: {"up_command": with_value(r.up_command, -1, len(r.readings) + 1)}, "press 299 goes from"),
-        (lambda r: {"forces_n": np.full(300, -1.0)}, "forces_n of press 0 is -1 N, allowed is 0 or more"),
-        (lambda r: {"readings": with_value(r.readings, (7, 0), -1e30)}, r"readings hold -1e\+30 V \(first in row 7\)"),
-        (lambda r: {"source": {"gain": np.nan}}, "source is .*expected what JSON can hold"),
-    ],
-)
-def test_recording_refuses_invalid_arrays(recording: Recording, change, message: str) -> None:
-    with pytest.raises(InputError, match=message) as caught:
-        replace(recording, **change(recording))
-    assert "\n" not in str(caught.value)
 
 
 def test_equality_and_digest_treat_all_nan_alike(recording: Recording) -> None:
@@ -103,16 +62,6 @@ def test_recording_accepts_limits_and_uneven_times(recording: Recording, tmp_pat
     least = Recording(np.ones((2, 1)), np.arange(2.0), np.full((1, 2), np.nan), np.array([1]), np.array([2]))
     least.save(tmp_path / "run", {})
     assert Recording.open(tmp_path / "run") == least
-
-
-def test_open_refuses_other_folders(folder: Path, tmp_path: Path) -> None:
-    for path in (tmp_path / "absent", tmp_path, folder / "start.json"):
-        with pytest.raises(InputError, match=r"no recording, expected a folder with start\.json, journal\.ndjson and"):
-            Recording.open(path)
-    (folder / "journal.ndjson").unlink()
-    (folder / "journal.ndjson").mkdir()
-    with pytest.raises(InputError, match=r"journal\.ndjson: cannot be read \(Is a directory\)"):
-        Recording.open(folder)
 
 
 def test_measures_are_saved_but_not_in_the_digest(recording: Recording, tmp_path: Path) -> None:

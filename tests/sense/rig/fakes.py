@@ -1,4 +1,4 @@
-"""An arm and a board in virtual time, on one simulated pad: minutes of pressing take moments."""
+"""An arm and a board in virtual time, on a pad of a formula: minutes of pressing take moments."""
 
 from collections.abc import Callable
 from contextlib import AbstractContextManager
@@ -10,13 +10,11 @@ import pytest
 from numpy.typing import NDArray
 
 from padforge.design import Morphology
-from padforge.design.settings import PUBLISHED_CONTACT
 from padforge.sense.recording.run_directory import STATE_COLUMNS
 from padforge.sense.rig import clock
 from padforge.sense.rig.config import RobotFrame
 from padforge.sense.rig.devices import ArmState, BoardSamples, Pose, RigFault
 from padforge.sense.settings import RigSettings
-from padforge.sense.simulation.pad_model import LivePad
 
 PAD = Morphology.straight(2)
 FIBRES = 4
@@ -111,12 +109,25 @@ class FakeArm:
             self._from = None
 
 
-class FakeBoard:
-    """Samples the simulated pad under a fake arm; samples may be lost, and the board may stall or vanish."""
+class FakePad:
+    """Four fibres at rest from 1.8 to 2.1 V, which read up to 50 mV less for each mm of depth, the nearer the more."""
 
-    def __init__(self, arm: FakeArm, rig: RigSettings = RIG, pad: Morphology = PAD) -> None:
+    def __init__(self) -> None:
+        self._rng = np.random.default_rng(1)
+
+    def volts(self, positions_mm: NDArray[np.float64], depths_mm: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the (n, 4) readings, V, with a noise of 2 mV, at (n, 2) positions and (n,) depths."""
+        away_mm = positions_mm[:, [1, 1, 0, 0]] - np.array([-5.6, 5.6, -5.6, 5.6])
+        rest_v = np.array([1.8, 1.9, 2.0, 2.1]) + 0.002 * self._rng.standard_normal((len(depths_mm), FIBRES))
+        return rest_v - 0.05 * np.maximum(depths_mm, 0.0)[:, None] * np.exp(-np.abs(away_mm) / 10)
+
+
+class FakeBoard:
+    """Samples the pad under a fake arm; samples may be lost, and the board may stall or vanish."""
+
+    def __init__(self, arm: FakeArm, rig: RigSettings = RIG) -> None:
         self.arm, self.rig, self.frame = arm, rig, RobotFrame.from_settings(rig)
-        self.model = LivePad(pad, PUBLISHED_CONTACT, rig, rig.board_rate_hz, np.random.default_rng(1))
+        self.volts = FakePad().volts
         self.rate_hz, self.taken_s = rig.board_rate_hz, arm.time()
         self.lose = 0
         self.lost = self.stalled = False
@@ -138,7 +149,7 @@ class FakeBoard:
         if len(times):
             missing[0] = skipped
         positions, depths = self.frame.tip(self.arm.pose_at(times))
-        return BoardSamples(times, self.model.volts(positions, depths), missing)
+        return BoardSamples(times, self.volts(positions, depths), missing)
 
     def close(self) -> None:
         pass

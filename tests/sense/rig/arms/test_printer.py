@@ -1,6 +1,7 @@
 """The printer as an arm, and its numbered lines, through a real pseudo-terminal against the emulated firmware."""
 
 import os
+import re
 from collections.abc import Iterator
 from contextlib import closing, contextmanager, suppress
 from typing import Any
@@ -53,12 +54,9 @@ def to_rest(arm: Printer) -> ArmState:
     return state
 
 
-def test_connect_reports_identity_and_axis_limits():
+def test_moves_keep_to_the_limits_of_the_axes():
     with EmulatedPrinter(AT) as printer, closing(driven(printer)) as arm:
-        identity = arm.connect()
-        assert identity["firmware"].startswith("Marlin")
-        assert identity["halts_at_once"]
-        assert identity["max_mm_s"] == [500.0, 500.0, 15.0]
+        arm.connect()
         state = arm.state()
         assert state.pose == pytest.approx(pose(110, 110, 40))
         assert (state.moving, state.force_n) == (False, None)
@@ -66,6 +64,30 @@ def test_connect_reports_identity_and_axis_limits():
         to_rest(arm)
         move = printer.firmware.moves[-1].move
         assert (move.speed, move.acceleration) == pytest.approx((15, 50), rel=1e-3)
+
+
+def test_printer_is_told_this_in_g_code(golden, monkeypatch):
+    """From connecting to closing; questions that are asked again and again are left out."""
+    told: list[str] = []
+    receive = firmware.Firmware.receive
+
+    def noted(self: firmware.Firmware, data: bytes, now_s: float) -> None:
+        told.extend(re.sub(r"^N\d+ |\*\d+$", "", line) for line in data.decode("ascii").splitlines() if line.strip())
+        receive(self, data, now_s)
+
+    monkeypatch.setattr(firmware.Firmware, "receive", noted)
+    with EmulatedPrinter(AT) as printer, closing(driven(printer)) as arm:
+        identity = dict(arm.connect()) | {"port": "<port>"}
+        for end, speed_mm_s in ((pose(112.5, 105.25, 40), 150.0), (pose(112.5, 105.25, 38.125), 10.5)):
+            told.append("# move")
+            arm.move(end, speed_mm_s, 500.0)
+            to_rest(arm)
+        told.append("# stop")
+        arm.move(pose(110, 110, 60), 20.0, 500.0)
+        arm.stop()
+    once = [line for before, line in zip(["", *told], told, strict=False) if line not in (before, "M114", "M114 R")]
+    golden("rig/gcode.txt", "\n".join(once))
+    golden("rig/printer.json", identity)
 
 
 @pytest.mark.parametrize("realtime", [pytest.param(True, marks=pytest.mark.slow), False])

@@ -1,6 +1,5 @@
 """The arm behind the real ur-rtde: what it does, and that it rests after a fault."""
 
-import importlib.util
 import os
 import signal
 import socket
@@ -146,14 +145,6 @@ def test_connect_refuses_unavailable_arm(robots: Any, host: str) -> None:
         refused_until_cured(arm, robot.protective_stop, "protective_stop", robot.clear)
         refused_until_cured(arm, robot.emergency_stop, "emergency_stop", robot.clear)
         arm.connect()
-
-
-def test_connect_without_ur_rtde_says_where_it_has_wheels(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
-    message = "ur-rtde, which moves the arm, is not installed; it has wheels for Linux on x86-64 and Windows, Python 3"
-    with pytest.raises(RigFault, match=message) as refused:
-        UR5("192.0.2.1").connect()
-    assert refused.value.exit_code == 2
 
 
 @pytest.mark.slow
