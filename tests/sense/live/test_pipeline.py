@@ -302,10 +302,12 @@ def test_view_follows_the_pad(recording, hasty, monkeypatch) -> None:
     assert press["text"].endswith(f" mm at 90 % ({press['moment_text']})")
 
 
-def test_view_has_presses_with_their_words_and_faults(recording, hasty, golden: Golden) -> None:
+def test_view_has_presses_with_their_words_and_faults(recording, hasty, golden: Golden, monkeypatch) -> None:
     """Of a pad whose second fibre has failed, in the press, and once it turns out to be another pad."""
     part, down = first_presses(recording, 2), int(recording.down_command[0]) + 15
-    live, _ = replay(replace(part, readings=part.readings[:down], times_s=part.times_s[:down]), hasty)
+    monkeypatch.setattr("padforge.sense.live.pipeline.PressDetector", ScriptedDetector(part))
+    live = Live(hasty, rate_hz=part.rate_hz)
+    live.feed(part.times_s[:down], part.readings[:down])
     live.presses.clear()
     live.presses.extend(event for event in EVENTS if isinstance(event, Estimate))
     live.track.clear()
