@@ -11,13 +11,15 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from padforge.design import Morphology, press_forces_n
+from padforge.design import Contact, Morphology, press_forces_n
+from padforge.design.settings import Scatter
 from padforge.sense import Recording
 from padforge.sense.studies.drift import AS_PUBLISHED, COMPENSATIONS, FILTERS, drift_study
 from padforge.sense.studies.fibre_loss import FibreLoss, MethodErrors, draw_fibre_loss, fibre_loss_lines
 from padforge.sense.studies.indentation import SETS, force_study, shape_study
 from padforge.sense.studies.learning_curve import LearningCurve, draw_learning_curve, learning_curve_lines
 from padforge.sense.studies.multicontact import COUNTING, METHODS, multicontact_study
+from padforge.sense.studies.press_model import PressModel
 from padforge.sense.studies.robustness import SIDE, robustness_study
 from padforge.sense.studies.scaling import scaling_study
 from padforge.sense.studies.sensitivity import sensitivity_study
@@ -111,7 +113,8 @@ def strokes() -> Results:
 
 def scaling() -> Results:
     """Presses in all cells of a map, whose errors grow along x, and less along y, and shrink from task to task."""
-    study = scaling_study({"square": PADS["square"], "bent": Morphology.random(4, 2, 0)}, grids=(4, 8))
+    pads = {"square": PADS["square"], "bent": Morphology.random(4, 2, 0)}
+    study = scaling_study(pads, grids=(4, 8), press_model=PressModel(Contact(), Scatter(0.02, 0.18, 0.36)))
     x_y = np.stack(np.meshgrid(np.arange(16) + 0.5, np.arange(16) + 0.5), axis=-1).reshape(-1, 2) / 16
     states = []
     for number in range(len(study.tasks)):
