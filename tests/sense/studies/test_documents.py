@@ -70,7 +70,7 @@ def drift() -> Results:
 def force() -> Results:
     """Six presses from 1 to 5 mm, predicted to be deeper by a tenth, and 0.1 to 0.3 units away in x."""
     study = force_study({"square": PADS["square"]})
-    depth = np.array([1.0, 1.5, 2.0, 3.0, 4.0, 5.0])
+    depth = np.array([1.0, 1.5, 2.0, 3.0, 4.5, 5.0])
     pressed, states = np.column_stack([np.full((6, 2), 1.5), depth]), []
     for noise in (1.0, 2.0):
         for shift, columns in ((0.3, 3), (0.2, 2), (0.1, 3)):
@@ -262,12 +262,12 @@ def test_rows_of_drift() -> None:
 
 def test_rows_of_force() -> None:
     """The deepest press is predicted to be as deep as presses are at most."""
-    row, depth = row_of("force", noise_counts=1.0), np.array([1.0, 1.5, 2.0, 3.0, 4.0, 5.0])
+    row, depth = row_of("force", noise_counts=1.0), np.array([1.0, 1.5, 2.0, 3.0, 4.5, 5.0])
     positions_mm = numbers(row, "position_mm", "position_depth_known_mm", "position_one_depth_mm")
     assert positions_mm == pytest.approx(UNIT_MM * np.array([0.15, 0.1, 0.05]))
     predicted = np.minimum(1.1 * depth, 5.0)
     force, predicted_n, middle_n = (press_forces_n(np.atleast_1d(each)) for each in (depth, predicted, 3.0))
-    assert numbers(row, "depth_mm", "depth_guessed_mm") == pytest.approx([(predicted - depth).mean(), 7.5 / 6])
+    assert numbers(row, "depth_mm", "depth_guessed_mm") == pytest.approx([(predicted - depth).mean(), 8 / 6])
     error_n, guess_n, range_n = (predicted_n - force).mean(), np.abs(middle_n - force).mean(), force[-1] - force[0]
     expected = [error_n, 100 * error_n / range_n, 100 * guess_n / range_n]
     assert numbers(row, "force_n", "force_percent", "force_guessed_percent") == pytest.approx(expected)
