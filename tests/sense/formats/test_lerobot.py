@@ -30,14 +30,10 @@ def eight(eight: Recording) -> Recording:
 def check_dataset(folder: Path) -> tuple[dict[str, Any], dict[str, np.ndarray], list[dict[str, Any]]]:
     """Check a dataset; return its info, columns and episodes."""
     info = json.loads((folder / "meta" / "info.json").read_text())
-    assert (info["codebase_version"], info["video_path"], info["fps"] > 0) == ("v3.0", None, True)
-    assert info["data_path"] == "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
     assert {name: info["features"][name]["dtype"] for name in COUNTED} == COUNTED
     episodes = pq.read_table(sorted((folder / "meta" / "episodes").glob("*/*.parquet"))).to_pylist()
-    assert info["splits"] == {"train": f"0:{len(episodes)}"}
     tasks = pq.read_table(folder / "meta" / "tasks.parquet")
     assert json.loads(tasks.schema.metadata[b"pandas"])["index_columns"] == ["task"]  # pandas has the text as index
-    assert tasks["task_index"].to_pylist() == [0]
     columns = read_columns(folder, info, episodes)
     assert columns["index"].tolist() == list(range(info["total_frames"]))
     end = 0

@@ -73,19 +73,6 @@ def test_import_mat_reads_matlab_7_3(tmp_path: Path) -> None:
     assert import_mat(new) == import_mat(tmp_path / "old.mat")
 
 
-def test_import_mat_by_columns(tmp_path: Path) -> None:
-    content = published_content()
-    pressed = np.arange(120) % 40 >= 20
-    lab = {"t": 1000 * content["tim"], "U": content["voltage"].T, "c": pressed[None] * 1.0, "P": content["pos"] / 10}
-    mapping = "time=t:ms,fibres=U,press=c,positions=P:cm"
-    scipy.io.savemat(tmp_path / "old.mat", lab)
-    for path in (tmp_path / "old.mat", write_hdf5_mat(tmp_path / "new.mat", lab)):
-        recording = import_mat(path, mapping)
-        assert np.array_equal(recording.readings, content["voltage"])
-        np.testing.assert_allclose(recording.presses_mm, content["pos"].T)
-        assert recording.down_command.tolist() == [20, 60, 100]
-
-
 @pytest.mark.parametrize(
     ("name", "value", "message"),
     [

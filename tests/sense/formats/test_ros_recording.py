@@ -254,17 +254,6 @@ def test_import_bag_holds_values_of_scalar_topics(tmp_path: Path) -> None:
     np.testing.assert_allclose(imported.presses_mm, np.column_stack([middle - 1, 1000 * (middle // 2 % 7)]))
 
 
-def test_import_bag_orders_topics_by_their_numbers(tmp_path: Path) -> None:
-    """Bags list topics as they were discovered."""
-    for folder, order in (("one", [10, 2, 1]), ("other", [1, 10, 2])):
-        messages = [(f"/skin/{i}", t / 10, make("Float64", float(i))) for t in range(30) for i in order]
-        pressed = [("/down", t / 10 + 1e-3, make("Bool", t == 9)) for t in (9, 15)]
-        bag = write_bag(tmp_path / folder, sorted([*messages, *pressed], key=lambda message: message[1]))
-        imported = import_bag(bag, "fibres=/skin/*,press=/down")
-        assert imported.fibre_names == ("/skin/1", "/skin/2", "/skin/10")
-        assert imported.readings[1].tolist() == [1, 2, 10]
-
-
 def test_import_bag_refuses_changing_lengths_and_empty_topics(tmp_path: Path) -> None:
     messages = {"other": array("Float64MultiArray", np.ones(3)), "none": array("Float64MultiArray", np.ones(0))}
     for name, message in messages.items():

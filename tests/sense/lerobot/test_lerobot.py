@@ -82,10 +82,6 @@ def test_lerobot_opens_exported_datasets(lerobot: Run, brief: Recording, tmp_pat
     index = np.arange(len(readings))
     np.testing.assert_allclose(frames["timestamp"] * 13, index - np.append(0, ends[:-1])[episodes], atol=1e-3)
     is_over = index >= brief.up_command[episodes]
-    is_down = (index >= brief.down_command[episodes]) & ~is_over
-    assert read["features"]["action"] == ["x_mm", "y_mm", "down"]
-    np.testing.assert_allclose(frames["action"], np.column_stack([brief.presses_mm[episodes], is_down]), rtol=1e-6)
-    np.testing.assert_allclose(frames["observation.force"], np.where(is_down, forces[episodes], 0), rtol=1e-6)
     touch = np.column_stack([-brief.presses_mm[episodes], r90[episodes], np.ones(len(index))])
     np.testing.assert_allclose(frames["observation.touch"], np.where(is_over[:, None], touch, 0), rtol=1e-6)
     statistics = read["stats"]["observation.state"]

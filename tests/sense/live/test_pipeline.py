@@ -17,7 +17,9 @@ from padforge.sense.health.fault_detector import FibreFault
 from padforge.sense.live.pipeline import MAX_TRACK, RELEASE, Estimate, Live
 from padforge.sense.localizer.model import Localization, LocalizerModel
 from padforge.sense.signals.press_detection import PressEvent
+from tests.helpers.golden import Golden, json_text
 from tests.sense.conftest import QUICK, few_moments, first_presses
+from tests.sense.live.test_messages import EVENTS
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -298,6 +300,22 @@ def test_view_follows_the_pad(recording, hasty, monkeypatch) -> None:
     (press,) = live.view()["presses"]
     assert press["moment_text"] == f"{press['since_s']:.2f} s after the lift"
     assert press["text"].endswith(f" mm at 90 % ({press['moment_text']})")
+
+
+def test_view_has_presses_with_their_words_and_faults(recording, hasty, golden: Golden, monkeypatch) -> None:
+    """Of a pad whose second fibre has failed, in the press, and once it turns out to be another pad."""
+    part, down = first_presses(recording, 2), int(recording.down_command[0]) + 15
+    monkeypatch.setattr("padforge.sense.live.pipeline.PressDetector", ScriptedDetector(part))
+    live = Live(hasty, rate_hz=part.rate_hz)
+    live.feed(part.times_s[:down], part.readings[:down])
+    live.presses.clear()
+    live.presses.extend(event for event in EVENTS if isinstance(event, Estimate))
+    live.track.clear()
+    live.track.extend(live.presses)
+    live.faults.extend(event for event in EVENTS if isinstance(event, FibreFault))
+    view = live.view()
+    live.is_other_pad = True
+    golden("live/view.json", json_text([view, live.view()["faults"]]))
 
 
 def test_track_has_the_places_that_a_finger_has_moved_to(recording, hasty, monkeypatch) -> None:

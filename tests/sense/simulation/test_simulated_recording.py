@@ -18,6 +18,7 @@ from padforge.sense.simulation.simulated_recording import (
     model_like_twin,
     model_twin,
 )
+from tests.helpers.golden import Golden, json_text
 from tests.helpers.rigs import ideal_rig, quiet_rig
 
 GRID = Morphology.straight(4)
@@ -53,6 +54,16 @@ def test_simulate_has_the_published_protocol() -> None:
     strip = simulate(GRID, RigSettings(presses=400), size=PadSettings(sensed_mm=(50, 8)))
     assert strip.source["sensed_mm"] == [50, 8]
     np.testing.assert_allclose(np.abs(strip.presses_mm).max(axis=0), [25, 4], rtol=0.02)
+
+
+def test_source_and_readings_of_a_simulated_recording(golden: Golden) -> None:
+    recording = simulate(PAD, RigSettings(presses=3, seed=1))
+    shown = {"source": dict(recording.source)} | {
+        name: np.round(getattr(recording, name), 4)
+        for name in ("presses_mm", "down_command", "up_command", "depths_mm")
+    }
+    shown |= {"times_s": recording.times_s[:4], "readings_v": np.round(recording.readings[15::20], 4)}
+    golden("simulation/recording.json", json_text(shown))
 
 
 def test_simulate_presses_as_deep_as_the_contact_unless_the_rig_says_otherwise() -> None:

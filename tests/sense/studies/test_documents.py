@@ -11,13 +11,15 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from padforge.design import Morphology, press_forces_n
+from padforge.design import Contact, Morphology, press_forces_n
+from padforge.design.settings import Scatter
 from padforge.sense import Recording
 from padforge.sense.studies.drift import AS_PUBLISHED, COMPENSATIONS, FILTERS, drift_study
 from padforge.sense.studies.fibre_loss import FibreLoss, MethodErrors, draw_fibre_loss, fibre_loss_lines
 from padforge.sense.studies.indentation import SETS, force_study, shape_study
 from padforge.sense.studies.learning_curve import LearningCurve, draw_learning_curve, learning_curve_lines
 from padforge.sense.studies.multicontact import COUNTING, METHODS, multicontact_study
+from padforge.sense.studies.press_model import PressModel
 from padforge.sense.studies.robustness import SIDE, robustness_study
 from padforge.sense.studies.scaling import scaling_study
 from padforge.sense.studies.sensitivity import sensitivity_study
@@ -68,7 +70,7 @@ def drift() -> Results:
 def force() -> Results:
     """Six presses from 1 to 5 mm, predicted to be deeper by a tenth, and 0.1 to 0.3 units away in x."""
     study = force_study({"square": PADS["square"]})
-    depth = np.array([1.0, 1.5, 2.0, 3.0, 4.0, 5.0])
+    depth = np.array([1.0, 1.5, 2.0, 3.0, 4.5, 5.0])
     pressed, states = np.column_stack([np.full((6, 2), 1.5), depth]), []
     for noise in (1.0, 2.0):
         for shift, columns in ((0.3, 3), (0.2, 2), (0.1, 3)):
@@ -111,7 +113,8 @@ def strokes() -> Results:
 
 def scaling() -> Results:
     """Presses in all cells of a map, whose errors grow along x, and less along y, and shrink from task to task."""
-    study = scaling_study({"square": PADS["square"], "bent": Morphology.random(4, 2, 0)}, grids=(4, 8))
+    pads = {"square": PADS["square"], "bent": Morphology.random(4, 2, 0)}
+    study = scaling_study(pads, grids=(4, 8), press_model=PressModel(Contact(), Scatter(0.02, 0.18, 0.36)))
     x_y = np.stack(np.meshgrid(np.arange(16) + 0.5, np.arange(16) + 0.5), axis=-1).reshape(-1, 2) / 16
     states = []
     for number in range(len(study.tasks)):
@@ -259,12 +262,12 @@ def test_rows_of_drift() -> None:
 
 def test_rows_of_force() -> None:
     """The deepest press is predicted to be as deep as presses are at most."""
-    row, depth = row_of("force", noise_counts=1.0), np.array([1.0, 1.5, 2.0, 3.0, 4.0, 5.0])
+    row, depth = row_of("force", noise_counts=1.0), np.array([1.0, 1.5, 2.0, 3.0, 4.5, 5.0])
     positions_mm = numbers(row, "position_mm", "position_depth_known_mm", "position_one_depth_mm")
     assert positions_mm == pytest.approx(UNIT_MM * np.array([0.15, 0.1, 0.05]))
     predicted = np.minimum(1.1 * depth, 5.0)
     force, predicted_n, middle_n = (press_forces_n(np.atleast_1d(each)) for each in (depth, predicted, 3.0))
-    assert numbers(row, "depth_mm", "depth_guessed_mm") == pytest.approx([(predicted - depth).mean(), 7.5 / 6])
+    assert numbers(row, "depth_mm", "depth_guessed_mm") == pytest.approx([(predicted - depth).mean(), 8 / 6])
     error_n, guess_n, range_n = (predicted_n - force).mean(), np.abs(middle_n - force).mean(), force[-1] - force[0]
     expected = [error_n, 100 * error_n / range_n, 100 * guess_n / range_n]
     assert numbers(row, "force_n", "force_percent", "force_guessed_percent") == pytest.approx(expected)

@@ -12,7 +12,7 @@ from padforge.sense import Recording, evaluate
 from padforge.sense.localizer.model import LocalizerModel
 from padforge.sense.studies import fibre_loss
 from padforge.sense.studies.fibre_loss import ONE, RETRAINED, MethodErrors, fibre_loss_study
-from tests.helpers.door import Ended, call
+from tests.helpers.door import called
 
 
 @pytest.fixture(autouse=True)
@@ -73,22 +73,13 @@ def test_retraining_ignores_failed_fibres_and_test_positions(recording: Recordin
     assert moved.errors[0]["mean_mm"] == pytest.approx(centre, abs=30)
 
 
-@pytest.fixture
-def here(localizer: LocalizerModel, recording: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The current folder holds a `model` and a recording `rec`."""
+def test_fibre_loss_command_writes_document_and_figure(
+    localizer: LocalizerModel, recording: Recording, tmp_path: Path
+) -> None:
     localizer.save(tmp_path / "model")
     recording.save(tmp_path / "rec", {})
-    monkeypatch.chdir(tmp_path)
-
-
-def call_fibre_loss(*arguments: str) -> Ended:
-    return call("sense", "fibre-loss", "rec", *arguments)
-
-
-@pytest.mark.usefixtures("here")
-def test_fibre_loss_command_writes_document_and_figure() -> None:
-    options = "--model model --retrain --max-failures 1 --failed 2,4 --out out --json"
-    ended = call_fibre_loss(*options.split())
+    options = "--model model --max-failures 1 --failed 2,4 --out out --json"
+    ended = called("sense", "fibre-loss", "rec", *options.split(), cwd=tmp_path)
     assert (ended.code, json.loads(ended.out)["methods"][ONE]["maps"][-1]["failed"]) == (0, [1, 3])
-    assert json.loads(ended.out) == json.loads(Path("out", "fibre_loss.json").read_text())
-    assert sorted(path.name for path in Path("out").iterdir()) == ["fibre_loss.json", "fibre_loss.png"]
+    assert json.loads(ended.out) == json.loads((tmp_path / "out/fibre_loss.json").read_text())
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["fibre_loss.json", "fibre_loss.png"]

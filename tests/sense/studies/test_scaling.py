@@ -50,12 +50,3 @@ def test_scaling_study_rejects_tiles_that_do_not_repeat() -> None:
         scaling_study({"square": Morphology.straight(4)}, grids=(4, 6))
     with pytest.raises(InputError, match=r"wide has 1 \+ 2 fibres, pitch 8 mm, expected tiles of M \+ M fibres"):
         scaling_study({"wide": Morphology.straight((1, 2), 8.0)}, grids=(4,))
-
-
-def test_scaling_study_maps_errors_by_x_along_rows_and_y_up_columns() -> None:
-    study = scaling_study({"square": Morphology.straight(2)}, grids=(4,))
-    corners = np.array([[4.0, 1.0], [1.0, 4.0], [4.0, 4.0]])
-    state = {"errors": np.array([3.0, 1.0, 2.0]), "positions": corners, "seconds": np.ones(()), "epochs": np.ones(())}
-    (panel,) = study.conclude([state] * len(study.tasks)).extra["maps"]
-    errors = np.array(panel["errors"])
-    assert (errors[0, -1], errors[-1, 0], errors[-1, -1], errors.sum()) == (3.0, 1.0, 2.0, 6.0)

@@ -30,7 +30,6 @@ from padforge.sense.studies.study import (
     Study,
     StudyResult,
     Task,
-    classification_scores,
     compute_states,
     fit_and_predict,
     load_pads,
@@ -229,13 +228,3 @@ def test_read_counts_gives_whole_counts_up_to_full_scale_of_the_training() -> No
     np.testing.assert_array_equal(signed, [[-2048, -ADC_STEPS], [ADC_STEPS, 0]])
     noisy = read_counts(np.repeat([0.5, 1.0], [4000, 1])[:, None], 4001, 4.0, np.random.default_rng(0))
     assert noisy[:-1].std() == pytest.approx(4, rel=0.1)
-
-
-def test_classification_scores_compare_with_always_guessing_the_most_frequent_class() -> None:
-    """Rows are the true classes: 6 of 10 presses are of the first, though 7 are taken for the second."""
-    assert classification_scores(np.array([[2, 4, 0], [0, 3, 0], [0, 0, 1]])) == {
-        "accuracy_percent": 60.0,
-        "majority_percent": 60.0,
-    }
-    guessed = classification_scores(np.array([[0, 0, 5], [0, 0, 3], [0, 0, 2]]))
-    assert guessed == {"accuracy_percent": 20.0, "majority_percent": 50.0}
