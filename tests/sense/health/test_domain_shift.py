@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from padforge.sense import FaultDetector, HealthModel, Recording, calibrate
-from padforge.sense.health.domain_shift import MIN_PRESSES, DomainShift, detect_shifts, rest_levels
+from padforge.sense.health.domain_shift import MIN_PRESSES, detect_shifts, rest_levels
 from padforge.sense.localizer.model import LocalizerModel
 from padforge.sense.settings import LocalizerSettings
 from tests.helpers.once import Once
@@ -45,20 +45,14 @@ def detect(
     return [(shift.kind, shift.fibres) for shift in detect_shifts(localizer, health, recording, mask)]
 
 
-def test_text_names_value_and_what_is_usual() -> None:
-    assert DomainShift("rest", (2,), 2.1512, (1.7, 1.8)).text == (
-        "fibre 3 rests at 2.15 V, usual since calibration is 1.70 to 1.80 V: radii may be too small; recalibrate"
-    )
-    assert DomainShift("gain", (0, 1), 0.7, (0.87, 1.15)).text.startswith(
-        "all fibres respond 0.70 times as strongly as in calibration, usual is 0.87 to 1.15: "
-    )
-    assert DomainShift("gain", (0,), 0.7, (0.87, 1.15)).text.startswith("fibre 1 responds 0.70 times")
-
-
 def test_other_rests_are_detected(model: HealthModel, localizer: LocalizerModel, later: Recording) -> None:
     recording = changed(later, [1], offset_v=-0.33)
     assert detect(localizer, model, recording) == [("rest", (1,))]
     assert detect(localizer, model, recording, failed=(1,)) == []
+    [shift] = detect_shifts(localizer, model, recording, np.ones((len(recording.down_command), 6), bool))
+    assert shift.value == np.median(rest_levels(recording)[:, 1])
+    low, high = model.rest_range_v[:, 1]
+    assert shift.usual == pytest.approx((low - (high - low) / 4, high + (high - low) / 4))
     every = changed(later, list(range(6)), offset_v=0.33)
     assert detect(localizer, model, every) == [("rest", (fibre,)) for fibre in range(6)]
 

@@ -16,6 +16,7 @@ from padforge.sense import (
     open_recording,
 )
 from padforge.sense.health import fault_detector
+from padforge.sense.health.domain_shift import DomainShift
 from padforge.sense.health.fault_detector import TEXTS, fault_lines, mask_faults
 from padforge.sense.health.fault_likelihoods import HYPOTHESES
 from tests.sense.health.pads import BAD_FROM, FEW, PRESSES, TRAINED, detect, detect_later, faulty, fit, part_of, plant
@@ -152,18 +153,25 @@ def test_any_readings_are_processed(pad: Recording, model: HealthModel, seed: in
         assert fault.score >= 5
 
 
-def test_fault_lines() -> None:
-    faults = [FibreFault(30, 21, (1, 4), "swapped", 7.2), FibreFault(50, 41, (0,), "reduced_gain", 6.0)]
-    dead, swapped, reduced, sound = fault_lines(faults, 6, dead=(5,))
-    assert dead == "fibre 6 was dead in the recording that health was learnt from"
-    assert (
-        swapped == "fibres 2 and 5 are swapped (swapped) since press 21, detected at press 30; "
-        "false alarm probability 1e-7 per press"
-    )
-    assert reduced.startswith("fibre 1 responds with about half its gain (reduced_gain) since press 41")
-    assert sound == "sound fibres: 3, 4"
-    # Every hypothesis has a text.
+def test_findings_are_told_whole(golden: Any) -> None:
+    """Every kind of fault, of one fibre and of several; dead fibres, sound ones or none; and shifts."""
+    faults = [
+        FibreFault(30 + number, 21, fibres, kind, 5.2 + number)
+        for number, kind in enumerate(TEXTS)
+        for fibres in [(1, 4) if kind == "swapped" else (0, 2, 3) if kind == "misfit" else (number % 6,)]
+    ]
+    shifts = [
+        DomainShift("rest", (2,), 2.1512, (1.7, 1.8)),
+        DomainShift("gain", (0, 1), 0.7049, (0.87, 1.15)),
+        DomainShift("gain", (0,), 1.402, (0.87, 1.15)),
+    ]
+    lines = [*fault_lines(faults, 6, dead=(5,)), *fault_lines(faults[:1], 6), *fault_lines([], 2)]
+    golden("sense/health.txt", "\n".join([*lines, *(shift.text for shift in shifts)]))
+    # every hypothesis has a text
     assert {name for name in HYPOTHESES if not name.startswith("offset")} <= set(TEXTS)
+    masked = mask_faults(faults, 40, 6)
+    assert masked[:21].all()
+    assert not masked[21:].any()
 
 
 @pytest.mark.slow

@@ -3,6 +3,7 @@
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,7 +16,7 @@ from padforge.sense.health.fault_detector import HEALTH_FILES, has_health
 from padforge.sense.health.health_model import COMMANDED, HYPOTHESES, MIN_PRESSES, WARM_UP, find_dead_fibres
 from padforge.sense.health.trace_model import LEVEL_RATE, MEMBERS
 from padforge.sense.localizer.model_files import files_of
-from tests.sense.health.pads import FEW, detect_later, fit, part_of, plant
+from tests.sense.health.pads import FEW, TRAINED, detect_later, fit, part_of, plant
 
 DOCUMENT = files_of(Path(), COMMANDED).document.name
 
@@ -26,13 +27,16 @@ def make_detector(model: HealthModel) -> FaultDetector:
     return detector
 
 
-def test_detector_files_keep_every_bit(pad: Recording, model: HealthModel, tmp_path: Path) -> None:
+def test_detector_files_keep_every_bit(pad: Recording, model: HealthModel, tmp_path: Path, golden: Any) -> None:
     assert not has_health(tmp_path)
     make_detector(replace(model, provenance={"command": "test"})).save(tmp_path / "old")
     assert {file.name for file in (tmp_path / "old").iterdir()} == HEALTH_FILES
     FaultDetector.load(tmp_path / "old").save(tmp_path / "new")
     for name in HEALTH_FILES:
         assert (tmp_path / "new" / name).read_bytes() == (tmp_path / "old" / name).read_bytes()
+    document = json.loads((tmp_path / "new" / DOCUMENT).read_text())
+    golden("sense/health.json", document)
+    assert document["presses"] == TRAINED
     loaded = HealthModel.load(tmp_path / "new")
     assert loaded.provenance == {"command": "test"}
     readings = plant(pad, "reduced_gain")

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from padforge.sense import Recording
-from padforge.sense.localizer import evaluation
 from padforge.sense.localizer.evaluation import conformal, error_row, errors_by_loss, errors_by_position, idle_share
 from padforge.sense.localizer.model import Localization, MeasureEstimate
 
@@ -98,36 +97,3 @@ def test_errors_by_position_and_idle_share() -> None:
         readings[down:up] = step
     recording = Recording(readings, np.arange(200) / 13, np.zeros((5, 2)), down_command, up_command)
     np.testing.assert_allclose(idle_share(recording), [2 / 5, 1 / 5])
-
-
-def test_lines_of_a_calibration_have_errors_below_their_names() -> None:
-    row = {"n_failed": 1, "subsets": 6, "mean_mm": 1.5, "std_mm": 0.25, "max_mm": 2.0, "median_mm": 1.25}
-    row |= {"p95_mm": 3.5, "within_r50": 0.512, "within_r90": 0.907}
-    row |= {"force_mean_n": 0.75, "force_p95_n": 2.25, "force_within_r90": 0.875}
-    document = {"errors": [row], "test_presses": 45, "split": "random", "provenance": {"recording_kind": "rig"}}
-    lines = evaluation.calibration_lines(document)
-    assert lines[0] == "error in mm on 45 presses (split: random)"
-    positions = dict(zip(lines[1].replace("in r", "r").split(), lines[2].split(), strict=True))
-    assert positions == {
-        **{"failed": "1", "sets": "6", "mean": "1.50", "std": "0.25", "max": "2.00", "median": "1.25", "p95": "3.50"},
-        **{"r50": "51.2%", "r90": "90.7%"},
-    }
-    assert lines[3] == "error of force in N"
-    assert lines[5].split() == ["1", "6", "0.75", "2.25", "87.5%"]
-    simulated = evaluation.calibration_lines(document | {"provenance": {"recording_kind": "simulated"}})
-    assert simulated[0] == "error in mm on 45 presses of a simulated pad (split: random)"
-    assert simulated[-1] == evaluation.BUILT_PAD
-
-
-def test_lines_of_moments_have_a_column_for_each_number_of_failed_fibres() -> None:
-    rows = [
-        {"since": since, "time_s": 0.15, "n_failed": n_failed, "mean_mm": mean_mm + n_failed, "within_r90": 0.9}
-        for since, mean_mm in (("touch", 4.0), ("lift", 2.0))
-        for n_failed in (0, 1)
-    ]
-    _, head, *lines = evaluation.moment_lines(rows)
-    assert head.split() == ["since", "time", "s", "0", "failed", "in", "r90", "1", "failed", "in", "r90"]
-    assert [line.split() for line in lines] == [
-        ["touch", "0.15", "4.00", "90.0%", "5.00", "90.0%"],
-        ["lift", "0.15", "2.00", "90.0%", "3.00", "90.0%"],
-    ]

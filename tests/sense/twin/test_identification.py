@@ -1,7 +1,6 @@
 """Identification of pads whose truth is known, and recordings that do not suffice."""
 
 from dataclasses import replace
-from pathlib import Path
 from unittest.mock import patch
 
 import numpy as np
@@ -17,7 +16,6 @@ from padforge.design.settings import Contact, PadSettings
 from padforge.design.twin import Twin
 from padforge.sense import identify
 from padforge.sense.recording.recording import Recording
-from padforge.sense.report.identification import identification_lines
 from padforge.sense.settings import RigSettings
 from padforge.sense.simulation.simulated_recording import simulate
 from padforge.sense.twin import identification
@@ -137,33 +135,6 @@ def test_identify_requires_presses_over_half_of_a_rectangle_each_way() -> None:
     narrow = PadSettings(**plan.layout.settings, sensed_mm=(10.0, 11.0))
     with pytest.raises(InputError, match="allowed is what spans 12 x 6 mm"):
         identify(simulate(plan, RigSettings(presses=80), size=narrow), plan)
-
-
-@pytest.mark.parametrize(
-    ("mirrored", "rig_mirrored", "side"),
-    [
-        *((False, None, "as planned"), (True, None, "turned over"), (True, False, "turned over")),
-        *((False, True, "turned over, as [rig] mirrored"), (True, True, "as planned, which [rig] mirrored denies")),
-    ],
-)
-def test_identification_lines_state_the_side_with_regard_to_the_rig(mirrored, rig_mirrored, side) -> None:
-    """A mirrored rig has mirrored positions already: its twin is mirrored only where that was wrong."""
-    document = {"presses": 10, "channels": [], "explained": 0.9, "explained_on_plan": 0.8, "noise": 0.01}
-    frame = {"mirrored": mirrored, "turn_deg": 0.0, "shift_mm": [0.0, 0.0], "scale": 1.0}
-    document |= {"doubts": [], "frame": frame}
-    document |= {} if rig_mirrored is None else {"rig_mirrored": rig_mirrored}
-    assert any(line.startswith(f"the pad lay {side}") for line in identification_lines(document, Path()))
-
-
-def test_identification_lines_count_from_1_and_state_millivolts_for_a_percent() -> None:
-    """A fibre of -50 mV for a relative stretch of 1 reads half a millivolt less for 1 %."""
-    row = {"channel": 0, "fibre": 1, "gain_v": -0.05, "noise_v": 2e-3, "explained": 0.9, "alternative_fibres": [2]}
-    row |= {"lateral_offset_mm": 0.3, "lateral_offset_std_mm": 0.1}
-    document = {"presses": 10, "channels": [row], "explained": 0.9, "explained_on_plan": 0.8, "noise": 0.01}
-    frame = {"mirrored": False, "turn_deg": 0.0, "shift_mm": [0.0, 0.0], "scale": 1.0}
-    document |= {"n_alternatives": 0, "doubts": [], "frame": frame}
-    lines = [line.split() for line in identification_lines(document, Path())]
-    assert ["1", "2", "3", "-0.5", "2.00", "0.90", "0.30", "±", "0.10"] in lines
 
 
 @pytest.mark.slow
