@@ -1,7 +1,7 @@
 """The contact model: the signal of each fibre for a press (paper, section II-B).
 
-A fibre's signal is the line integral of a weight along it: of the strains of the silicone under a tool, of a measured
-profile of the distance to the press centre, or of the published weight inside a regular polygon.
+The signal of a fibre is the line integral of a weight along it. The weight follows from the strains of the silicone
+under a tool, is a measured function of the distance to the press centre, or is the published weight inside a polygon.
 """
 
 import math
@@ -41,26 +41,26 @@ if TYPE_CHECKING:
 
 _WEIGHTS = {"uniform": geometry.UNIFORM, "inverse_square": geometry.INVERSE_SQUARE, "inverse": geometry.INVERSE}
 _LENGTHS = {"manhattan": geometry.MANHATTAN, "euclidean": geometry.EUCLIDEAN}
-FINEST_PRECISION = 1e-6  # a `weight_table` agrees to about 1e-7 of the largest weight
 _Sparse = tuple[Ints, Ints]
-_DENSE = np.empty(0, np.int64), np.empty(0, np.int64)
-_SPARSE_BLOCK = 1000  # presses whose signals are dense for a moment
+_NO_SPARSE_OUTPUT = np.empty(0, np.int64), np.empty(0, np.int64)
 LAYER_REACH = {"bonded": 8.0, "slipping": 16.0}
-"""Distance beyond the contact at which strains of a layer end, thicknesses. What is left out is less than 1 % of a
-straight fibre's largest signal; strains of a slipping layer fall only with the square of the distance."""
-THICK = 4.0
-"""Contact radii above which a thickness counts no more for that: there strains fall with the cube of the distance."""
+"""Distance outside the contact at which strains of a layer are cut off, thicknesses. The neglected part is less than
+1 % of the largest signal of a straight fibre. Strains of a slipping layer decay only with the square of the distance.
+"""
+MAX_REACH_RADII = 4.0
+"""Maximum thickness that counts for that, contact radii: strains of a thicker layer decay with the cube."""
 FIBRE_BLUR_MM = 0.1
-"""Standard deviation of a Gaussian by which strains are averaged, about that of the width of a fibre, 0.3 mm: it does
-not follow the step of the strains at the edge of the contact, which signals, their integrals, hardly show."""
+"""Standard deviation of the Gaussian by which strains are averaged, about that of the width of a fibre of 0.3 mm. It
+smooths the step of the strains at the edge of the contact, which hardly changes signals, the integrals of strains.
+"""
 PANEL_SHARE = 0.4
-"""Length of a panel of distances, on which strains are one polynomial, as a share of its distance from the edge of the
-contact, or if more of the depth of the fibres: polynomials of degree 7 are then within 1e-8 of the largest strain."""
-STRAIN_SAMPLES, STRAIN_HEIGHTS = 50, 9
-"""Distances and heights at which the largest strain is sought."""
+"""Length of an interval of distances in which strains are one polynomial, relative to its distance from the edge of the
+contact or, if that is more, to the depth of the fibres. Polynomials of degree 7 then err by 1e-8 of the largest strain.
+"""
 DEPTH_STEPS = 16
-"""Solved depths by which signals and forces are interpolated. More would not take longer for each press; fewer err more
-than 0.5 % of full scale, since signals bend where the edge of the contact passes a fibre."""
+"""Number of depths for which the contact is solved, to interpolate signals and forces. Fewer would err by more than
+0.5 % of full scale, since signals bend when the edge of the contact passes a fibre.
+"""
 PressShape = tuple[tuple[Array, Array], Array, geometry.WeightLaw]
 """Chains, extents and weight law of a press."""
 
@@ -75,20 +75,20 @@ def signals(
 ) -> Array:
     """Compute signals: the weighted length of each fibre's PCHIP curve in the press.
 
-    Those of a shape are exact, without sampling: its boundary belongs to the press, so that a straight fibre that runs
-    along an edge counts with its full length there. Those of a layer or a profile are sums over short elements.
+    Signals of a shape are exact, without sampling. The boundary belongs to the press, so that a straight fibre along an
+    edge counts with its full length there. Signals of a layer or a profile are sums over short elements.
 
     Args:
         pad: a morphology; or knots of a population of square pads of the default pitch, 11.25 mm; shape
             (..., 2 M, N + 2, 2), grid units.
-        presses: centres; shape (Q, 2), grid units. Or C simultaneous presses whose signals add, shape (Q, C, 2); where
-            their shapes overlap a fibre counts once for each.
+        presses: centres; shape (Q, 2), grid units. Or C simultaneous presses, shape (Q, C, 2), whose signals add, also
+            in the overlap of their shapes.
         contact: contact model; the default layer, `Contact()`, if None.
-        precision: error of signals of a layer or a profile near a press, as a share of the largest one: the root of its
-            mean square for a layer, the largest for a profile; 1e-6 to 1. It does not matter for a shape, where uniform
-            Manhattan signals are closed forms between roots, to rounding, and others Gauss-Kronrod integrals, to 1e-11.
+        precision: error of signals near a press, relative to the largest signal, 1e-6 to 1: the RMS error for a layer,
+            the maximum error for a profile. A shape ignores it: its uniform Manhattan signals have a closed form, all
+            others are Gauss-Kronrod integrals with a relative error of 1e-11.
         sensitivity: factors on the response of each fibre to a layer or a profile, at K >= 2 even steps along its axis;
-            shape (F, K). 1 if None, and for a shape.
+            shape (F, K). 1 if None; a shape ignores it.
 
     Returns:
         Signals; shape (Q, F), or (..., Q, F) of a population; grid units for weights without unit.
@@ -104,18 +104,18 @@ def signals(
     out = np.zeros((len(along), len(centres), fibres))
     if contact.model == "shape":
         shape = press_shape(contact, grid_unit_mm(pad))
-        _run_exact(along, across, ends, centres, shape, _DENSE, out.reshape(-1))
+        _run_exact(along, across, ends, centres, shape, _NO_SPARSE_OUTPUT, out.reshape(-1))
     elif len(centres):
-        precision = check_float("precision", precision, FINEST_PRECISION, 1.0)
+        precision = check_float("precision", precision, 1e-6, 1.0)  # that of a `weight_table` is about 1e-7
         for curves in zip(along, across, out, strict=True):
             _sum_elements(*curves, ends, centres, contact, grid_unit_mm(pad), precision, sensitivity)
     return _sum_simultaneous(out, (*batch, *press_counts, fibres))
 
 
 def relative_stretch(pad: Morphology, presses: ArrayLike, contact: Contact) -> Array:
-    """Compute the relative stretch (Q, F) of each fibre, which is what a voltage divider measures: signal over length.
+    """Compute the relative stretch (Q, F) of each fibre, its signal divided by its length.
 
-    A fibre is a strain gauge: its resistance grows with its relative stretch, less on a longer fibre.
+    A fibre is a strain gauge: its relative change of resistance, which a voltage divider measures, grows with it.
     """
     return signals(pad, presses, contact) / lengths(pad)
 
@@ -131,7 +131,7 @@ def _sum_elements(
     precision: float,
     sensitivity: Array | None,
 ) -> None:
-    """Write the signals (Q, F) of one pad, whose knots have coordinates (F, N + 2), by elements of its fibres."""
+    """Compute the signals of one pad with knots (F, N + 2) from elements of its fibres into `out` (Q, F)."""
     shape, slope = press_shape(contact, unit_mm), population_slopes(along[None], across[None])[0]
     law, spacings = shape[2], element_spacings(contact, unit_mm, precision)
     elements = element_signals.fibre_elements(along, across, slope, ends.horizontals, presses, law, spacings)
@@ -145,7 +145,7 @@ def _sum_elements(
 
 
 def widened(contact: Contact, factor: float) -> Contact:
-    """Return a contact whose press is wider by a factor, and as strong in its middle.
+    """Return a contact whose press is wider by a factor, of the same weight at its centre.
 
     Args:
         contact: a contact of any model.
@@ -166,17 +166,17 @@ def indented_signals(
 ) -> Array:
     """Compute signals of presses of known depths into an elastic layer.
 
-    The contact is solved at DEPTH_STEPS depths that are evenly spaced by their square root, in which signals are
-    smooth as the contact radius is; a press is interpolated by the cubic through the four nearest.
+    The contact is solved at DEPTH_STEPS depths of evenly spaced square roots, of which signals and the contact radius
+    are smooth functions. A press is interpolated by the cubic through the four nearest.
 
     Args:
         pad: the fibres.
         presses: centres; shape (Q, 2), grid units.
         depths_mm: depth of each press, shape (Q,), or one for all; 0 to the depth of the contact, mm.
-        contact: a layer, whose depth is the greatest one; `Contact()` if None.
+        contact: a layer, whose depth is the maximum; `Contact()` if None.
 
     Returns:
-        Signals; shape (Q, F), grid units; those of `signals` within 1 % of the largest.
+        Signals; shape (Q, F), grid units; they differ from those of `signals` by less than 1 % of the largest.
 
     Raises:
         InputError: presses or depths of the wrong shape, not finite or out of range, or a contact that is no layer.
@@ -188,21 +188,21 @@ def indented_signals(
     fibres = len(check_type("pad", pad, Morphology).knots)
     check_memory(len(centres) * fibres)
     out = np.zeros((len(centres), fibres))
-    for rows, weight, pressed in depth_terms(np.broadcast_to(depths_mm, len(centres)), contact):
-        out[rows] += weight[:, None] * signals(pad, centres[rows], pressed)
+    for rows, weight, solved in depth_terms(np.broadcast_to(depths_mm, len(centres)), contact):
+        out[rows] += weight[:, None] * signals(pad, centres[rows], solved)
     return out
 
 
 def depth_terms(depths_mm: Array, contact: Contact) -> Iterator[tuple[Ints, Array, Contact]]:
-    """Yield the terms that sum to what is 0 at depth 0, of presses of known depths into a layer.
+    """Yield the terms of an interpolation over depth of a quantity that is 0 at depth 0, for presses into a layer.
 
     Args:
         depths_mm: depth of each press; shape (Q,), 0 to the depth of the contact, mm.
         contact: a layer.
 
     Yields:
-        Indices (n,) of presses, the weights (n,) of a solved contact for them, and that contact. They are the contacts
-        themselves if there are few depths.
+        Indices (n,) of presses, the weights (n,) of a solved contact for them, and that contact. If there are few
+        depths, each is solved, and the weights are 1.
     """
     depths = np.unique(depths_mm)
     if len(depths) <= DEPTH_STEPS:
@@ -211,10 +211,10 @@ def depth_terms(depths_mm: Array, contact: Contact) -> Iterator[tuple[Ints, Arra
             yield rows, np.ones(len(rows)), Contact(**contact.model_dump() | {"depth_mm": depth_mm})
         return
     weights = _depth_weights(depths_mm, contact)
-    for pressed, weight in zip(_depth_steps(contact), weights.T, strict=True):
+    for solved, weight in zip(_depth_steps(contact), weights.T, strict=True):
         rows = np.flatnonzero(weight)
         if rows.size:
-            yield rows, weight[rows], pressed
+            yield rows, weight[rows], solved
 
 
 def press_forces_n(
@@ -224,23 +224,23 @@ def press_forces_n(
 
     Args:
         depths_mm: depths of any shape; 0 to the depth of the contact, mm.
-        contact: a layer, whose depth is the greatest one; `Contact()` if None.
+        contact: a layer, whose depth is the maximum; `Contact()` if None.
         reduced_modulus_kpa: E* = E / (1 - nu^2) of the silicone, kPa.
 
     Returns:
-        Forces of the shape of the depths, N; within 0.05 % of the largest.
+        Forces of the shape of the depths, N; they err by less than 0.05 % of the largest.
 
     Raises:
         InputError: depths or a modulus that are out of range, or a contact that is no layer.
     """
     contact, depths_mm = _check_depths(contact, depths_mm)
     modulus_kpa = check_float("reduced_modulus_kpa", reduced_modulus_kpa, 0, 1e12)
-    forces = [contact_press(pressed).force_n(modulus_kpa) for pressed in _depth_steps(contact)]
+    forces = [contact_press(solved).force_n(modulus_kpa) for solved in _depth_steps(contact)]
     return _depth_weights(depths_mm, contact) @ np.array(forces)
 
 
 def _check_depths(contact: Contact | None, depths_mm: ArrayLike) -> tuple[Contact, Array]:
-    """Return a contact and depths if it is a layer and they lie within its depth."""
+    """Check that a contact is a layer and that depths are within its depth, and return both."""
     contact = or_default("contact", contact, Contact)
     if contact.model != "layer":
         raise InputError(f"contact is a {contact.model}, allowed is a layer: nothing else is pressed to a depth")
@@ -254,16 +254,16 @@ def _check_depths(contact: Contact | None, depths_mm: ArrayLike) -> tuple[Contac
 
 
 def _depth_steps(contact: Contact) -> list[Contact]:
-    """Return the contact at the depths that are solved, the last of which is its own."""
+    """Return the contact at the depths for which it is solved, up to its own."""
     shares = (np.arange(1, DEPTH_STEPS + 1) / DEPTH_STEPS) ** 2
     return [contact.model_copy(update={"depth_mm": share * contact.depth_mm}) for share in shares.tolist()]
 
 
 def _depth_weights(depths_mm: Array, contact: Contact) -> Array:
-    """Return the weights (..., DEPTH_STEPS) of the solved depths by which what is 0 at depth 0 is interpolated."""
+    """Return the weights (..., DEPTH_STEPS) of the solved depths for interpolating a quantity that is 0 at depth 0."""
     step = DEPTH_STEPS * np.sqrt(depths_mm / contact.depth_mm)
     first = np.clip(np.floor(step) - 1, 0, DEPTH_STEPS - 3)
-    x = step - first  # Lagrange's cubic through 0, 1, 2, 3
+    x = step - first  # the cubic Lagrange polynomials on 0, 1, 2, 3 follow
     weights = np.zeros((*depths_mm.shape, DEPTH_STEPS + 1))
     cubic = (
         (1 - x) * (2 - x) * (3 - x) / 6,
@@ -277,7 +277,7 @@ def _depth_weights(depths_mm: Array, contact: Contact) -> Array:
 
 
 def signals_sparse(pad: Morphology, presses: ArrayLike, contact: Contact | None = None) -> "csr_array":
-    """Compute `signals` (Q, F) of one pad as a sparse matrix, in time and memory proportional to the fibres touched.
+    """Compute `signals` (Q, F) of one pad as a sparse matrix, in time and memory proportional to the touched fibres.
 
     Args:
         pad: the fibres.
@@ -290,7 +290,7 @@ def signals_sparse(pad: Morphology, presses: ArrayLike, contact: Contact | None 
     along, across, ends, _ = fibre_axes(check_type("pad", pad, Morphology))
     centres, max_offsets = check_presses(presses)[0], geometry.max_offsets(across, ends)
     if contact.model != "shape":
-        blocks = np.array_split(centres, range(_SPARSE_BLOCK, len(centres), _SPARSE_BLOCK))
+        blocks = np.array_split(centres, range(1000, len(centres), 1000))  # 1000 rows are dense at a time
         return csr_array(vstack([csr_array(signals(pad, block, contact)) for block in blocks], format="csr"))
     shape = press_shape(contact, pad.unit_mm)
     starts = geometry.count_touched(max_offsets[0], centres, shape[1], ends)
@@ -319,7 +319,7 @@ def _run_exact(
 def record_visits(
     along: Array, max_offsets: Array, ends: geometry.Ends, presses: Array, extents: Array, visited: int
 ) -> None:
-    """Record for the profile how many fibres and spans were visited; arguments as of the kernels."""
+    """Count visited fibres and spans for profiling; arguments are those of the kernels."""
     pads, fibres, knots = along.shape
     touched = sum(int(geometry.count_touched(offsets, presses, extents, ends)[-1]) for offsets in max_offsets)
     profiling.add_count("fibres, press by press", touched, pads * len(presses) * fibres)
@@ -354,7 +354,7 @@ def fibre_axes(
     if not fibres or knots.shape[-1] != 2 or knots.shape[-2] < 2 or (layout is None and fibres % 2):
         raise InputError(f"knots have shape {knots.shape}, expected (..., 2 M, N + 2, 2)")
     ends = fibre_ends(check_layout(fibres, layout))
-    # in C order, else kernels would be compiled anew for the memory order of a caller's array, which takes seconds
+    # in C order, since kernels would take seconds to compile for another memory order
     along, across = split_axes(np.ascontiguousarray(knots).reshape(-1, *knots.shape[-3:]), ends.horizontals)
     if not is_pad and not (np.diff(along) >= MIN_SPAN).all():
         raise InputError(f"knots do not ascend by {MIN_SPAN:g} or more along the fibre's axis")
@@ -377,7 +377,7 @@ def press_shape(contact: Contact, unit_mm: float) -> PressShape:
 
 
 def search_precision(contact: Contact) -> float:
-    """Return the precision of `signals` in a search, far lower for a layer, whose strains step at a contact's edge."""
+    """Return the precision of `signals` in a search; it is coarser for a layer, whose strains have a step."""
     return LAYER_PRECISION if contact.model == "layer" else PROFILE_PRECISION
 
 
@@ -411,7 +411,7 @@ def contact_law(contact: Contact, unit_mm: float) -> geometry.WeightLaw:
 
 
 def contact_press(contact: Contact) -> LayerPress:
-    """Return the press of a tool into the layer of a contact, not widened by its `scale`.
+    """Return the press of a tool into the layer of a contact, without its `scale`.
 
     Args:
         contact: a layer.
@@ -420,13 +420,13 @@ def contact_press(contact: Contact) -> LayerPress:
 
 
 def fibre_strains(contact: Contact) -> list[tuple[float, float]]:
-    """Compute the greatest strains of the horizontal and of the vertical fibres under a press.
+    """Compute the maximum strains of the horizontal and of the vertical fibres under a press.
 
     Args:
         contact: a layer.
 
     Returns:
-        By how much fibres are pressed flat and stretched, relative to their size.
+        Compressive strain across the fibres, and tensile strain along them, by family.
     """
     press = contact_press(contact)
     distances_mm = np.linspace(0, 2 * press.contact_radius_mm, 100)
@@ -436,16 +436,16 @@ def fibre_strains(contact: Contact) -> list[tuple[float, float]]:
 
 
 def describe_large_strain(contact: Contact) -> str:
-    """Say that the linear layer is strained by more than 1, which no real one can be; return "" if it is not.
+    """Return a warning if the linear layer has strains above 1, which are impossible; "" otherwise.
 
     Args:
-        contact: any contact; those other than a layer have no strains.
+        contact: any contact; only a layer has strains.
     """
     if contact.model != "layer":
         return ""
     press, fibres_mm = contact_press(contact), contact.thickness_mm - min(contact.fibre_depths_mm)
-    distances_mm = np.linspace(0, 2 * press.contact_radius_mm, STRAIN_SAMPLES)
-    heights_mm = np.linspace(0, fibres_mm, STRAIN_HEIGHTS)  # the fibres, and the silicone that they are pressed into
+    distances_mm = np.linspace(0, 2 * press.contact_radius_mm, 50)
+    heights_mm = np.linspace(0, fibres_mm, 9)  # at and below the fibres
     strains = [press.strains(distances_mm, height_mm, FIBRE_BLUR_MM) for height_mm in heights_mm.tolist()]
     largest = float(np.abs(strains).max())
     if largest <= 1:
@@ -458,22 +458,23 @@ def describe_large_strain(contact: Contact) -> str:
 
 @lru_cache(maxsize=128)
 def profile_weights(contact: Contact) -> tuple[tuple[Array, Array, Array], ...]:
-    """Return the weights of a contact that is no shape, once, or for the horizontal and for the vertical fibres.
+    """Return the weights of a contact that is no shape, once for all fibres, or for each family.
 
-    An element at the distance d, at the angle phi between fibre and press, has the weight w + v cos^2 phi.
+    An element has the weight w(d) + v(d) cos^2 phi, with its distance d and the angle phi between the fibre and the
+    direction to the press.
 
     Args:
         contact: a layer or a profile.
 
     Returns:
-        Distances d, mm, ascending from 0 to where the weight ends; w and v there; all of shape (n,). Of a layer they
-        are strains: their integral over the length of a fibre is an elongation, or what responds like one.
+        Distances d, mm, ascending from 0 to the end of the weight, and w and v there; all of shape (n,). For a layer
+        they are strains, whose integral over the length of a fibre is its effective elongation.
     """
     if contact.model == "profile":
         distance, weight = np.array(contact.sensitivity_profile).T
         return ((distance, weight, np.zeros_like(weight)),)
     press = contact_press(contact)
-    thickness_mm = min(contact.thickness_mm, THICK * press.contact_radius_mm)
+    thickness_mm = min(contact.thickness_mm, MAX_REACH_RADII * press.contact_radius_mm)
     distance = _layer_distances(contact, press.contact_radius_mm, thickness_mm)
     fade = np.clip((distance[-1] - distance) / thickness_mm, 0, 1)
     fade = fade * fade * (3 - 2 * fade)
@@ -482,7 +483,7 @@ def profile_weights(contact: Contact) -> tuple[tuple[Array, Array, Array], ...]:
         strains = press.strains(distance, contact.thickness_mm - depth_mm, FIBRE_BLUR_MM)
         plain = contact.squeeze * strains.compressive + contact.stretch * strains.hoop
         directed = contact.stretch * (strains.radial - strains.hoop)
-        directed[0] = 0.0  # to rounding, by symmetry
+        directed[0] = 0.0  # by symmetry, except for rounding
         families.append((contact.scale * distance, fade * plain, fade * directed))
     return tuple(families)
 
@@ -493,9 +494,9 @@ def half_width_mm(contact: Contact) -> float:
 
 
 def half_widths_mm(contact: Contact) -> list[float]:
-    """Return the largest distance at which an element of a fibre has half of its greatest weight, mm.
+    """Return the largest distance at which the weight is half of its maximum, mm, once for all fibres or by family.
 
-    It is the mean over the directions of the fibre: of the horizontal and of the vertical fibres of a layer, or of all.
+    The weight is the mean over all directions of the fibre.
 
     Args:
         contact: a layer or a profile.
@@ -504,16 +505,16 @@ def half_widths_mm(contact: Contact) -> list[float]:
     for distance, plain, directed in profile_weights(contact):
         weight = np.abs(plain + directed / 2)
         half = weight.max() / 2
-        last = int(np.flatnonzero(weight >= half)[-1])  # never the last point, whose weight is 0
+        last = int(np.flatnonzero(weight >= half)[-1])  # not the last point, whose weight is 0
         share = (weight[last] - half) / (weight[last] - weight[last + 1])
         widths.append(float(distance[last] + share * (distance[last + 1] - distance[last])))
     return widths
 
 
 def _layer_distances(contact: Contact, contact_radius_mm: float, thickness_mm: float) -> Array:
-    """Return distances at which strains are computed: the nodes of panels that are shortest at the edge of the contact.
+    """Return the distances at which strains are computed: nodes of panels that are shortest at the edge of the contact.
 
-    They are Lobatto-Chebyshev nodes by the squared distance, and neighbours share theirs.
+    The nodes are Chebyshev-Lobatto points of the squared distance; neighbouring panels have a node in common.
     """
     finest_mm = PANEL_SHARE * math.hypot(min(contact.fibre_depths_mm), 2 * FIBRE_BLUR_MM)
 
@@ -535,7 +536,7 @@ def _layer_distances(contact: Contact, contact_radius_mm: float, thickness_mm: f
 def signals_quantized(
     pad: Morphology | Array, presses: ArrayLike, contact: Contact | None = None, samples: int = 2000
 ) -> Array:
-    """Compute signals by the published rule: segments of a sampled fibre count in full if they start in the press.
+    """Compute signals by the published rule, by which segments of a sampled fibre count if they start in the press.
 
     Args:
         pad: as in `signals`.
@@ -565,18 +566,18 @@ def signals_quantized(
 
 
 def check_memory(values: int) -> None:
-    """Refuse more signals than fit into memory."""
+    """Check that signals fit into memory."""
     if values > MAX_VALUES:
         raise InputError(f"these are {values} signals, allowed at once are {MAX_VALUES}; signals_sparse takes less")
 
 
 def check_samples(samples: int, fibres: int) -> int:
-    """Return the number of samples per fibre if it is allowed."""
+    """Check the number of samples per fibre, and return it."""
     return check_int("samples", samples, 2, min(MAX_SAMPLES, MAX_VALUES // max(fibres, 1)))
 
 
 def check_presses(presses: ArrayLike, several: bool = False) -> tuple[Array, tuple[int, int]]:
-    """Return presses (Q, 2), or if `several` (Q, C, 2) simultaneous ones, as contiguous (Q C, 2), and their (Q, C)."""
+    """Return presses (Q, 2) or, if `several`, (Q, C, 2) as a contiguous array (Q C, 2), and (Q, C)."""
     positions = check_array("presses", presses, MAX_COORDINATE)
     if positions.shape == (0,):
         positions = positions.reshape(0, 2)
@@ -590,8 +591,7 @@ def check_presses(presses: ArrayLike, several: bool = False) -> tuple[Array, tup
 def serpentine_presses(rectangle: Rectangle, side: int, jitter: float = 0.0, seed: int = 214) -> Array:
     """Return side x side presses (side^2, 2) in serpentine order: x ascends in even rows and descends in odd ones.
 
-    Each is moved by U(0, jitter) along both axes, by NumPy's legacy RandomState, with which the published values were
-    computed.
+    Each is shifted by U(0, jitter) along both axes. Numbers are from NumPy's legacy RandomState, as in the publication.
     """
     rows = grid_positions(rectangle, side).reshape(side, side, 2)
     rows[1::2] = rows[1::2, ::-1]
