@@ -22,7 +22,6 @@ from padforge.fabricate.plan import Plan, polygon_rings
 Numbers = NDArray[np.int64]
 _log = logging.getLogger(__name__)
 
-_STL_HEADER = b"padforge, mm".ljust(80)
 _STL_RECORD = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
 
 _STL_HEAD_BYTES = 84  # header of a binary STL, and its number of triangles
@@ -98,7 +97,7 @@ def write_stl(path: Path, vertices: np.ndarray, triangles: np.ndarray) -> None:
     records = np.zeros(len(corners), _STL_RECORD)
     records["normal"] = np.divide(normals, lengths, out=np.zeros_like(normals), where=lengths > 0)
     records["corners"] = corners
-    path.write_bytes(_STL_HEADER + np.uint32(len(records)).astype("<u4").tobytes() + records.tobytes())
+    path.write_bytes(b"padforge, mm".ljust(80) + np.uint32(len(records)).astype("<u4").tobytes() + records.tobytes())
 
 
 def write_3mf(path: Path, vertices: np.ndarray, triangles: np.ndarray, *, name: str, title: str, material: str) -> None:

@@ -38,8 +38,7 @@ FAMILIES = ("horizontal", "vertical")
 FAMILY_COLOURS = (HORIZONTAL, VERTICAL)
 INTO_WALL_MM = 0.5
 """Depth of ridges in the walls: the tracks open to the pad's sides, and no two faces of the mould coincide."""
-COVER_MM = 1.0
-"""Minimum silicone over the deepest track; a pad of more than two layers is made thicker for it."""
+COVER_MM = 1.0  # minimum silicone over the deepest track; a pad of more than two layers is made thicker for it
 SNAP_MM = 1e-4
 """Grid to which areas are snapped by Boolean operations, mm.
 

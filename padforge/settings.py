@@ -21,8 +21,6 @@ SECTIONS = {
 }
 """Sections of a `pad.toml`, and the model of each."""
 
-_LAYOUT_KEYS = {"grid", "horizontals", "verticals", "pitch_mm", "size_mm"}
-
 
 def section_models() -> "dict[str, type[Settings]]":
     """Import the models of all sections, by name."""
@@ -45,7 +43,7 @@ def check_settings(spec: "Spec") -> None:
         if model.section() != "contact":  # read by `FabricationSettings`, completed with the lengths of the cast pad
             spec.section(model)
     fabrication, rig = FabricationSettings.from_spec(spec), read_rig(spec)
-    if spec.stated(PadSettings).keys() & _LAYOUT_KEYS:
+    if spec.stated(PadSettings).keys() & {"grid", "horizontals", "verticals", "pitch_mm", "size_mm"}:
         layout = spec.section(PadSettings).layout
         fabrication.require_consistent(layout)
         rig.inputs(layout.fibres)

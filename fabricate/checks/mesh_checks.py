@@ -30,8 +30,7 @@ from padforge.fabricate.mesh import read_mesh
 from padforge.fabricate.plan import areas, overlap, without
 from padforge.fabricate.settings import DEFAULTS, PrinterSettings
 
-SOLID_CHECKS = ("manifold", "watertight", "bodies", "volume", "genus")
-"""The checks that any solid must pass."""
+SOLID_CHECKS = ("manifold", "watertight", "bodies", "volume", "genus")  # the checks that any solid must pass
 _MIN_SIDE_MM = 5.0  # longest side of the smallest mould; smaller meshes are in another unit
 _MAX_METRES_MM = 0.5  # longest side, read as mm, of a mesh in metres; other meshes that are too small are in inches
 _POSES = {
@@ -239,7 +238,6 @@ def _check_self_intersection(mesh: TriangleMesh, slabs: Sequence[Slab]) -> Findi
 MIN_FLOOR_MM = 0.4  # thinner floors bend when the casting is pulled out
 MIN_SILICONE_MM = 0.1  # thinner silicone tears in demoulding
 _WALL_LINES = 2  # minimum thickness of a stable wall, in printed lines
-_FLOOR_LAYERS = 2  # minimum thickness of a tight floor, in printed layers
 _DEPTH_STEP = 1.5  # difference of heights, in minimum silicone walls, above which tracks of two depths may come close
 _MAX_WALL_SLOPE = math.tan(math.radians(10))  # outward lean of a wall per mm of height
 _MAX_RIDGE_SLOPE = math.tan(math.radians(20))  # widening of a ridge on either side per mm downwards
@@ -316,7 +314,7 @@ def _check_floor_thickness(mesh: TriangleMesh, printer: PrinterSettings) -> Find
     Thickness is measured vertically, at the middles of faces and near their corners. It is not measured against
     leaning faces, since it vanishes at any sharp edge.
     """
-    limit = max(MIN_FLOOR_MM, _FLOOR_LAYERS * printer.layer_mm)
+    limit = max(MIN_FLOOR_MM, 2 * printer.layer_mm)
     up, down = mesh.normal_z > _MIN_FLOOR_COSINE, mesh.normal_z < -_MIN_FLOOR_COSINE
     both = zip(_measure_thickness(mesh, up, down), _measure_thickness(mesh, down, up), strict=True)
     thicknesses, points = map(np.concatenate, both)
@@ -342,7 +340,6 @@ def _measure_thickness(mesh: TriangleMesh, start: FaceMask, end: FaceMask) -> tu
 
 
 MAX_OVERHANG_DEG = 45.0  # faces that lean farther from vertical need support
-_OVERHANG_TOLERANCE_DEG = 1.0  # for the rounding of an STL
 _UPRIGHT_DEG = 0.1  # faces that lean less are vertical within the rounding of their corners
 _OFF_FACE_MM = 5e-3  # distance in front of a face at which silicone is detected
 _MAX_HEIGHTS = 32  # heights at which silicone is detected, those of the largest faces
@@ -351,7 +348,7 @@ _MAX_HEIGHTS = 32  # heights at which silicone is detected, those of the largest
 def _check_overhang(mesh: TriangleMesh, printer: PrinterSettings) -> Finding:
     """Check that no face above the first layer leans so far that it needs support."""
     high = mesh.corners[:, :, 2].max(axis=1) > mesh.bounds[0, 2] + printer.layer_mm
-    leaning = _leaning(mesh, MAX_OVERHANG_DEG + _OVERHANG_TOLERANCE_DEG) & high
+    leaning = _leaning(mesh, MAX_OVERHANG_DEG + 1.0) & high  # with a tolerance for the rounding of an STL
     lean = _max_lean_deg(mesh, high)
     message = f"overhangs of up to {lean:.0f}°, {MAX_OVERHANG_DEG:g}° print without support"
     positions = _deduplicate(mesh.patch_positions(leaning))
@@ -403,7 +400,6 @@ def _before_void(mesh: TriangleMesh, mask: FaceMask, lowest: Slab) -> FaceMask:
 MAX_LEAK_MM = 10.0  # wider openings in a wall are not leaks, but the shape of a part that is not a tray
 _NEAR_MM = 1e-3  # distance up to which areas cut on a grid adjoin
 _MIN_BASIN = 0.25  # minimum fraction of a tray's outline that is hollow; funnels and holes have less
-_MIN_FLOOR = 0.5  # minimum fraction of a tray's hollow that has a floor
 
 
 def _check_leaks(slabs: Sequence[Slab]) -> Finding:
@@ -438,6 +434,6 @@ def _find_floor_leaks(slabs: Sequence[Slab]) -> list[BaseGeometry]:
         hollow = shapely.union_all([shapely.Polygon(ring) for ring in rings])
         if hollow.area > _MIN_BASIN * slabs[0].cross_section.envelope.area:
             bare = reduce(without, [lower.cross_section for lower in slabs[:index]], hollow)
-            if bare.area < _MIN_FLOOR * hollow.area:
+            if bare.area < 0.5 * hollow.area:  # otherwise it is not a tray
                 return list(shapely.get_parts(bare))
     return []

@@ -91,7 +91,6 @@ def check_plan(plan: Plan) -> list[Finding]:
 
 _SLENDER = 5.0  # ratio of height to width above which ridges may break
 _MAX_SLENDERNESS = 10.0  # ratio above which they cannot be printed
-_FOLD_TURN = 0.05  # turn between the points at which folds are searched, rad
 _BEND_TURN = 2.5e-3  # turn between the points of a bend, rad
 _BEND_TOLERANCE = 1e-3  # relative, of bend radii, since leads bend as tightly as allowed
 _MAX_NAMES = 8  # more fibres are counted instead of named
@@ -308,7 +307,7 @@ def _check_folds(plan: Plan) -> Finding:
     curves = zip(beziers(pad), slope_beziers(pad), flatten(pad, 3e-4 / pad.unit_mm), strict=True)  # tolerance 3e-4 mm
     for fibre, (spans, slopes, line) in enumerate(curves):
         half = mould.ridge_width_mm / 2 + plan.heights_mm[plan.layer_indices[fibre]] * plan.settings.ridge_slope
-        points, headings = trace_curve(spans, slopes, _FOLD_TURN)
+        points, headings = trace_curve(spans, slopes, 0.05)  # maximum turn between points, rad
         axes = slice(None, None, -1 if plan.family(fibre) else 1)  # along and across the fibre's axis
         positions, walls = _find_tight_bends(pad.to_mm(points)[:, axes], headings, half)
         cuts = half - shapely.distance(shapely.LineString(pad.to_mm(line)), shapely.points(walls[:, axes]))

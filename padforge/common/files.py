@@ -30,8 +30,6 @@ UNFINISHED = ".unfinished-"  # prefix of the names of temporary files and folder
 LOCK = ".lock"  # name of the file that locks a folder
 MAX_BYTES = 2**28  # size limit of a file; only recordings may be larger
 
-_LEFTOVER_S = 86400.0  # age after which an unchanged temporary folder is that of a killed run
-_PACKAGES = ("padforge", "numpy", "scipy")
 _MORPHOLOGY = "padforge-morphology/"  # prefix of the format of pads, which are independent of pads they derive from
 
 
@@ -102,7 +100,7 @@ def locked_folder(folder: Path) -> Iterator[None]:
         make_folder(folder)
     try:
         with locked(folder, f"{folder}: another run is writing there; wait for its end, or choose another folder"):
-            remove_leftovers(folder, _LEFTOVER_S)
+            remove_leftovers(folder, 86400.0)  # unchanged for a day
             yield
     finally:
         with suppress(OSError):  # not empty
@@ -295,7 +293,7 @@ def provenance(
         "command": command,
         "seed": seed,
         "versions": {"python": platform.python_version()}
-        | {name: installed_version(name) for name in (*_PACKAGES, *packages)},
+        | {name: installed_version(name) for name in ("padforge", "numpy", "scipy", *packages)},
         "inputs": {path.name: sha256(path) for path in inputs},
     }
 

@@ -27,8 +27,6 @@ def read_resource(package: str, name: str) -> str:
 TEMPLATES = "padforge.common.templates"
 _TYPES = {".png": "image/png", ".svg": "image/svg+xml"}
 _NUMBER = re.compile(r"[-+]?\d[\d.]*(e[-+]?\d+)?( ?%| mm| ml| g)?")  # right-aligned in a table
-_SHORT = 16  # characters; columns of shorter cells are not wrapped
-_LONG = 30  # characters; longer words are broken
 _RESULTS = ("pass", "warn", "fail")  # cells with these words are coloured
 
 
@@ -162,6 +160,6 @@ def _column_style(column: Sequence[str]) -> str:
     """Return the CSS class of the cells of a column."""
     if any(column) and all(_NUMBER.fullmatch(text) for text in column if text not in ("", "-")):
         return "number"
-    if max(map(len, column)) <= _SHORT:
+    if max(map(len, column)) <= 16:  # not wrapped
         return "short"
-    return "long" if any(len(word) > _LONG for text in column for word in text.split()) else ""
+    return "long" if any(len(word) > 30 for text in column for word in text.split()) else ""  # such words are broken

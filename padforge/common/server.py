@@ -29,10 +29,8 @@ from padforge.common.validation import InputError
 HOST = "127.0.0.1"  # the loopback interface; other addresses are served only with a token
 MIN_TOKEN = 16  # characters
 POLL_S = 0.05  # interval at which a server checks whether to end
-END_S = 1.0  # time limit for the last message
 MIN_INTERVAL_S = 0.04  # between two messages to a browser
 KEEP_ALIVE_S = 5.0  # time without a message after which an empty one is sent, to detect a closed browser
-RETRY_MS = 1000  # time after which a browser reconnects
 HTTP_PORT = 80  # browsers omit it from the Host header
 
 # Takes the body of a post, and returns JSON or None; raises InputError for an invalid body.
@@ -88,7 +86,7 @@ class ConnectionServer(socketserver.ThreadingTCPServer):
 
     def __exit__(self, *error: object) -> None:
         self.shutdown()
-        self.end(END_S)
+        self.end(timeout_s=1.0)
         self.server_close()
 
     def end(self, timeout_s: float) -> None:
@@ -228,7 +226,7 @@ class _PageHandler(BaseHTTPRequestHandler):
             self._send(HTTPStatus.OK, "text/html; charset=utf-8", page, Content_Security_Policy=policy)
         elif self._url.path == "/events":
             self._send(HTTPStatus.OK, "text/event-stream")
-            self.wfile.write(f"retry: {RETRY_MS}\n\n".encode())
+            self.wfile.write(b"retry: 1000\n\n")  # ms after which a browser reconnects
             self.server.send_messages(self.wfile.write)
         else:
             self.send_error(HTTPStatus.NOT_FOUND)

@@ -25,7 +25,7 @@ _warn = partial(common.echo, err=True)
 
 
 def check_rig(name: str, simulated: bool = True) -> None:
-    """Raise InputError unless `--rig` names a rig, a real one if none is `simulated`."""
+    """Raise InputError unless `--rig` is the name of a rig; "simulated" is allowed if `simulated`."""
     from importlib.metadata import entry_points
 
     names = [*["simulated"] * simulated, "hand", *sorted(entry_points(group="padforge.arms").names)]
@@ -102,7 +102,7 @@ def record(
         raise InputError("--twin is of the simulated pad, allowed with --rig simulated")
     like = Twin.load(twin) if twin else None
     if not (simulated or morphology):
-        morphology = target.parent / "morphology.json"  # a real pad is named, never guessed
+        morphology = target.parent / "morphology.json"  # a real pad has no default
         if not morphology.is_file():
             raise InputError(f"--morphology is needed, of the pad under the arm: there is none at {morphology}")
         folder = common.pad_folder(morphology)
@@ -140,12 +140,12 @@ def record(
 
 
 def _bag_path(target: Path, dry_run: bool, resume: bool) -> Path:
-    """Return the path of the bag of a recording; raise InputError, before anything moves, if it cannot be written."""
+    """Return the path of the bag of a recording; raise InputError if it cannot be written."""
     from padforge.sense.formats.ros_writer import load_typestore
 
     if dry_run:
         raise InputError("--mcap exports what is recorded, and --dry-run keeps nothing")
-    named = target if target.name.strip(".") else target.resolve()  # "." and ".." are no names
+    named = target if target.name.strip(".") else target.resolve()  # "." and ".." have no name
     path = named.with_name(f"{named.name}.mcap")
     load_typestore(f"{path}: MCAP")
     if path.exists() and not resume:
@@ -176,7 +176,7 @@ def _record_with(rig: str, config: "RigConfig", model: Path | None, dry_run: boo
 
 
 def _record_by_hand(config: "RigConfig", resume: bool) -> "Recording":
-    """Show a person where to press, on a page and in the terminal, and take commands of both."""
+    """Record by hand, with the view and the commands on a page and in the terminal."""
     from padforge.sense.live.outputs import LivePage
     from padforge.sense.rig.by_hand import COMMANDS, pad_view, record_by_hand, view_lines
     from padforge.sense.rig.operation import make_board
@@ -199,7 +199,7 @@ def _record_by_hand(config: "RigConfig", resume: bool) -> "Recording":
             if draw is None and view["message"] != latest.get("message", ""):
                 common.echo(view["message"])
             if draw is not None and view["phase"] == "lift" != latest.get("phase"):
-                click.echo("\a", nl=False)  # eyes are on the pad
+                click.echo("\a", nl=False)  # a sound, since the person looks at the pad
             latest = pad | view
             page.show(latest)
             if draw is not None:

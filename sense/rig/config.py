@@ -36,7 +36,6 @@ from padforge.sense.settings import SIMULATED, Millimetres, RigSettings
 
 FABRICATION_FILE = "fabrication.json"
 FABRICATION_FORMAT = "padforge-fabrication/1"
-_ROUNDING_MM = 1e-6
 
 KIND = "rig"  # kind of source of a recording that an arm pressed
 _PLAN_KEYS = ("presses", "plan", "seed")
@@ -138,7 +137,7 @@ def locate_on_bed(rig: RigSettings, folder: Path) -> RigSettings:
     box = (
         *(max(x - half_x, dx), min(x + half_x, width + dx)),
         *(max(y - half_y, dy), min(y + half_y, depth + dy)),
-        *(max(contact - rig.max_depth_mm, frame.walls_mm) - _ROUNDING_MM, height + dz),
+        *(max(contact - rig.max_depth_mm, frame.walls_mm) - 1e-6, height + dz),
     )
     return rig.model_copy(
         update={

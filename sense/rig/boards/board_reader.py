@@ -17,9 +17,7 @@ SETTLE_S = 0.5  # time of blocks before the first samples are returned, so that 
 BUFFER_S = 60.0  # time of samples that are buffered for a program that does not read
 
 _START_S = 1.5  # longest wait for settled times
-_STALL_S = 1.0  # maximum silence of a board
 _BUCKET_S = 1.0  # of the arrivals in a bucket only the one with the minimum delay counts
-_MAX_BUCKETS = 60
 _MIN_STEP = 0.5  # between two returned times while the fitted line changes, in periods
 _MAX_STEP = 1.5  # the same
 
@@ -103,7 +101,7 @@ class BlockReader(threading.Thread):
                     self._n_buffered += len(block)
                 if self._n_buffered > self._capacity:
                     raise RigFault("data", f"{self._port}: nobody has read the samples for {BUFFER_S:g} s")
-            if silent_s > _STALL_S:
+            if silent_s > 1.0:
                 raise RigFault("stale", f"{self._port}: no sample for {silent_s:.1f} s", "reset the board")
 
 
@@ -180,7 +178,7 @@ class SampleClock:
         self._period_s, self._max_skew = period_s, max_skew
         self._origin: tuple[int, float] | None = None
         self._bucket_min: Point | None = None
-        self._buckets: deque[Point] = deque(maxlen=_MAX_BUCKETS)
+        self._buckets: deque[Point] = deque(maxlen=60)
         self._offset = 0.0
         self._slope = 0.0
         self._last: tuple[int, float] | None = None

@@ -22,7 +22,6 @@ LISTEN_S = 2.0  # time in which columns and rate are measured
 _START_S = 1.5  # lines of this time are ignored: opening the port resets many boards, which print a greeting
 _RATE_TOLERANCE = 0.05  # relative, of a measured rate
 _MIN_LINES = 10  # within `LISTEN_S`
-_COUNTS_V = 50.0  # higher readings are probably counts of a converter
 _LABEL = re.compile(rb"[A-Za-z_]\w*[:=]")
 _SEPARATOR = re.compile(rb"[,;\t ]+")
 
@@ -113,7 +112,7 @@ class CsvBoard(SerialBoard):
         level_v = float(np.median(np.abs(table[:, self._columns]))) * self._count_v
         counts = (
             f"; they rest at {level_v:.4g}: if that are counts, [rig] count_v is the volts of one"
-            if level_v > _COUNTS_V
+            if level_v > 50.0  # higher readings are probably counts of a converter
             else ""
         )
         return {
