@@ -176,16 +176,15 @@ def _without_unprinted(path: Path) -> bytes:
     content, count = BytesIO(), 0
     with zipfile.ZipFile(path) as package, zipfile.ZipFile(content, "w") as printed:
         for name in package.namelist():
-            part = package.read(name)
+            data = package.read(name)
             if name.lower().endswith(".model"):
-                model = ElementTree.fromstring(part)
-                parts = [(node, child) for node in model for child in node]
-                unprinted = [(node, child) for node, child in parts if not _is_printed(child)]
+                model = ElementTree.fromstring(data)
+                unprinted = [(node, child) for node in model for child in node if not _is_printed(child)]
                 for node, child in unprinted:
                     node.remove(child)
                 count += len(unprinted)
-                part = ElementTree.tostring(model) if unprinted else part
-            printed.writestr(name, part)
+                data = ElementTree.tostring(model) if unprinted else data
+            printed.writestr(name, data)
     if count:
         _log.warning("%s: %d objects that are not printed are left out", path, count)
     return content.getvalue()

@@ -99,7 +99,7 @@ def tray_body(plan: Plan) -> Body:
     """
     floor, rim = plan.settings.mould.floor_mm, plan.settings.mould.floor_mm + plan.silicone_mm
     tray = _tray(plan.tray, [plan.cavity, *plan.exits], floor, plan.silicone_mm, plan.flare_mm)
-    pillars = [Prism(part, floor - INTO_FLOOR_MM, rim) for part in shapely.get_parts(plan.pillars)]
+    pillars = [Prism(outline, floor - INTO_FLOOR_MM, rim) for outline in shapely.get_parts(plan.pillars)]
     pillars += [Prism(head, floor - INTO_FLOOR_MM, floor + plan.head_mm) for head in plan.heads]
     return replace(tray, adds=(*pillars, *(registration_pins(plan) if plan.settings.mould.pins else ())))
 

@@ -144,8 +144,8 @@ def _position_numbers(plan: "Plan", numbers: Sequence[BaseGeometry]) -> list[Bas
         for middle in np.split(middles, range(_NUMBER_TRIES, len(middles), _NUMBER_TRIES)):
             boxes = shapely.box(*(middle - half).T, *(middle + half).T)
             free = shapely.contains(floor, boxes)
-            for other in (*lines, *occupied):
-                free[free] = ~shapely.dwithin(other, boxes[free], clearance)
+            for obstacle in (*lines, *occupied):
+                free[free] = ~shapely.dwithin(obstacle, boxes[free], clearance)
             if free.any():
                 first = int(np.argmax(free))
                 occupied.append(boxes[first])
@@ -236,9 +236,9 @@ class Plan:
         curves = flatten(self.pad, tolerance_mm / self.pad.unit_mm)
         paths = []
         for (start, end), curve in zip(self.leads.pairs, curves, strict=True):
-            before, after = start.flatten_bends(tolerance_mm)[::-1], end.flatten_bends(tolerance_mm)
+            bends = start.flatten_bends(tolerance_mm)[::-1], end.flatten_bends(tolerance_mm)
             ends = start.point_past_edge(*past), end.point_past_edge(*past)
-            paths.append(np.vstack([ends[0], before, self.pad.to_mm(curve), after, ends[1]]))
+            paths.append(np.vstack([ends[0], bends[0], self.pad.to_mm(curve), bends[1], ends[1]]))
         return paths
 
     def trace(self, step: float, past_mm: float) -> list[tuple[Array, Array]]:

@@ -316,13 +316,12 @@ def _check_floor_thickness(mesh: TriangleMesh, printer: PrinterSettings) -> Find
     """
     limit = max(MIN_FLOOR_MM, 2 * printer.layer_mm)
     up, down = mesh.normal_z > _MIN_FLOOR_COSINE, mesh.normal_z < -_MIN_FLOOR_COSINE
-    both = zip(_measure_thickness(mesh, up, down), _measure_thickness(mesh, down, up), strict=True)
-    thicknesses, points = map(np.concatenate, both)
+    below, above = _measure_thickness(mesh, up, down), _measure_thickness(mesh, down, up)
+    thicknesses, points = map(np.concatenate, zip(below, above, strict=True))
     thickness = float(thicknesses.min(initial=mesh.bounds[1, 2] - mesh.bounds[0, 2]))
-    thin = thicknesses < tested_width(limit)
+    positions = _deduplicate(points[thicknesses < tested_width(limit)])
     message = f"the thinnest floor is {thickness:.2f} mm"
-    passed = thickness >= tested_width(limit)
-    return check_result("floor_thickness", passed, thickness, limit, message, _deduplicate(points[thin]))
+    return check_result("floor_thickness", thickness >= tested_width(limit), thickness, limit, message, positions)
 
 
 def _measure_thickness(mesh: TriangleMesh, start: FaceMask, end: FaceMask) -> tuple[Array, Array]:
@@ -357,7 +356,7 @@ def _check_overhang(mesh: TriangleMesh, printer: PrinterSettings) -> Finding:
 
 def _check_undercut(mesh: TriangleMesh, lowest: Slab) -> Finding:
     """Check that no face leans over the casting, which would hold it back in demoulding."""
-    holding = _before_void(mesh, _leaning(mesh, _UPRIGHT_DEG), lowest)
+    holding = _faces_at_silicone(mesh, _leaning(mesh, _UPRIGHT_DEG), lowest)
     lean = _max_lean_deg(mesh, holding)
     message = (
         f"faces lean over the casting by up to {lean:.1f}°" if holding.any() else "none, the casting can be demoulded"
@@ -379,7 +378,7 @@ def _max_lean_deg(mesh: TriangleMesh, mask: FaceMask) -> float:
     return math.degrees(math.asin(np.maximum(-mesh.normal_z[mask], 0.0).max(initial=0.0)))
 
 
-def _before_void(mesh: TriangleMesh, mask: FaceMask, lowest: Slab) -> FaceMask:
+def _faces_at_silicone(mesh: TriangleMesh, mask: FaceMask, lowest: Slab) -> FaceMask:
     """Return the faces of `mask` (m,) with silicone in front: an area enclosed by the solid, with a floor beneath."""
     faces = np.flatnonzero(mask & (mesh.centroids[:, 2] > lowest.middle_mm + _OFF_FACE_MM))
     crosses = np.cross(*np.moveaxis(np.diff(mesh.corners[faces], axis=1), 1, 0))
@@ -387,14 +386,15 @@ def _before_void(mesh: TriangleMesh, mask: FaceMask, lowest: Slab) -> FaceMask:
     x, y, z = (mesh.centroids[faces] + _OFF_FACE_MM * normals).T
     height = np.unique(np.round(z / _OFF_FACE_MM), return_inverse=True)[1]
     largest = np.argsort(-np.bincount(height, mesh.areas[faces]), kind="stable")[:_MAX_HEIGHTS]
-    before = np.zeros(len(mesh.triangles), dtype=bool)
-    floor = shapely.contains_xy(lowest.base, x, y)
+    result = np.zeros(len(mesh.triangles), dtype=bool)
+    has_floor = shapely.contains_xy(lowest.base, x, y)
     for index in largest:
         selected = height == index
         area = cut_solid(mesh.solid, float(z[selected].min()))
-        enclosed = shapely.contains_xy(fill_outline(area), x[selected], y[selected])
-        before[faces[selected]] = enclosed & ~shapely.contains_xy(area, x[selected], y[selected]) & floor[selected]
-    return before
+        is_enclosed = shapely.contains_xy(fill_outline(area), x[selected], y[selected])
+        is_solid = shapely.contains_xy(area, x[selected], y[selected])
+        result[faces[selected]] = is_enclosed & ~is_solid & has_floor[selected]
+    return result
 
 
 MAX_LEAK_MM = 10.0  # wider openings in a wall are not leaks, but the shape of a part that is not a tray
@@ -415,7 +415,7 @@ def _check_leaks(slabs: Sequence[Slab]) -> Finding:
 def _find_wall_leaks(section: BaseGeometry) -> list[BaseGeometry]:
     """Return the gaps in walls that would enclose an area without them."""
     closed = section.buffer(MAX_LEAK_MM / 2, join_style="mitre").buffer(-MAX_LEAK_MM / 2, join_style="mitre")
-    basins = [shapely.Polygon(ring) for part in shapely.get_parts(areas(closed)) for ring in part.interiors]
+    basins = [shapely.Polygon(ring) for polygon in shapely.get_parts(areas(closed)) for ring in polygon.interiors]
     if not basins:
         return []
     frame = shapely.box(*section.bounds).buffer(1.0, join_style="mitre")
@@ -430,7 +430,7 @@ def _find_wall_leaks(section: BaseGeometry) -> list[BaseGeometry]:
 def _find_floor_leaks(slabs: Sequence[Slab]) -> list[BaseGeometry]:
     """Return the parts of the lowest area enclosed by walls that have no solid beneath them."""
     for index, slab in enumerate(slabs[1:], 1):
-        rings = [ring for part in shapely.get_parts(slab.cross_section) for ring in part.interiors]
+        rings = [ring for polygon in shapely.get_parts(slab.cross_section) for ring in polygon.interiors]
         hollow = shapely.union_all([shapely.Polygon(ring) for ring in rings])
         if hollow.area > _MIN_BASIN * slabs[0].cross_section.envelope.area:
             bare = reduce(without, [lower.cross_section for lower in slabs[:index]], hollow)

@@ -103,8 +103,8 @@ def _list_fibres(noun: str, numbers: Sequence[int]) -> str:
     return f"{plural} {', '.join(map(str, numbers))}" if len(numbers) <= _MAX_NAMES else f"{len(numbers)} {plural}"
 
 
-def _points_in(parts: Iterable[Any]) -> list[Position]:
-    return [part.representative_point().coords[0] for part in parts]
+def _points_in(polygons: Iterable[Any]) -> list[Position]:
+    return [polygon.representative_point().coords[0] for polygon in polygons]
 
 
 def _ridge_middles(plan: Plan, layer: int) -> list[tuple[float, ...]]:
@@ -233,9 +233,10 @@ def _check_tray_wall(plan: Plan) -> Finding:
     border = plan.cavity.difference(plan.cavity.buffer(-reach, join_style="mitre"))
     end = INTO_WALL_MM + plan.settings.mould.exit_mm + 2 * reach
     middles = [ops.substring(line, end, line.length - end) for line in plan.lines]
-    near = [part for middle in middles for part in shapely.get_parts(middle.intersection(border)) if part.length]
-    gap = min(part.distance(wall) - half for part in near or middles)
-    positions = [ops.nearest_points(part, wall)[0].coords[0] for part in near]
+    pieces = chain(*(shapely.get_parts(middle.intersection(border)) for middle in middles))
+    close = [piece for piece in pieces if piece.length]
+    gap = min(piece.distance(wall) - half for piece in close or middles)
+    positions = [ops.nearest_points(piece, wall)[0].coords[0] for piece in close]
     message = f"ridges between their ends come within {gap:.2f} mm of the tray's wall"
     return check_result("tray_wall", grade(gap, limit), gap, limit, message, positions)
 
@@ -352,8 +353,8 @@ def _check_keep_outs(plan: Plan) -> Iterator[Finding]:
     message = (
         f"tracks of {_list_fibres('fibre', blocked)} run into keep-outs" if blocked else "no track runs into a keep-out"
     )
-    parts = [part for fibre in blocked for part in shapely.get_parts(shared[fibre]) if part.area > 0]
-    yield check_result("keep_out", not blocked, len(blocked), 0, message, _points_in(parts))
+    overlaps = [area for fibre in blocked for area in shapely.get_parts(shared[fibre]) if area.area > 0]
+    yield check_result("keep_out", not blocked, len(blocked), 0, message, _points_in(overlaps))
 
     mould = plan.shrinkage_compensated  # a pillar of one printed line bends; a thinner one cannot be printed
     line, region = mould.settings.printer.line_mm, overlap(mould.pillars, mould.cavity)

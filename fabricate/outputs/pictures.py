@@ -382,11 +382,11 @@ def draw_toolpath(plan: Plan, steps: Sequence[Step], path: Path) -> None:
         handles.append(lines[0])
     for turn, stroke in enumerate(strokes, 1):
         start, end = stroke.positions_mm[[0, -1]]
-        before, after = (2.5 * mirror_x(lead.outward) for lead in plan.leads.pairs[stroke.fibre])
+        start_offset, end_offset = (2.5 * mirror_x(lead.outward) for lead in plan.leads.pairs[stroke.fibre])
         axes.plot(*start, "o", mfc="none", mec=INK, ms=6)
         axes.plot(*end, "o", color=INK, ms=3)
-        picture.write(str(stroke.fibre + 1), start + before, 2.5)
-        picture.write(f"{turn}.", end + after, 2.5)
+        picture.write(str(stroke.fibre + 1), start + start_offset, 2.5)
+        picture.write(f"{turn}.", end + end_offset, 2.5)
     picture.save(path, handles)
 
 

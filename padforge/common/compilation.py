@@ -89,11 +89,11 @@ def _delete_older_caches(base: Path) -> None:
 def _caching_in(folder: Path) -> Iterator[None]:
     """Return a context in which decorated functions are cached in a folder; those of other programs are not."""
     with _decorating:
-        before, _numba.CACHE_DIR = _numba.CACHE_DIR, str(folder)
+        previous, _numba.CACHE_DIR = _numba.CACHE_DIR, str(folder)
         try:
             yield
         finally:
-            _numba.CACHE_DIR = before
+            _numba.CACHE_DIR = previous
 
 
 def _cached_njit(function: Callable[..., Any] | None = None, **options: Any) -> Any:

@@ -340,8 +340,8 @@ def check_replaceable(
     if isinstance(by, Path):
         is_same = sha256(by) == sha256(path)
     else:
-        before = _as_dict(_read_dict(path).get("provenance"))
-        is_same = all(before.get(key) == value for key, value in json.loads(json.dumps(by)).items())
+        stored = _as_dict(_read_dict(path).get("provenance"))
+        is_same = all(stored.get(key) == value for key, value in json.loads(json.dumps(by)).items())
     if not is_same and (dependents := find_dependents(path, remade)):
         *names, last = dependents
         listed = f"{', '.join(names)} and {last} were" if names else f"{last} was"

@@ -213,18 +213,18 @@ def _to_input_error(
 def _key_path(loc: Sequence[str | int], model: type[Settings], values: object) -> str:
     """Return the path of an error in the values of a model, such as contacts[0].radius.
 
-    Parts of `loc` that are neither keys nor indices are names of types, which pydantic inserts.
+    Items of `loc` that are neither keys nor indices are names of types, which pydantic inserts.
     """
     path = ""
-    for part in loc:
-        if isinstance(part, int):
-            path += f"[{part}]"
-        elif part in model.model_fields or (isinstance(values, Mapping) and part in values):
-            path += f".{part}"
+    for item in loc:
+        if isinstance(item, int):
+            path += f"[{item}]"
+        elif item in model.model_fields or (isinstance(values, Mapping) and item in values):
+            path += f".{item}"
         else:
             continue
         with suppress(LookupError, TypeError):  # a number in place of an array of one
-            values = cast("Any", values)[part]
+            values = cast("Any", values)[item]
     return path.removeprefix(".")
 
 

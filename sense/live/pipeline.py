@@ -312,17 +312,19 @@ class Live:
 
     def _advance(self, cut: int | None = None) -> list[Event]:
         """Return the events at the latest reading; with `cut`, the last ones of a press that ends there."""
-        press, now = self._press, self._buffer.end
+        press, until = self._press, self._buffer.end
         if press is None:
             return []
         if cut is not None:
-            now = max(cut, press.down_command + 1)
+            until = max(cut, press.down_command + 1)
             if press.up_command is None:
                 press.release(cut, self._buffer)
         press.store_opening(self._buffer)
-        end = None if press.up_command is None else press.up_command + RELEASE
-        is_complete = end is not None and (now >= end or cut is not None)
-        until = now if end is None else min(now, end)
+        is_complete = False
+        if press.up_command is not None:
+            end = press.up_command + RELEASE
+            is_complete = until >= end or cut is not None
+            until = min(until, end)
         events: list[Event] = []
         if is_complete or self._localizer.features == "windows":  # published features need a complete press
             events.append(self._estimate(press, until, is_complete))

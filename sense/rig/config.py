@@ -184,11 +184,11 @@ def read_source(config: RigConfig, rig: RigSettings, kind: str) -> dict[str, Any
         raise InputError(f"{config.out}: has no plan, so that it cannot be resumed")
     if source.get("kind") != kind:
         raise InputError(f"{config.out}: holds a recording of kind {source.get('kind')!r}, not {kind!r}")
-    now = _settings_and_pad(config, rig)
-    if source.get("morphology") != now["morphology"]:
+    current = _settings_and_pad(config, rig)
+    if source.get("morphology") != current["morphology"]:
         raise InputError(f"{config.out}: was begun with another pad than the one given")
-    for key in sorted(now["rig"].keys() - _CHANGEABLE):
-        if (stored := _get(source.get("rig"), key)) != (value := now["rig"][key]):
+    for key in sorted(current["rig"].keys() - _CHANGEABLE):
+        if (stored := _get(source.get("rig"), key)) != (value := current["rig"][key]):
             raise InputError(f"[rig] {key}: got {value}, the recording in {config.out} was begun with {stored}")
     return source
 

@@ -150,7 +150,7 @@ def check_target(pose: Sequence[float], speed_mm_s: float, acceleration_mm_s2: f
 
 
 def check_start_state(state: ArmState, limits: Limits) -> None:
-    """Raise RigFault("refused") if the first move would turn tool and cable too far, or the arm measures no force."""
+    """Raise RigFault("refused") if the first move would turn the tool too far, or a limited force is not measured."""
     if not (turn := turn_deg(state.pose[3:], limits.tool)) <= MAX_TURN_DEG:
         _refuse(f"the tool is held {turn:.0f} degrees away from [rig] tool_rad", f"at most {MAX_TURN_DEG:g}")
     if state.force_n is None and limits.max_force_n is not None:
