@@ -140,19 +140,26 @@ def _position_numbers(plan: "Plan", numbers: Sequence[BaseGeometry]) -> list[Bas
         inward = np.sign(second - start)  # along an axis: lines leave the walls at right angles
         start = np.where(inward > 0, plan.cavity.bounds[:2], start)
         middles = (start + depth[:, None] * inward + shift[:, None] * inward[::-1])[nearest_first]
-        half, position = np.array(number.bounds[2:]), None
-        for middle in np.split(middles, range(_NUMBER_TRIES, len(middles), _NUMBER_TRIES)):
-            boxes = shapely.box(*(middle - half).T, *(middle + half).T)
-            free = shapely.contains(floor, boxes)
-            for obstacle in (*lines, *occupied):
-                free[free] = ~shapely.dwithin(obstacle, boxes[free], clearance)
-            if free.any():
-                first = int(np.argmax(free))
-                occupied.append(boxes[first])
-                position = affinity.translate(number, *middle[first])
-                break
-        positioned.append(position)
+        half = np.array(number.bounds[2:])
+        middle = _find_free(middles, half, floor, [*lines, *occupied], clearance)
+        if middle is not None:
+            occupied.append(shapely.box(*(middle - half), *(middle + half)))
+        positioned.append(None if middle is None else affinity.translate(number, *middle))
     return positioned
+
+
+def _find_free(
+    middles: Array, half: Array, floor: BaseGeometry, obstacles: Sequence[BaseGeometry], clearance: float
+) -> Array | None:
+    """Return the first middle (2,), of (n, 2), of a box with half sides (2,) on the floor and clear of obstacles."""
+    for batch in np.split(middles, range(_NUMBER_TRIES, len(middles), _NUMBER_TRIES)):
+        boxes = shapely.box(*(batch - half).T, *(batch + half).T)
+        is_free = shapely.contains(floor, boxes)
+        for obstacle in obstacles:
+            is_free[is_free] = ~shapely.dwithin(obstacle, boxes[is_free], clearance)
+        if is_free.any():
+            return batch[np.argmax(is_free)]
+    return None
 
 
 class CommonTrack(NamedTuple):
