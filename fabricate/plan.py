@@ -436,15 +436,7 @@ class Plan:
         outlines = outlines.intersection(self.cavity.buffer(into_mm, join_style="mitre"))
         low, high = np.reshape(self.cavity.bounds, (2, 2))
         for axis in (0, 1):  # in sequence, so that corners are filled as well
-            extensions = []
-            for edge, out in ((low[axis], -1), (high[axis], 1)):
-                strip = np.stack([low, high])
-                strip[:, axis] = sorted((edge - out * _AT_WALL_MM, edge))
-                for contact in shapely.get_parts(outlines.intersection(shapely.box(*strip.ravel()))):
-                    box = np.reshape(contact.bounds, (2, 2))
-                    box[:, axis] = sorted((edge - out * _AT_WALL_MM, edge + out * into_mm))
-                    extensions.append(shapely.box(*box.ravel()))
-            outlines = shapely.union_all([outlines, *extensions])
+            outlines = shapely.union_all([outlines, *_wall_extensions(outlines, low, high, axis, into_mm)])
             low[axis], high[axis] = low[axis] - into_mm, high[axis] + into_mm
         return areas(shapely.set_precision(outlines, SNAP_MM))
 
@@ -490,6 +482,21 @@ class Plan:
     def tray(self) -> shapely.Polygon:
         """Outline of the mould, walls included, mm."""
         return offset_box(self.cavity, self.flare_mm, self.corner_mm)
+
+
+def _wall_extensions(
+    outlines: BaseGeometry, low: Array, high: Array, axis: int, into_mm: float
+) -> list[shapely.Polygon]:
+    """Return boxes that extend outlines into the walls, at `low` and `high` (2,) along an axis, that they touch."""
+    extensions = []
+    for edge, outward in ((low[axis], -1), (high[axis], 1)):
+        strip = np.stack([low, high])
+        strip[:, axis] = sorted((edge - outward * _AT_WALL_MM, edge))
+        for contact in shapely.get_parts(outlines.intersection(shapely.box(*strip.ravel()))):
+            box = np.reshape(contact.bounds, (2, 2))
+            box[:, axis] = sorted((edge - outward * _AT_WALL_MM, edge + outward * into_mm))
+            extensions.append(shapely.box(*box.ravel()))
+    return extensions
 
 
 def overlap(first: BaseGeometry, second: BaseGeometry) -> BaseGeometry:
