@@ -1,5 +1,6 @@
 """The commands `padforge sense record` and `doctor`."""
 
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, closing
 from functools import partial
 from pathlib import Path
@@ -14,6 +15,7 @@ from padforge.sense.cli.options import FILE, FOLDER, recording_line, redrawn_lin
 if TYPE_CHECKING:
     from padforge.design.morphology import Morphology
     from padforge.design.settings import PadSettings
+    from padforge.sense.live.outputs import LivePage
     from padforge.sense.recording.recording import Recording
     from padforge.sense.rig.config import RigConfig
 
@@ -178,7 +180,7 @@ def _record_with(rig: str, config: "RigConfig", model: Path | None, dry_run: boo
 def _record_by_hand(config: "RigConfig", resume: bool) -> "Recording":
     """Record by hand, with the view and the commands on a page and in the terminal."""
     from padforge.sense.live.outputs import LivePage
-    from padforge.sense.rig.by_hand import COMMANDS, pad_view, record_by_hand, view_lines
+    from padforge.sense.rig.by_hand import COMMANDS, pad_view, record_by_hand
     from padforge.sense.rig.operation import make_board
 
     commands = {row["key"]: row["command"] for row in COMMANDS}
@@ -187,28 +189,39 @@ def _record_by_hand(config: "RigConfig", resume: bool) -> "Recording":
         page = stack.enter_context(LivePage(0, "hand.html", commands.values()))
         _warn(f"page: {page.url} (q ends)")
         draw, typed = stack.enter_context(redrawn_lines()), stack.enter_context(typed_keys())
-        latest = pad = pad_view(config.pad, str(config.out), bool(config.rig.mirrored))
-
-        @stack.push
-        def show_end(kind: object, error: BaseException | None, trace: object) -> None:
-            if latest is not pad:
-                page.show(latest | {"ended": str(error or "") or "ended"})
-
-        def show(view: dict[str, Any]) -> None:
-            nonlocal latest
-            if draw is None and view["message"] != latest.get("message", ""):
-                common.echo(view["message"])
-            if draw is not None and view["phase"] == "lift" != latest.get("phase"):
-                click.echo("\a", nl=False)  # a sound, since the person looks at the pad
-            latest = pad | view
-            page.show(latest)
-            if draw is not None:
-                draw(view_lines(latest))
+        display = _HandDisplay(page, draw, pad_view(config.pad, str(config.out), bool(config.rig.mirrored)))
+        stack.push(display.show_end)
 
         def poll_commands() -> list[str]:
             return [*page.read_commands(), *(commands[key] for key in typed() if key in commands)]
 
-        return record_by_hand(config, board, show, poll_commands, resume)
+        return record_by_hand(config, board, display.show, poll_commands, resume)
+
+
+class _HandDisplay:
+    """Shows the views of a session on a page, and in a terminal if there is one (`draw`)."""
+
+    def __init__(self, page: "LivePage", draw: Callable[[Sequence[str]], None] | None, pad: Mapping[str, Any]) -> None:
+        self._page, self._draw, self._pad = page, draw, pad
+        self._latest: dict[str, Any] = {}
+
+    def show(self, view: dict[str, Any]) -> None:
+        """Show a view; without a terminal, print its message if that has changed."""
+        from padforge.sense.rig.by_hand import view_lines
+
+        previous, self._latest = self._latest, {**self._pad, **view}
+        if self._draw is None and view["message"] != previous.get("message", ""):
+            common.echo(view["message"])
+        if self._draw is not None and view["phase"] == "lift" != previous.get("phase"):
+            click.echo("\a", nl=False)  # a sound, since the person looks at the pad
+        self._page.show(self._latest)
+        if self._draw is not None:
+            self._draw(view_lines(self._latest))
+
+    def show_end(self, kind: object, error: BaseException | None, trace: object) -> None:
+        """Show the reason of the end on the page, if the session has begun."""
+        if self._latest:
+            self._page.show(self._latest | {"ended": str(error or "") or "ended"})
 
 
 @click.command()
