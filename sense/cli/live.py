@@ -212,13 +212,15 @@ class EventPrinter:
     def _is_news(self, estimate: "Estimate") -> bool:
         """Return whether to print an estimate, and remember it if so."""
         latest = self._latest
-        is_same_press = latest is not None and latest.press == estimate.press
-        if is_same_press and not (
-            estimate.final or estimate.is_sharper_than(latest) or estimate.has_moved_from(latest)
-        ):
-            return False
-        self._latest = estimate
-        return True
+        is_news = (
+            latest is None
+            or latest.press != estimate.press
+            or estimate.final
+            or estimate.is_sharper_than(latest)
+            or estimate.has_moved_from(latest)
+        )
+        self._latest = estimate if is_news else latest
+        return is_news
 
 
 def view_lines(view: dict[str, Any]) -> list[str]:
