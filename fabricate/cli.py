@@ -46,7 +46,7 @@ def fabricate() -> None:
 
 
 class _FormatsOption(click.Option):
-    """Option whose help lists the formats; they are imported only where it is shown."""
+    """An option whose help lists the formats; they are imported only when the help is shown."""
 
     def get_help_record(self, ctx: click.Context) -> tuple[str, str] | None:
         from padforge.fabricate.export import FORMATS
@@ -103,7 +103,7 @@ def build(morphology: Path, formats: tuple[str, ...], spec: Path | None, out: Pa
 
 
 def mould_lines(document: dict[str, Any], out: Path) -> list[str]:
-    """Summarise a fabrication document in a few lines: the mould, and the findings to look at."""
+    """Summarise a fabrication document in a few lines: the mould, and the findings that did not pass."""
     size = " x ".join(f"{round(side, 2):g}" for side in document["size_mm"])
     remarks = [finding for finding in document["findings"] if finding["status"] != "pass"]
     passed = len(document["findings"]) - len(remarks)
@@ -161,9 +161,13 @@ def _line(finding: dict[str, Any]) -> str:
 
 
 def mould_costs(pad: "Morphology", spec: "Spec", folder: Path) -> dict[str, float]:
-    """Build the mould of a pad, write fabrication.json and .stl to `folder`, and return what it costs.
+    """Build the mould of a pad, write fabrication.json and .stl to `folder`, and return its costs.
 
-    That is ml, failed checks, and of a layer the force of a press and the greatest stretch of a fibre under it.
+    Returns:
+        "mould_ml" and "silicone_ml": volumes of plastic and silicone.
+        "failed": number of failed checks.
+        "strain_percent": maximum strain of a fibre under a press, if the contact is a layer.
+        "force_n": force of a press, if in addition the modulus of the silicone is known.
     """
     from padforge.design.contact import contact_press, fibre_strains
     from padforge.design.layer import reduced_modulus_kpa

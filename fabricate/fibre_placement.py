@@ -14,8 +14,7 @@ from padforge.fabricate.checks import Finding, check_result
 from padforge.fabricate.plan import FibreLayer, Plan, fibre_layers, fibre_name, without
 from padforge.fabricate.settings import DispenserSettings
 
-TOLERANCE_MM = 0.005
-"""Maximum distance of a toolpath from its curve: a tenth of a fine gantry's repeatability."""
+TOLERANCE_MM = 0.005  # maximum distance of a toolpath from its curve: a tenth of a fine gantry's repeatability
 _FLAT_SHARE = 0.2  # fraction of the tolerance for flattening
 _SIMPLIFY_SHARE = 0.8  # fraction of the tolerance for simplification, which removes most points
 _MAX_TURN = 0.02  # between two samples of the heading, radians

@@ -22,7 +22,6 @@ from padforge.fabricate.plan import Plan, polygon_rings
 Numbers = NDArray[np.int64]
 _log = logging.getLogger(__name__)
 
-_STL_HEADER = b"padforge, mm".ljust(80)
 _STL_RECORD = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
 
 _STL_HEAD_BYTES = 84  # header of a binary STL, and its number of triangles
@@ -98,7 +97,7 @@ def write_stl(path: Path, vertices: np.ndarray, triangles: np.ndarray) -> None:
     records = np.zeros(len(corners), _STL_RECORD)
     records["normal"] = np.divide(normals, lengths, out=np.zeros_like(normals), where=lengths > 0)
     records["corners"] = corners
-    path.write_bytes(_STL_HEADER + np.uint32(len(records)).astype("<u4").tobytes() + records.tobytes())
+    path.write_bytes(b"padforge, mm".ljust(80) + np.uint32(len(records)).astype("<u4").tobytes() + records.tobytes())
 
 
 def write_3mf(path: Path, vertices: np.ndarray, triangles: np.ndarray, *, name: str, title: str, material: str) -> None:
@@ -177,16 +176,15 @@ def _without_unprinted(path: Path) -> bytes:
     content, count = BytesIO(), 0
     with zipfile.ZipFile(path) as package, zipfile.ZipFile(content, "w") as printed:
         for name in package.namelist():
-            part = package.read(name)
+            data = package.read(name)
             if name.lower().endswith(".model"):
-                model = ElementTree.fromstring(part)
-                parts = [(node, child) for node in model for child in node]
-                unprinted = [(node, child) for node, child in parts if not _is_printed(child)]
+                model = ElementTree.fromstring(data)
+                unprinted = [(node, child) for node in model for child in node if not _is_printed(child)]
                 for node, child in unprinted:
                     node.remove(child)
                 count += len(unprinted)
-                part = ElementTree.tostring(model) if unprinted else part
-            printed.writestr(name, part)
+                data = ElementTree.tostring(model) if unprinted else data
+            printed.writestr(name, data)
     if count:
         _log.warning("%s: %d objects that are not printed are left out", path, count)
     return content.getvalue()

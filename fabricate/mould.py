@@ -19,10 +19,8 @@ from padforge.fabricate.settings import WELL_MM, WELL_RIM_MM, WELL_SLOT_MM
 
 BODY_COLOURS = {"mould": "#8FA3B8", "lid": "#D9C27E", "conductive": "#6F8F72", "holder": "#B0886E"}
 """The printed bodies, and their colours in CAD programs and slicers."""
-INTO_FLOOR_MM = 0.2
-"""Overlap of a part with the solid below it, so that no two faces coincide."""
-LID_MM = 3.0
-"""Thickness of the lid."""
+INTO_FLOOR_MM = 0.2  # overlap of a part with the solid below it, so that no two faces coincide
+LID_MM = 3.0  # thickness of the lid
 _VENT_MM = 1.5  # diameter of the lid's vents
 _VENT_INSET_MM = 3.0  # distance of the vents from the cavity's rim
 _BORE_MM = 6.0  # diameter of the spout's bore
@@ -30,11 +28,9 @@ _FUNNEL_MM = 6.0  # height of the spout's funnel
 _FUNNEL_WALL_MM = 2.0
 _FUNNEL_FLARE_MM = _FUNNEL_MM * math.tan(math.radians(30.0))  # increase of the funnel's radius up to its top
 _PIN_CLEARANCE_MM = 0.3  # difference in diameter between the lid's holes and the pins
-_PILLAR_GAP_MM = 0.5  # minimum distance between a bore of the lid and a pillar
 HOLDER_WALL_MM = 1.0
 """Height of the holder's walls above its floor, far below the pad's surface, so that no probe touches them."""
-HOLDER_PLAY_MM = 0.2
-"""Clearance on every side of the pad in its holder."""
+HOLDER_PLAY_MM = 0.2  # clearance on every side of the pad in its holder
 
 Position = tuple[float, float]
 
@@ -103,7 +99,7 @@ def tray_body(plan: Plan) -> Body:
     """
     floor, rim = plan.settings.mould.floor_mm, plan.settings.mould.floor_mm + plan.silicone_mm
     tray = _tray(plan.tray, [plan.cavity, *plan.exits], floor, plan.silicone_mm, plan.flare_mm)
-    pillars = [Prism(part, floor - INTO_FLOOR_MM, rim) for part in shapely.get_parts(plan.pillars)]
+    pillars = [Prism(outline, floor - INTO_FLOOR_MM, rim) for outline in shapely.get_parts(plan.pillars)]
     pillars += [Prism(head, floor - INTO_FLOOR_MM, floor + plan.head_mm) for head in plan.heads]
     return replace(tray, adds=(*pillars, *(registration_pins(plan) if plan.settings.mould.pins else ())))
 
@@ -228,7 +224,7 @@ def lid_holes(plan: Plan) -> int:
 
 def _free_position(plan: Plan, wanted: Position, diameter_mm: float) -> Position:
     """Return the position nearest to `wanted` where a bore of the lid is clear of pillars."""
-    reach = diameter_mm / 2 + _PILLAR_GAP_MM
+    reach = diameter_mm / 2 + 0.5  # 0.5 mm between a bore of the lid and a pillar
     if not plan.pillars.area or plan.pillars.distance(shapely.Point(wanted)) >= reach:
         return wanted
     bounds = np.reshape(offset_box(plan.cavity, -reach).bounds, (2, 2))

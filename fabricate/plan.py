@@ -38,8 +38,7 @@ FAMILIES = ("horizontal", "vertical")
 FAMILY_COLOURS = (HORIZONTAL, VERTICAL)
 INTO_WALL_MM = 0.5
 """Depth of ridges in the walls: the tracks open to the pad's sides, and no two faces of the mould coincide."""
-COVER_MM = 1.0
-"""Minimum silicone over the deepest track; a pad of more than two layers is made thicker for it."""
+COVER_MM = 1.0  # minimum silicone over the deepest track; a pad of more than two layers is made thicker for it
 SNAP_MM = 1e-4
 """Grid to which areas are snapped by Boolean operations, mm.
 
@@ -141,19 +140,26 @@ def _position_numbers(plan: "Plan", numbers: Sequence[BaseGeometry]) -> list[Bas
         inward = np.sign(second - start)  # along an axis: lines leave the walls at right angles
         start = np.where(inward > 0, plan.cavity.bounds[:2], start)
         middles = (start + depth[:, None] * inward + shift[:, None] * inward[::-1])[nearest_first]
-        half, position = np.array(number.bounds[2:]), None
-        for middle in np.split(middles, range(_NUMBER_TRIES, len(middles), _NUMBER_TRIES)):
-            boxes = shapely.box(*(middle - half).T, *(middle + half).T)
-            free = shapely.contains(floor, boxes)
-            for other in (*lines, *occupied):
-                free[free] = ~shapely.dwithin(other, boxes[free], clearance)
-            if free.any():
-                first = int(np.argmax(free))
-                occupied.append(boxes[first])
-                position = affinity.translate(number, *middle[first])
-                break
-        positioned.append(position)
+        half = np.array(number.bounds[2:])
+        middle = _find_free(middles, half, floor, [*lines, *occupied], clearance)
+        if middle is not None:
+            occupied.append(shapely.box(*(middle - half), *(middle + half)))
+        positioned.append(None if middle is None else affinity.translate(number, *middle))
     return positioned
+
+
+def _find_free(
+    middles: Array, half: Array, floor: BaseGeometry, obstacles: Sequence[BaseGeometry], clearance: float
+) -> Array | None:
+    """Return the first middle (2,), of (n, 2), of a box with half sides (2,) on the floor and clear of obstacles."""
+    for batch in np.split(middles, range(_NUMBER_TRIES, len(middles), _NUMBER_TRIES)):
+        boxes = shapely.box(*(batch - half).T, *(batch + half).T)
+        is_free = shapely.contains(floor, boxes)
+        for obstacle in obstacles:
+            is_free[is_free] = ~shapely.dwithin(obstacle, boxes[is_free], clearance)
+        if is_free.any():
+            return batch[np.argmax(is_free)]
+    return None
 
 
 class CommonTrack(NamedTuple):
@@ -237,9 +243,9 @@ class Plan:
         curves = flatten(self.pad, tolerance_mm / self.pad.unit_mm)
         paths = []
         for (start, end), curve in zip(self.leads.pairs, curves, strict=True):
-            before, after = start.flatten_bends(tolerance_mm)[::-1], end.flatten_bends(tolerance_mm)
+            bends = start.flatten_bends(tolerance_mm)[::-1], end.flatten_bends(tolerance_mm)
             ends = start.point_past_edge(*past), end.point_past_edge(*past)
-            paths.append(np.vstack([ends[0], before, self.pad.to_mm(curve), after, ends[1]]))
+            paths.append(np.vstack([ends[0], bends[0], self.pad.to_mm(curve), bends[1], ends[1]]))
         return paths
 
     def trace(self, step: float, past_mm: float) -> list[tuple[Array, Array]]:
@@ -430,15 +436,7 @@ class Plan:
         outlines = outlines.intersection(self.cavity.buffer(into_mm, join_style="mitre"))
         low, high = np.reshape(self.cavity.bounds, (2, 2))
         for axis in (0, 1):  # in sequence, so that corners are filled as well
-            extensions = []
-            for edge, out in ((low[axis], -1), (high[axis], 1)):
-                strip = np.stack([low, high])
-                strip[:, axis] = sorted((edge - out * _AT_WALL_MM, edge))
-                for contact in shapely.get_parts(outlines.intersection(shapely.box(*strip.ravel()))):
-                    box = np.reshape(contact.bounds, (2, 2))
-                    box[:, axis] = sorted((edge - out * _AT_WALL_MM, edge + out * into_mm))
-                    extensions.append(shapely.box(*box.ravel()))
-            outlines = shapely.union_all([outlines, *extensions])
+            outlines = shapely.union_all([outlines, *_wall_extensions(outlines, low, high, axis, into_mm)])
             low[axis], high[axis] = low[axis] - into_mm, high[axis] + into_mm
         return areas(shapely.set_precision(outlines, SNAP_MM))
 
@@ -484,6 +482,21 @@ class Plan:
     def tray(self) -> shapely.Polygon:
         """Outline of the mould, walls included, mm."""
         return offset_box(self.cavity, self.flare_mm, self.corner_mm)
+
+
+def _wall_extensions(
+    outlines: BaseGeometry, low: Array, high: Array, axis: int, into_mm: float
+) -> list[shapely.Polygon]:
+    """Return boxes that extend outlines into the walls, at `low` and `high` (2,) along an axis, that they touch."""
+    extensions = []
+    for edge, outward in ((low[axis], -1), (high[axis], 1)):
+        strip = np.stack([low, high])
+        strip[:, axis] = sorted((edge - outward * _AT_WALL_MM, edge))
+        for contact in shapely.get_parts(outlines.intersection(shapely.box(*strip.ravel()))):
+            box = np.reshape(contact.bounds, (2, 2))
+            box[:, axis] = sorted((edge - outward * _AT_WALL_MM, edge + outward * into_mm))
+            extensions.append(shapely.box(*box.ravel()))
+    return extensions
 
 
 def overlap(first: BaseGeometry, second: BaseGeometry) -> BaseGeometry:

@@ -1,14 +1,14 @@
 """From an idea to a calibrated soft strain-sensor pad.
 
-`padforge.design`, `padforge.fabricate` and `padforge.sense` are the three stages. The names that most programs begin
-with are here too: `padforge.search`, `padforge.build`, `padforge.Localizer`. All load on first use.
+`padforge.design`, `padforge.fabricate` and `padforge.sense` are the three stages. The names that most programs need are
+also in this package: `padforge.search`, `padforge.build`, `padforge.Localizer`. All are loaded on first use.
 """
 
 from pathlib import Path
 
 import lazy_loader
 
-# a checkout has the stages beside this package, a wheel has them inside it
+# A checkout has the stages beside this package, a wheel has them inside it.
 if not (Path(__file__).parent / "design").is_dir():
     __path__.append(str(Path(__file__).parents[1]))
 

@@ -25,7 +25,7 @@ from .settings import SECTIONS, check_settings, section_models
 try:
     from padforge.benchmarks.cli import bench
 except ModuleNotFoundError as error:
-    if not (error.name or "").startswith("padforge.benchmarks"):  # else an installed wheel, which has none
+    if not (error.name or "").startswith("padforge.benchmarks"):  # a wheel has no benchmarks
         raise
 
     @click.command(context_settings={"ignore_unknown_options": True, "allow_extra_args": True})
@@ -42,7 +42,7 @@ PRESETS = {
 """Settings other than the defaults, by section, that `padforge init` can write."""
 
 EXTRAS = {"design": "design", "fabricate": "cad", "sense": "train", "study": "train"}
-"""Optional dependencies in `pyproject.toml` of each stage; commands that chain stages need all of them."""
+"""Optional dependencies, as in `pyproject.toml`, of each stage; commands that chain stages need all of them."""
 
 
 @click.group(context_settings={"help_option_names": ["-h", "--help"]})

@@ -12,7 +12,7 @@ PAD = "morphology.json"
 
 
 def write_report(folder: Path) -> Path:
-    """Write `report.html` on the results of all stages in a folder; a stage without results has no section.
+    """Write `report.html` with a section on each stage that has results in a folder.
 
     Args:
         folder: folder of the pad.
@@ -82,7 +82,7 @@ def write_report(folder: Path) -> Path:
 
 
 def _materials(folder: Path, format_: str) -> tuple[float | None, tuple[str, float] | None]:
-    """Return what `press_sections` asks of the materials of the mould in a folder, as far as it is known."""
+    """Return the arguments of `press_sections` on the materials of the mould in a folder, None if unknown."""
     path = folder / "fabrication.json"
     if not path.exists():
         return None, None
@@ -96,7 +96,7 @@ def _materials(folder: Path, format_: str) -> tuple[float | None, tuple[str, flo
 def _find_mismatches(
     folder: Path, stage: str, document: Mapping[str, Any], recording: Callable[[], str | None]
 ) -> Iterator[str]:
-    """Yield whether a result is of another pad than the morphology.json in the folder, or of another recording."""
+    """Yield a message if a result is of another pad than the folder's morphology.json, or of another recording."""
     origin = document["provenance"]
     inputs, name = origin.get("inputs", {}), f"{stage} ({origin.get('command')})"
     pad = document.get("morphology_sha256") if stage == "design" else inputs.get(PAD)
@@ -118,7 +118,7 @@ def _describe_inputs(folder: Path, inputs: Mapping[str, Any]) -> Iterator[str]:
     for name, digest in inputs.items():
         if not isinstance(digest, str):  # the provenance of an input that was computed
             yield f"{name}: {digest['command']}" if digest else name
-        elif Path(name).name == name and (folder / name).is_file():  # never opens a file in another folder
+        elif Path(name).name == name and (folder / name).is_file():  # a name with a folder is never opened
             match = "the one here" if find_unchanged(folder, {name: digest}) else "not the one here"
             yield f"{name} {digest} ({match})"
         else:

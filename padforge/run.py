@@ -1,7 +1,7 @@
 """Chain all stages of a pad, as `padforge run` does: design, mould, recording, contact comparison, calibration.
 
 A run may have a time budget. Every stage is cached by the digest of its settings and inputs, so that an interrupted run
-is resumed where it ended.
+can be resumed.
 """
 
 import hashlib
@@ -39,18 +39,17 @@ _STAGE_SECTIONS = {
 }
 """Sections that the result of each stage depends on."""
 
-SEARCH_SHARE = 0.5
-"""Largest share of the time budget that the search may use."""
-RESERVE_S = 30.0
-"""Part of the time budget reserved for radii, errors, fault detection, figures and report after the training, s."""
-FORMAT, NAME = "padforge-run/1", "run.json"
+SEARCH_SHARE = 0.5  # maximum fraction of the time budget for the search
+RESERVE_S = 30.0  # reserved after the training for calibration of radii, errors, fault detection, figures and report
+FORMAT = "padforge-run/1"
+NAME = "run.json"
 PAD = "morphology.json"
 
 Result = TypeVar("Result")
 
 
 def _read_section(spec: "Spec", name: str) -> "Settings":
-    """Read a section; the contact with lengths of the pad as it will be cast."""
+    """Read a section; the contact is completed with the lengths of the cast pad."""
     from padforge.design.settings import read_contact
 
     return read_contact(spec) if name == "contact" else spec.section(resolve_name(SECTIONS[name]))
@@ -89,10 +88,10 @@ class Run:
 
 
 class _StageCache:
-    """Stages that a run has finished, noted in `run.json`, and those of them whose earlier results were `reused`."""
+    """The finished stages of a run, recorded in `run.json`; `reused` lists those loaded from an earlier run."""
 
     def __init__(self, run: Run) -> None:
-        """Read the note of an earlier run, or delete it if it is not to be resumed."""
+        """Read the record of an earlier run, or delete it if the run is not resumed."""
         self.reused: list[str] = []
         self._run, self._note = run, run.out / NAME
         self._stages: dict[str, dict[str, Any]] = {}
@@ -101,7 +100,7 @@ class _StageCache:
                 for stage, entry in dict(read_json(self._note, FORMAT)["stages"]).items():
                     files = {str(name): digest for name, digest in dict(entry["files"]).items()}
                     self._stages[stage] = {"cache_key": entry["cache_key"], "files": files}
-        if not self._stages:  # from now on the results of another run are replaced
+        if not self._stages:  # results of an earlier run will be replaced
             self._note.unlink(missing_ok=True)
 
     def get(
@@ -112,16 +111,22 @@ class _StageCache:
         load: Callable[[], Result],
         **inputs: Any,
     ) -> Result:
-        """Return the result of a stage: loaded if an earlier run had the same settings and inputs, else computed.
+        """Return the result of a stage, loaded if an earlier run had the same settings and inputs, otherwise computed.
 
-        `compute` may note a result with its files, as soon as they are written; one without files is not noted.
+        Args:
+            stage: name of the stage.
+            files: returns the names of a result's files; results without files are not recorded.
+            compute: computes the result; its argument is a function that it may call to record the result as soon as
+                its files are written.
+            load: loads an earlier result.
+            **inputs: digests of the inputs.
         """
         from padforge.design.settings import Contact
 
         run, names = self._run, _STAGE_SECTIONS[stage]
         content = {
             "settings": {name: _read_section(run.spec, name).model_dump(mode="json") for name in names},
-            # a contact that is stated is designed for, even if it is the default one
+            # A search uses a stated contact alone, even if it equals the default.
             "stated": {"contact": run.spec.stated(Contact)} if "contact" in names else {},
             "seed": run.seed,
             "inputs": inputs,
@@ -147,10 +152,11 @@ class _StageCache:
 
 
 def check_run(run: Run) -> None:
-    """Raise now what would fail only after minutes of work, or replace data that no run makes again.
+    """Check for errors that would occur only after minutes of work, and for data that a run must not replace.
 
     Raises:
-        InputError: invalid or inconsistent settings, a measured recording, or a pad or localizer that is in use.
+        InputError: settings are invalid or inconsistent, or the folder has a measured recording, or a pad or localizer
+            that is in use.
     """
     import numpy as np
 
@@ -201,7 +207,7 @@ def check_run(run: Run) -> None:
 
 
 def _regenerated_files() -> set[str]:
-    """Return the names of the files that a run makes anew with the pad."""
+    """Return the names of the files that a run writes together with the pad."""
     from padforge.sense.report.calibration import FILES
 
     return {"fabrication.json", "recording", "contacts.json", *FILES}
@@ -266,7 +272,7 @@ def run_stages(
     if design.stopped == "interrupted":
         return INTERRUPTED
     if not design.stopped:
-        Checkpoints(out / "search", {}).clear()  # a kill leaves them just after the results are written
+        Checkpoints(out / "search", {}).clear()  # left by a run that was killed just after it wrote its results
     pad, source, digest = design.morphology, [out / PAD], sha256(out / PAD)
     settings = FabricationSettings.from_spec(spec)
     mould = cache.get(

@@ -21,8 +21,6 @@ SECTIONS = {
 }
 """Sections of a `pad.toml`, and the model of each."""
 
-_LAYOUT_KEYS = {"grid", "horizontals", "verticals", "pitch_mm", "size_mm"}
-
 
 def section_models() -> "dict[str, type[Settings]]":
     """Import the models of all sections, by name."""
@@ -30,25 +28,22 @@ def section_models() -> "dict[str, type[Settings]]":
 
 
 def check_settings(spec: "Spec") -> None:
-    """Check every section, and each against the others, whichever of them a command needs.
+    """Check all sections, and each against the others, also those that a command does not need.
 
-    Fibres and pitch of the pad are compared only if they are stated: most commands take them from a morphology.
-
-    Args:
-        spec: settings file.
+    Fibres and pitch of the pad are compared only if they are stated, since most commands take them from a morphology.
 
     Raises:
-        InputError: an unknown key, a value out of range, or two sections that contradict each other.
+        InputError: a key is unknown, a value out of range, or two sections contradict each other.
     """
     from padforge.design.settings import PadSettings
     from padforge.fabricate import FabricationSettings
     from padforge.sense.settings import read_rig
 
     for model in section_models().values():
-        if model.section() != "contact":  # is read below, with the lengths of the pad as it will be cast
+        if model.section() != "contact":  # read by `FabricationSettings`, completed with the lengths of the cast pad
             spec.section(model)
     fabrication, rig = FabricationSettings.from_spec(spec), read_rig(spec)
-    if spec.stated(PadSettings).keys() & _LAYOUT_KEYS:
+    if spec.stated(PadSettings).keys() & {"grid", "horizontals", "verticals", "pitch_mm", "size_mm"}:
         layout = spec.section(PadSettings).layout
         fabrication.require_consistent(layout)
         rig.inputs(layout.fibres)

@@ -21,21 +21,16 @@ from padforge.fabricate.plan import Plan, polygon_rings
 Array = NDArray[np.float64]
 Arc = tuple[float, float, float, float, float]
 """Centre x and y, radius, start angle and swept angle (positive counter-clockwise), radians."""
-Joints = dict[tuple[float, float], Array]
-"""Direction (2,) of the fibre at every joint, by x and y in mm."""
+Joints = dict[tuple[float, float], Array]  # direction (2,) of the fibre at every joint, by x and y in mm
 
-FINE_MM = 3e-4
-"""Tolerance of the drawn rings against the exact outlines; their vertices are much closer."""
+FINE_MM = 3e-4  # tolerance of the drawn rings against the exact outlines; their vertices are much closer
 MAX_SPANS = 8
 """Longer splines are cut: the CAD kernel's default integration is inexact on edges of many spans (1.4e-4 at twelve)."""
 _JOINT_MM = 1e-3  # maximum distance of a joint from its outline; others lie inside, where walls merge
-_CORNER_RAD = 0.2  # turn at a vertex above which it is a corner; vertices of drawn curves turn less
 _STRAIGHT_MM = 1e-3  # sagitta above which an edge is straight; chords of drawn curves have several times less
 _ARC_TOLERANCE_MM = 1e-4  # of arcs and straight runs
 _KNOT_DECIMALS = 4  # of knots, mm; further decimals lengthen STEP files and depend on memory alignment
 _MIN_SPAN_MM = 1e-3  # minimum distance of inner knots from the ends
-_MIN_SAMPLES = 4  # samples of every edge at which a fit is checked
-_SAMPLE_MM = 0.1  # maximum distance between samples
 _ALONG_FACTOR = 20  # tolerance of the parameter against the arc length over that of the shape, which it hardly changes
 
 
@@ -86,7 +81,7 @@ def ring_curves(ring: Array, joints: Joints, fit_mm: float) -> Iterator[OutlineC
     previous = np.roll(edges, 1, axis=0)
     cross = previous[:, 0] * edges[:, 1] - previous[:, 1] * edges[:, 0]
     turn = np.abs(np.arctan2(cross, (previous * edges).sum(axis=1)))
-    corner = turn > _CORNER_RAD
+    corner = turn > 0.2  # vertices of finely drawn curves turn less
     straight = _is_straight(length, turn, corner)
     joint = np.array([vertex in joints for vertex in map(tuple, ring.tolist())])
     cuts = np.flatnonzero(corner | straight | np.roll(straight, 1) | joint)
@@ -239,7 +234,7 @@ def _sample_edges(points: Array) -> tuple[Array, Array, Array, NDArray[np.intp]]
     """Sample a polyline; return arc lengths (m,), points (m, 2), unit normals (m, 2), and the indices of vertices."""
     s = arc_lengths(points)
     length = np.diff(s)
-    counts = np.maximum(_MIN_SAMPLES, np.ceil(length / _SAMPLE_MM)).astype(int)
+    counts = np.maximum(4, np.ceil(length / 0.1)).astype(int)  # at most 0.1 mm apart
     vertices = np.concatenate([[0], np.cumsum(counts)])
     edge = np.append(np.repeat(np.arange(len(counts)), counts), len(counts) - 1)
     fraction = (np.arange(vertices[-1] + 1) - vertices[edge]) / counts[edge]

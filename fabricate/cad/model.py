@@ -64,28 +64,23 @@ FIT_TOLERANCES_MM = (2e-3, 1.5e-3, 5e-4, 1e-4)
 
 Fitted curves may cross where the outlines only come close; closer fits do not.
 """
-FUSE_S = 60.0
-"""Time limit for the union of all parts."""
+FUSE_S = 60.0  # time limit for the union of all parts
 _FUSE = """\
 import sys, build123d
 first, *others = map(build123d.import_brep, sys.argv[2:])
 build123d.export_brep(first.fuse(*others), sys.argv[1])
 """
 """Program that writes the union of files to its first argument."""
-_NUMBER_COLOUR = "#5D6B7A"
 _WELL_SIDES = 512  # of the polygons to which arcs of the round wells are fitted
 _MIN_CIRCLE_CORNERS = 32  # of a polygon that stands for a circle
-MAX_DEVIATION = 2e-4
-"""Maximum relative deviation of a ridge's volume from that of its mesh."""
-MAX_BODY_DEVIATION = 5e-4
-"""The same for other parts, such as a lid, whose round holes are polygons in the mesh."""
+MAX_DEVIATION = 2e-4  # maximum relative deviation of a ridge's volume from that of its mesh
+MAX_BODY_DEVIATION = 5e-4  # the same for other parts, such as a lid, whose round holes are polygons in the mesh
 KERNEL_ERRORS = Standard_Failure, Standard_NullObject, RuntimeError, ValueError
 """Errors of the CAD kernel and of build123d."""
 _DECIMALS = 5  # of points, mm; more would only lengthen a STEP file
 _MIN_EDGE_MM = 2e-5  # of an outline, so that rounding does not merge two points
 _AREA_TOLERANCE = 1e-2  # relative, of areas; it selects adaptive integration, whose error is far smaller
 _INTO_TERRACE_MM = 0.005  # overlap of a terrace with the one below, so that no two faces coincide
-_SPACING_MM = 10.0  # between bodies that stand side by side
 
 
 @dataclass(frozen=True)
@@ -133,7 +128,7 @@ def mould_parts(plan: Plan, name: str) -> list[CadPart]:
     parts = [_build_part("tray", BODY_COLOURS["mould"], tray_body(plan), name)]
     parts += [_ridge_part(plan, fibre, name) for fibre in range(plan.pad.layout.fibres)]
     numbers = [
-        _build_part(f"number {fibre}", _NUMBER_COLOUR, Body((prism,)), name)
+        _build_part(f"number {fibre}", "#5D6B7A", Body((prism,)), name)
         for fibre, prism in enumerate(number_prisms(plan), 1)
         if prism
     ]
@@ -267,7 +262,7 @@ def assemble(bodies: Mapping[str, Sequence[CadPart]], plan: Plan) -> Compound:
         if shape.label == "lid":
             shape.locate(Location((0.0, 0.0, plan.settings.mould.floor_mm + plan.silicone_mm)))
         else:
-            shape.locate(Location((x_mm + _SPACING_MM - box.min.X, 0.0, 0.0)))
+            shape.locate(Location((x_mm + 10.0 - box.min.X, 0.0, 0.0)))
             x_mm = shape.bounding_box().max.X
     return Compound(label="moulds of the pad", children=shapes)
 

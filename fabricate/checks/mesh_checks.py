@@ -30,8 +30,7 @@ from padforge.fabricate.mesh import read_mesh
 from padforge.fabricate.plan import areas, overlap, without
 from padforge.fabricate.settings import DEFAULTS, PrinterSettings
 
-SOLID_CHECKS = ("manifold", "watertight", "bodies", "volume", "genus")
-"""The checks that any solid must pass."""
+SOLID_CHECKS = ("manifold", "watertight", "bodies", "volume", "genus")  # the checks that any solid must pass
 _MIN_SIDE_MM = 5.0  # longest side of the smallest mould; smaller meshes are in another unit
 _MAX_METRES_MM = 0.5  # longest side, read as mm, of a mesh in metres; other meshes that are too small are in inches
 _POSES = {
@@ -240,7 +239,6 @@ def _check_self_intersection(mesh: TriangleMesh, slabs: Sequence[Slab]) -> Findi
 MIN_FLOOR_MM = 0.4  # thinner floors bend when the casting is pulled out
 MIN_SILICONE_MM = 0.1  # thinner silicone tears in demoulding
 _WALL_LINES = 2  # minimum thickness of a stable wall, in printed lines
-_FLOOR_LAYERS = 2  # minimum thickness of a tight floor, in printed layers
 _DEPTH_STEP = 1.5  # difference of heights, in minimum silicone walls, above which tracks of two depths may come close
 _MAX_WALL_SLOPE = math.tan(math.radians(10))  # outward lean of a wall per mm of height
 _MAX_RIDGE_SLOPE = math.tan(math.radians(20))  # widening of a ridge on either side per mm downwards
@@ -317,15 +315,14 @@ def _check_floor_thickness(mesh: TriangleMesh, printer: PrinterSettings) -> Find
     Thickness is measured vertically, at the middles of faces and near their corners. It is not measured against
     leaning faces, since it vanishes at any sharp edge.
     """
-    limit = max(MIN_FLOOR_MM, _FLOOR_LAYERS * printer.layer_mm)
+    limit = max(MIN_FLOOR_MM, 2 * printer.layer_mm)
     up, down = mesh.normal_z > _MIN_FLOOR_COSINE, mesh.normal_z < -_MIN_FLOOR_COSINE
-    both = zip(_measure_thickness(mesh, up, down), _measure_thickness(mesh, down, up), strict=True)
-    thicknesses, points = map(np.concatenate, both)
+    below, above = _measure_thickness(mesh, up, down), _measure_thickness(mesh, down, up)
+    thicknesses, points = map(np.concatenate, zip(below, above, strict=True))
     thickness = float(thicknesses.min(initial=mesh.bounds[1, 2] - mesh.bounds[0, 2]))
-    thin = thicknesses < tested_width(limit)
+    positions = _deduplicate(points[thicknesses < tested_width(limit)])
     message = f"the thinnest floor is {thickness:.2f} mm"
-    passed = thickness >= tested_width(limit)
-    return check_result("floor_thickness", passed, thickness, limit, message, _deduplicate(points[thin]))
+    return check_result("floor_thickness", thickness >= tested_width(limit), thickness, limit, message, positions)
 
 
 def _measure_thickness(mesh: TriangleMesh, start: FaceMask, end: FaceMask) -> tuple[Array, Array]:
@@ -343,7 +340,6 @@ def _measure_thickness(mesh: TriangleMesh, start: FaceMask, end: FaceMask) -> tu
 
 
 MAX_OVERHANG_DEG = 45.0  # faces that lean farther from vertical need support
-_OVERHANG_TOLERANCE_DEG = 1.0  # for the rounding of an STL
 _UPRIGHT_DEG = 0.1  # faces that lean less are vertical within the rounding of their corners
 _OFF_FACE_MM = 5e-3  # distance in front of a face at which silicone is detected
 _MAX_HEIGHTS = 32  # heights at which silicone is detected, those of the largest faces
@@ -352,7 +348,7 @@ _MAX_HEIGHTS = 32  # heights at which silicone is detected, those of the largest
 def _check_overhang(mesh: TriangleMesh, printer: PrinterSettings) -> Finding:
     """Check that no face above the first layer leans so far that it needs support."""
     high = mesh.corners[:, :, 2].max(axis=1) > mesh.bounds[0, 2] + printer.layer_mm
-    leaning = _leaning(mesh, MAX_OVERHANG_DEG + _OVERHANG_TOLERANCE_DEG) & high
+    leaning = _leaning(mesh, MAX_OVERHANG_DEG + 1.0) & high  # with a tolerance for the rounding of an STL
     lean = _max_lean_deg(mesh, high)
     message = f"overhangs of up to {lean:.0f}°, {MAX_OVERHANG_DEG:g}° print without support"
     positions = _deduplicate(mesh.patch_positions(leaning))
@@ -361,7 +357,7 @@ def _check_overhang(mesh: TriangleMesh, printer: PrinterSettings) -> Finding:
 
 def _check_undercut(mesh: TriangleMesh, lowest: Slab) -> Finding:
     """Check that no face leans over the casting, which would hold it back in demoulding."""
-    holding = _before_void(mesh, _leaning(mesh, _UPRIGHT_DEG), lowest)
+    holding = _faces_at_silicone(mesh, _leaning(mesh, _UPRIGHT_DEG), lowest)
     lean = _max_lean_deg(mesh, holding)
     message = (
         f"faces lean over the casting by up to {lean:.1f}°" if holding.any() else "none, the casting can be demoulded"
@@ -383,7 +379,7 @@ def _max_lean_deg(mesh: TriangleMesh, mask: FaceMask) -> float:
     return math.degrees(math.asin(np.maximum(-mesh.normal_z[mask], 0.0).max(initial=0.0)))
 
 
-def _before_void(mesh: TriangleMesh, mask: FaceMask, lowest: Slab) -> FaceMask:
+def _faces_at_silicone(mesh: TriangleMesh, mask: FaceMask, lowest: Slab) -> FaceMask:
     """Return the faces of `mask` (m,) with silicone in front: an area enclosed by the solid, with a floor beneath."""
     faces = np.flatnonzero(mask & (mesh.centroids[:, 2] > lowest.middle_mm + _OFF_FACE_MM))
     crosses = np.cross(*np.moveaxis(np.diff(mesh.corners[faces], axis=1), 1, 0))
@@ -391,20 +387,20 @@ def _before_void(mesh: TriangleMesh, mask: FaceMask, lowest: Slab) -> FaceMask:
     x, y, z = (mesh.centroids[faces] + _OFF_FACE_MM * normals).T
     height = np.unique(np.round(z / _OFF_FACE_MM), return_inverse=True)[1]
     largest = np.argsort(-np.bincount(height, mesh.areas[faces]), kind="stable")[:_MAX_HEIGHTS]
-    before = np.zeros(len(mesh.triangles), dtype=bool)
-    floor = shapely.contains_xy(lowest.base, x, y)
+    result = np.zeros(len(mesh.triangles), dtype=bool)
+    has_floor = shapely.contains_xy(lowest.base, x, y)
     for index in largest:
         selected = height == index
         area = cut_solid(mesh.solid, float(z[selected].min()))
-        enclosed = shapely.contains_xy(fill_outline(area), x[selected], y[selected])
-        before[faces[selected]] = enclosed & ~shapely.contains_xy(area, x[selected], y[selected]) & floor[selected]
-    return before
+        is_enclosed = shapely.contains_xy(fill_outline(area), x[selected], y[selected])
+        is_solid = shapely.contains_xy(area, x[selected], y[selected])
+        result[faces[selected]] = is_enclosed & ~is_solid & has_floor[selected]
+    return result
 
 
 MAX_LEAK_MM = 10.0  # wider openings in a wall are not leaks, but the shape of a part that is not a tray
 _NEAR_MM = 1e-3  # distance up to which areas cut on a grid adjoin
 _MIN_BASIN = 0.25  # minimum fraction of a tray's outline that is hollow; funnels and holes have less
-_MIN_FLOOR = 0.5  # minimum fraction of a tray's hollow that has a floor
 
 
 def _check_leaks(slabs: Sequence[Slab]) -> Finding:
@@ -420,7 +416,7 @@ def _check_leaks(slabs: Sequence[Slab]) -> Finding:
 def _find_wall_leaks(section: BaseGeometry) -> list[BaseGeometry]:
     """Return the gaps in walls that would enclose an area without them."""
     closed = section.buffer(MAX_LEAK_MM / 2, join_style="mitre").buffer(-MAX_LEAK_MM / 2, join_style="mitre")
-    basins = [shapely.Polygon(ring) for part in shapely.get_parts(areas(closed)) for ring in part.interiors]
+    basins = [shapely.Polygon(ring) for polygon in shapely.get_parts(areas(closed)) for ring in polygon.interiors]
     if not basins:
         return []
     frame = shapely.box(*section.bounds).buffer(1.0, join_style="mitre")
@@ -435,10 +431,10 @@ def _find_wall_leaks(section: BaseGeometry) -> list[BaseGeometry]:
 def _find_floor_leaks(slabs: Sequence[Slab]) -> list[BaseGeometry]:
     """Return the parts of the lowest area enclosed by walls that have no solid beneath them."""
     for index, slab in enumerate(slabs[1:], 1):
-        rings = [ring for part in shapely.get_parts(slab.cross_section) for ring in part.interiors]
+        rings = [ring for polygon in shapely.get_parts(slab.cross_section) for ring in polygon.interiors]
         hollow = shapely.union_all([shapely.Polygon(ring) for ring in rings])
         if hollow.area > _MIN_BASIN * slabs[0].cross_section.envelope.area:
             bare = reduce(without, [lower.cross_section for lower in slabs[:index]], hollow)
-            if bare.area < _MIN_FLOOR * hollow.area:
+            if bare.area < 0.5 * hollow.area:  # otherwise it is not a tray
                 return list(shapely.get_parts(bare))
     return []

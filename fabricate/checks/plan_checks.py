@@ -91,7 +91,6 @@ def check_plan(plan: Plan) -> list[Finding]:
 
 _SLENDER = 5.0  # ratio of height to width above which ridges may break
 _MAX_SLENDERNESS = 10.0  # ratio above which they cannot be printed
-_FOLD_TURN = 0.05  # turn between the points at which folds are searched, rad
 _BEND_TURN = 2.5e-3  # turn between the points of a bend, rad
 _BEND_TOLERANCE = 1e-3  # relative, of bend radii, since leads bend as tightly as allowed
 _MAX_NAMES = 8  # more fibres are counted instead of named
@@ -104,8 +103,8 @@ def _list_fibres(noun: str, numbers: Sequence[int]) -> str:
     return f"{plural} {', '.join(map(str, numbers))}" if len(numbers) <= _MAX_NAMES else f"{len(numbers)} {plural}"
 
 
-def _points_in(parts: Iterable[Any]) -> list[Position]:
-    return [part.representative_point().coords[0] for part in parts]
+def _points_in(polygons: Iterable[Any]) -> list[Position]:
+    return [polygon.representative_point().coords[0] for polygon in polygons]
 
 
 def _ridge_middles(plan: Plan, layer: int) -> list[tuple[float, ...]]:
@@ -234,9 +233,10 @@ def _check_tray_wall(plan: Plan) -> Finding:
     border = plan.cavity.difference(plan.cavity.buffer(-reach, join_style="mitre"))
     end = INTO_WALL_MM + plan.settings.mould.exit_mm + 2 * reach
     middles = [ops.substring(line, end, line.length - end) for line in plan.lines]
-    near = [part for middle in middles for part in shapely.get_parts(middle.intersection(border)) if part.length]
-    gap = min(part.distance(wall) - half for part in near or middles)
-    positions = [ops.nearest_points(part, wall)[0].coords[0] for part in near]
+    pieces = chain(*(shapely.get_parts(middle.intersection(border)) for middle in middles))
+    close = [piece for piece in pieces if piece.length]
+    gap = min(piece.distance(wall) - half for piece in close or middles)
+    positions = [ops.nearest_points(piece, wall)[0].coords[0] for piece in close]
     message = f"ridges between their ends come within {gap:.2f} mm of the tray's wall"
     if gap <= 0:
         message = f"ridges run into the tray's wall between their ends, by {-gap:.2f} mm"
@@ -310,7 +310,7 @@ def _check_folds(plan: Plan) -> Finding:
     curves = zip(beziers(pad), slope_beziers(pad), flatten(pad, 3e-4 / pad.unit_mm), strict=True)  # tolerance 3e-4 mm
     for fibre, (spans, slopes, line) in enumerate(curves):
         half = mould.ridge_width_mm / 2 + plan.heights_mm[plan.layer_indices[fibre]] * plan.settings.ridge_slope
-        points, headings = trace_curve(spans, slopes, _FOLD_TURN)
+        points, headings = trace_curve(spans, slopes, 0.05)  # maximum turn between points, rad
         axes = slice(None, None, -1 if plan.family(fibre) else 1)  # along and across the fibre's axis
         positions, walls = _find_tight_bends(pad.to_mm(points)[:, axes], headings, half)
         cuts = half - shapely.distance(shapely.LineString(pad.to_mm(line)), shapely.points(walls[:, axes]))
@@ -355,8 +355,8 @@ def _check_keep_outs(plan: Plan) -> Iterator[Finding]:
     message = (
         f"tracks of {_list_fibres('fibre', blocked)} run into keep-outs" if blocked else "no track runs into a keep-out"
     )
-    parts = [part for fibre in blocked for part in shapely.get_parts(shared[fibre]) if part.area > 0]
-    yield check_result("keep_out", not blocked, len(blocked), 0, message, _points_in(parts))
+    overlaps = [area for fibre in blocked for area in shapely.get_parts(shared[fibre]) if area.area > 0]
+    yield check_result("keep_out", not blocked, len(blocked), 0, message, _points_in(overlaps))
 
     mould = plan.shrinkage_compensated  # a pillar of one printed line bends; a thinner one cannot be printed
     line, region = mould.settings.printer.line_mm, overlap(mould.pillars, mould.cavity)

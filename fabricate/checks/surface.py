@@ -138,8 +138,6 @@ class TriangleMesh:
         return np.stack(points, axis=1)
 
 
-_MIN_SLABS = 8
-_MAX_SLABS = 12  # moulds of up to ten layers are cut between all horizontal faces
 _FLAT_MM = 1e-3  # rise of a face below which it is horizontal, and difference of heights below which they are equal
 _SLOT_MM = 2.0  # width of a gap in a wall below which the wall counts as closed
 SPECK_MM2 = 0.01  # smaller areas are corners and the width of a line, not walls or faces
@@ -197,9 +195,9 @@ def build_slabs(mesh: TriangleMesh, layer_mm: float) -> list[Slab]:
     heights, index = np.unique(np.round(z[flat, 0] / _FLAT_MM), return_inverse=True)
     order = np.argsort(-np.bincount(index, mesh.areas[flat], len(heights)), kind="stable")
     inner = [height for i in order if low + _FLAT_MM < (height := float(heights[i]) * _FLAT_MM) < high - _FLAT_MM]
-    cuts = [low, *sorted(inner[: _MAX_SLABS - 1]), high]
+    cuts = [low, *sorted(inner[:11]), high]  # enough for all horizontal faces of moulds of up to ten layers
     spans = [span for span in pairwise(cuts) if span[1] - span[0] > layer_mm / 2] or [(low, high)]
-    while len(spans) < _MIN_SLABS:
+    while len(spans) < 8:
         tallest = max(range(len(spans)), key=lambda i: spans[i][1] - spans[i][0])
         low, high = spans[tallest]
         spans[tallest : tallest + 1] = [(low, (low + high) / 2), ((low + high) / 2, high)]

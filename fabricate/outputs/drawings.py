@@ -22,12 +22,10 @@ _NAMESPACES = {
     "xmlns": "http://www.w3.org/2000/svg",
     "xmlns:inkscape": "http://www.inkscape.org/namespaces/inkscape",
 }
-_EDGE = "#888"  # colour of outlines
 _NOTE = "#555555"  # colour of notes
 ORIENTATION_FILE = "orientation.svg"
 ORIENTATION_CAPTION = "The pad in its mould, turned over, and in use, from above and from the near side."
-ORIENTATION_LINK = f"![{ORIENTATION_CAPTION}]({ORIENTATION_FILE})"
-"""Link to the drawing from a page in the same folder."""
+ORIENTATION_LINK = f"![{ORIENTATION_CAPTION}]({ORIENTATION_FILE})"  # link to the drawing from a page in the same folder
 CROSSING_FILE = "crossing.svg"
 CROSSING_CAPTION = "The two fibres that cross nearest to each other, in section: the pad lies turned over, to scale."
 CROSSING_LINK = f"![{CROSSING_CAPTION}]({CROSSING_FILE})"
@@ -52,8 +50,7 @@ def orientation_sentence(counts: tuple[int, int], leads: str) -> str:
     return _TURNED + ("all leads leave at the near side: " if leads == "one side" else "") + fibres + "."
 
 
-SCALE_MM = 10.0
-"""Length of the scale bar, which verifies the size of a print."""
+SCALE_MM = 10.0  # length of the scale bar, which verifies the size of a print
 _TEXT_MM = 2.5  # maximum text height, by drawing standards; smaller for a narrow pitch
 _GAP_MM = 1.0  # between the silicone and the text beside it
 _LETTER_WIDTH = 0.6  # mean width of a letter, in text heights
@@ -165,7 +162,7 @@ def tracks_svg(plan: Plan) -> str:
         return layer
 
     edge = "".join(f"{_path(ring)}Z" for polygon in polygon_rings(plan.silicone) for ring in polygon)
-    silicone = add_layer("silicone", "silicone's edge", stroke=_EDGE, stroke_width="0.2")
+    silicone = add_layer("silicone", "silicone's edge", stroke="#888", stroke_width="0.2")
     SubElement(silicone, "path", {"id": "edge", "d": edge})
     for depth in fibre_layers(plan):
         width = f"{plan.settings.fibre.material.diameter_mm:g}"

@@ -64,8 +64,6 @@ what is added on either side narrows the silicone between two.
 {layers:.3g} layers.
 - Calibrate the exposure: a wall that is {ridge:g} mm wide in the file must be so on the plate.
 - Wash and cure it well. Traces of resin can keep silicone from curing: try a drop on a scrap first."""
-_SOLID_MM = 0.8  # thickness of solid plastic that hides the infill below it
-_MAX_WALLS = 4
 _MIN_LINE = 0.85  # minimum width of a line, in nozzles
 _MAX_ROWS = 24  # of a table of crossings on a page
 
@@ -325,8 +323,8 @@ def print_settings_rows(mould: MouldSettings, printer: PrinterSettings) -> list[
         line=f"{line:.3g} mm",
         ridge=ridge,
         ridge_lines=ridge_lines,
-        walls=min(_MAX_WALLS, max(2, math.ceil(mould.wall_mm / 2 / line - 1e-6))),
-        solid=math.ceil(_SOLID_MM / layer - 1e-6),
+        walls=min(4, max(2, math.ceil(mould.wall_mm / 2 / line - 1e-6))),
+        solid=math.ceil(0.8 / layer - 1e-6),  # 0.8 mm of solid plastic hide the infill
         foot="the holes of the lid stay open" if mould.lid else "the mould stands flat",
     )
     return [tuple(row.split(" | ")) for row in settings.splitlines()]

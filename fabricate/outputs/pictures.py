@@ -45,12 +45,9 @@ _EDGE = "#a7a49c"  # colour of outlines
 _GREY = "#77746c"  # colour of text beside a picture
 _RAMP = (PAPER, "#a9c4c9", "#4f7f8e", "#24404c")  # colours of a mesh from its lowest visible height to its highest
 _DPI = 100
-PIXELS = 900
-"""Longer side of the axes: 14 pixels a mm for the published pad, about six for a ridge."""
-_MIN_WIDTH = 600  # pixels, for a title and a legend
+PIXELS = 900  # longer side of the axes: 14 pixels a mm for the published pad, about six for a ridge
 _FLAT = 1e-3  # mm or slope: a face is flat below it, and vertical if z of its normal is below it
 _MARGIN_LEFT, _MARGIN_RIGHT, _MARGIN_TOP, _MARGIN_BOTTOM = 66, 24, 44, 62  # pixels, for title, ticks and axis labels
-_ROW = 21  # height of a row of the legend, pixels
 _COLUMNS = 3  # entries in a row of the legend
 _LINE = 15  # height of a line of the note below the legend, pixels
 _FAIL_MARKS = "osp8H"  # markers of the first checks that fail; further ones have a cross
@@ -191,8 +188,7 @@ def _draw_layer(picture: "_Picture", plan: Plan, layer: FibreLayer) -> list[Any]
 
 # Orientation
 
-TURN_DEG = 20.0
-"""Example of the angle of the pad in use under the arm."""
+TURN_DEG = 20.0  # example of the angle of the pad in use under the arm
 _WIDTH_MM = 64.0  # of a panel
 _HEIGHT_MM = 56.0  # of a panel
 _HALF_MM = 21.0  # half the side of the mould in a panel
@@ -386,11 +382,11 @@ def draw_toolpath(plan: Plan, steps: Sequence[Step], path: Path) -> None:
         handles.append(lines[0])
     for turn, stroke in enumerate(strokes, 1):
         start, end = stroke.positions_mm[[0, -1]]
-        before, after = (2.5 * mirror_x(lead.outward) for lead in plan.leads.pairs[stroke.fibre])
+        start_offset, end_offset = (2.5 * mirror_x(lead.outward) for lead in plan.leads.pairs[stroke.fibre])
         axes.plot(*start, "o", mfc="none", mec=INK, ms=6)
         axes.plot(*end, "o", color=INK, ms=3)
-        picture.write(str(stroke.fibre + 1), start + before, 2.5)
-        picture.write(f"{turn}.", end + after, 2.5)
+        picture.write(str(stroke.fibre + 1), start + start_offset, 2.5)
+        picture.write(f"{turn}.", end + end_offset, 2.5)
     picture.save(path, handles)
 
 
@@ -408,9 +404,9 @@ class _Picture:
 
         x_min, y_min, x_max, y_max = bounds
         axes_width, axes_height = _count_pixels(bounds)
-        width = _MARGIN_LEFT + max(axes_width, _MIN_WIDTH) + _MARGIN_RIGHT
+        width = _MARGIN_LEFT + max(axes_width, 600) + _MARGIN_RIGHT  # at least 600 pixels for title and legend
         self.note = textwrap.wrap(note, int((width - _MARGIN_LEFT) / 6.2))  # mean width of a letter, pixels
-        legend = _ROW * math.ceil(n_entries / _COLUMNS) + 6 * (n_entries > 0)
+        legend = 21 * math.ceil(n_entries / _COLUMNS) + 6 * (n_entries > 0)  # 21 pixels a row
         bottom = _MARGIN_BOTTOM + legend + _LINE * len(self.note)
         height = bottom + axes_height + _MARGIN_TOP
         self.extent, self.pixels, self.size = (x_min, x_max, y_min, y_max), (axes_width, axes_height), (width, height)

@@ -35,8 +35,7 @@ from padforge.fabricate.outputs.drawings import (
 from padforge.fabricate.outputs.laying_page import laying_page
 from padforge.fabricate.plan import FAMILIES, FAMILY_COLOURS
 
-MAX_BYTES = 3_000_000
-"""Maximum size of a packed mesh; base64 makes 4 MB of it, half of the maximum of a page."""
+MAX_BYTES = 3_000_000  # maximum size of a packed mesh; base64 makes 4 MB of it, half of the maximum of a page
 _STEPS = np.iinfo(np.uint16).max  # steps of a coordinate along a side of the bounding box
 _TOLERANCES_MM = (0.01, 0.02, 0.05, 0.1, 0.2)  # tried in order for a large mesh; the last is half a common nozzle
 _PICTURES = ("mould.stl", "mould.png", "tracks.png", "toolpath.svg", ORIENTATION_FILE, CROSSING_FILE)

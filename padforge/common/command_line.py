@@ -1,4 +1,4 @@
-"""Shared by the command lines of all stages: common options, progress on stderr, results on stdout, exit codes."""
+"""Shared parts of the command lines: common options, progress on stderr, results on stdout, exit codes."""
 
 import atexit
 import functools
@@ -58,7 +58,7 @@ def out_option(
 
 
 class FiniteRange(click.FloatRange):
-    """A range of numbers without NaN and infinity, which click lets through."""
+    """A range of finite numbers; click's own accepts NaN and infinity."""
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         """Convert the text of an option."""
@@ -69,13 +69,13 @@ class FiniteRange(click.FloatRange):
 
 
 def setting_option(name: str, section: str, kind: Any, text: str) -> Callable[..., Any]:
-    """Make an option that takes the place of the setting of its name; its value is checked before anything is done.
+    """Return an option that overrides the setting of its name and is checked when the command line is parsed.
 
     Args:
-        name: of the option, such as `--knots`.
-        section: model of the setting as `module:class`, which is imported where the option is used.
+        name: name of the option, such as `--knots`.
+        section: model of the setting, as `module:class`; it is imported when the option is used.
         kind: type of the value for click.
-        text: help.
+        text: help text.
     """
 
     def check(context: click.Context, param: click.Parameter, value: Any) -> Any:
@@ -90,7 +90,7 @@ def setting_option(name: str, section: str, kind: Any, text: str) -> Callable[..
 
 
 class SectionedGroup(click.Group):
-    """A group whose help lists its commands under headings, in the order in which they were added."""
+    """A group whose help lists its commands under headings, in the order of their addition."""
 
     def __init__(self, *arguments: Any, **options: Any) -> None:
         self._headings: dict[str, str] = {}
@@ -101,8 +101,8 @@ class SectionedGroup(click.Group):
 
         Args:
             cmd: the command.
-            name: its name in this group; that of the command if None.
-            heading: what it is listed under.
+            name: name in this group; that of the command if None.
+            heading: heading in the help.
         """
         super().add_command(cmd, name)
         self._headings[name or cmd.name or ""] = heading
@@ -110,7 +110,7 @@ class SectionedGroup(click.Group):
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """Write the commands with their short helps."""
         width = max(map(len, self._headings))
-        limit = formatter.width - 6 - width  # as click counts: indent, gap and margin
+        limit = formatter.width - 6 - width  # click's indent, gap and margin
         for heading in dict.fromkeys(self._headings.values()):
             commands = [(name, self.commands[name]) for name in self._headings if self._headings[name] == heading]
             rows = [(name.ljust(width), command.get_short_help_str(limit)) for name, command in commands]
@@ -119,7 +119,7 @@ class SectionedGroup(click.Group):
 
 
 def pad_folder(source: Path | None = None) -> Path:
-    """Return the folder for results without `--out`, that of the pad they belong to; of NAME.mat it is out/NAME."""
+    """Return the default folder for results: that of the pad `source`; out/NAME for NAME.mat."""
     if source is None:
         return Path("out/pad")
     if source.is_dir() or source.suffix.lower() == ".json":
@@ -128,7 +128,7 @@ def pad_folder(source: Path | None = None) -> Path:
 
 
 def profile_option(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Add `--profile` to a command: at its end, print to stderr where time went and what was skipped."""
+    """Add the option `--profile` to a command."""
 
     @click.option("--profile", is_flag=True, help="Print to stderr where time went and what was skipped.")
     @functools.wraps(command)
@@ -147,14 +147,14 @@ def profile_option(command: Callable[..., Any]) -> Callable[..., Any]:
 
 
 class SettingsFile(NamedTuple):
-    """What the command line knows of a settings file: object of the root context, for `load_spec`."""
+    """Allowed sections and check of a settings file; the object of click's root context, used by `load_spec`."""
 
     sections: Collection[str]
-    check: "Callable[[Spec], None]"  # raises InputError where sections contradict each other
+    check: "Callable[[Spec], None]"  # raises InputError if sections contradict each other
 
 
 def load_spec(path: Path | None) -> "Spec":
-    """Load and check `path`, else pad.toml of the current folder, else the defaults; see `SettingsFile`."""
+    """Load and check the settings at `path`; by default pad.toml of the current folder, or the default settings."""
     from padforge.common.settings import Spec
 
     default, context = Path("pad.toml"), click.get_current_context(silent=True)
@@ -191,12 +191,7 @@ def progress_bar(name: str) -> Iterator["OnProgress"]:
 
 
 def echo(line: str, err: bool = False) -> None:
-    """Print a line, whatever the texts of files in it.
-
-    Args:
-        line: without its end.
-        err: whether to print it on stderr.
-    """
+    """Print a line, on stderr if `err`; characters that are not printable are escaped."""
     click.echo(printable(line), err=err)
 
 
@@ -206,7 +201,7 @@ def show_result(document: dict[str, Any], lines: list[str], as_json: bool) -> No
 
 
 def text_table(rows: Sequence[Sequence[str]], text_columns: Collection[int] = (0,)) -> list[str]:
-    """Format cells in aligned columns, a line per row, numbers right-aligned; a short row ends in "-"."""
+    """Format cells in aligned columns, a line per row, numbers right-aligned; missing cells of short rows are "-"."""
     columns = []
     for number, column in enumerate(zip_longest(*rows, fillvalue="-")):
         width = max(map(len, column))
@@ -218,36 +213,42 @@ class _StderrHandler(logging.Handler):
     """Prints log records on stderr."""
 
     def emit(self, record: logging.LogRecord) -> None:
-        # Not by click.echo, which writes past the sys.stderr of a progress bar, and so into the bar.
+        # click.echo would bypass the sys.stderr of a progress bar and write into the bar.
         print(printable(self.format(record)), file=sys.stderr)
 
 
 _HANDLER = _StderrHandler()
-INTERRUPTED = 130  # exit code after Ctrl-C, as of shells
+INTERRUPTED = 130  # exit code after Ctrl-C, as in shells
 
 
 def run_to_end(command: click.Command, name: str, extras: Mapping[str, str]) -> int:
-    """Run a command line on the arguments of this process, errors as one line on stderr; return the exit code.
+    """Run a command line with the arguments of this process; print an error as one line on stderr.
 
-    `extras` are the optional dependencies that its commands need, by their first word; others need all of these.
+    Args:
+        command: command or group.
+        name: name of the program.
+        extras: optional dependencies of its subcommands, by name; other subcommands need all of these.
+
+    Returns:
+        The exit code.
     """
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, TextIOWrapper):
-            stream.reconfigure(errors="backslashreplace")  # file names may be no valid text
+            stream.reconfigure(errors="backslashreplace")  # file names may not be valid text
     for name_of_signal in {"SIGTERM", "SIGHUP"} & set(dir(signal)):
         number = getattr(signal, name_of_signal)
-        if signal.getsignal(number) is signal.SIG_DFL:  # else it is ignored, as under nohup
-            signal.signal(number, signal.default_int_handler)  # cleans up as Ctrl-C does
+        if signal.getsignal(number) is signal.SIG_DFL:  # otherwise it is ignored, as under nohup
+            signal.signal(number, signal.default_int_handler)  # clean up as after Ctrl-C
     logger = logging.getLogger("padforge")
     logger.setLevel(logging.INFO)
-    logger.addHandler(_HANDLER)  # once, however often it is added
+    logger.addHandler(_HANDLER)  # has no effect if it was added before
     code = _run(command, name, extras)
     atexit.register(_end_with_tasks, code)
     return code
 
 
 def _end_with_tasks(code: int) -> None:
-    """End this process if tasks are running: none can be stopped, and those in torch would crash as it ends."""
+    """End this process at once if tasks are running: they cannot be stopped, and torch would crash in the clean-up."""
     parallel = sys.modules.get(f"{__package__}.parallel")
     if parallel is not None and parallel.active_threads:
         for stream in (sys.stdout, sys.stderr):
@@ -284,6 +285,6 @@ def _run(command: click.Command, name: str, extras: Mapping[str, str]) -> int:
 
 
 def _fail(name: str, message: str, code: int = 2) -> int:
-    with suppress(OSError):  # on a full disk the exit code has to say it
+    with suppress(OSError):  # if stderr is a file on a full disk, the exit code must suffice
         print(f"{name}: {printable(' '.join(message.split()))}", file=sys.stderr)
     return code

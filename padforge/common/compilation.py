@@ -1,4 +1,4 @@
-"""How kernels are compiled, and kept on disk by Numba; and a note to users whose first command compiles them."""
+"""Compilation of kernels by Numba, their cache on disk, and a notice to users whose command compiles them."""
 
 import atexit
 import gc
@@ -15,7 +15,7 @@ from tempfile import TemporaryFile, mkdtemp
 from threading import Lock, Timer
 from typing import Any, Protocol, TypeVar, overload
 
-# else each overload that is tried in vain has its message coloured, a thirtieth of the time
+# Colouring the message of each rejected overload would take a thirtieth of the time.
 os.environ.setdefault("NUMBA_DISABLE_ERROR_MESSAGE_HIGHLIGHTING", "1")
 
 from numba import njit
@@ -24,16 +24,16 @@ from numba.core import event as events
 
 import padforge
 
-PATIENCE_S = 1.5  # time spent on compiling, s, after which the user is told why nothing happens
-_STAGES = next(base for base in map(Path, padforge.__path__) if (base / "design").is_dir())  # those that are imported
-SOURCES = [_STAGES / stage for stage in ("design", "sense")]  # that have kernels
-MAX_CACHES = 4  # in a folder, of the latest versions of the sources
+PATIENCE_S = 1.5  # time spent on compiling after which the user is notified
+_STAGES = next(base for base in map(Path, padforge.__path__) if (base / "design").is_dir())  # folder of the stages
+SOURCES = [_STAGES / stage for stage in ("design", "sense")]  # folders with kernels
+MAX_CACHES = 4  # in a folder, for the latest versions of the sources
 _PREFIX = "padforge-kernels-"
 
 _Function = TypeVar("_Function", bound=Callable[..., Any])
 _log = logging.getLogger(__name__)
 _decorating = Lock()
-_numba: Any = config  # its names are made of the environment, which type checkers cannot know
+_numba: Any = config  # has attributes from the environment, unknown to type checkers
 
 
 class _Decorator(Protocol):
@@ -46,7 +46,7 @@ class _Decorator(Protocol):
 
 
 def cache_bases() -> Iterator[Path]:
-    """Yield the folders that a cache of kernels may be in, the best first."""
+    """Yield the possible folders of a cache of kernels, in order of preference."""
     if chosen := os.environ.get("NUMBA_CACHE_DIR"):
         yield Path(chosen)
     yield Path(__file__).parent / "__pycache__"
@@ -58,10 +58,10 @@ def cache_bases() -> Iterator[Path]:
 
 @cache
 def cache_folder() -> Path:
-    """Return the folder of the compiled kernels of these sources, a temporary one where none can be written.
+    """Return the folder of the compiled kernels of these sources; a temporary one if no folder can be written.
 
-    Numba compares the source of a kernel alone, not those of the kernels and constants in it: a digest of all sources
-    is part of the name.
+    Its name contains a digest of all sources, since Numba compares the source file of a kernel only, not those of the
+    kernels and constants that it uses.
     """
     sources = sorted(path for folder in SOURCES for path in folder.rglob("*.py"))
     name = _PREFIX + sha256(b"\0".join(source.read_bytes() for source in sources)).hexdigest()[:16]
@@ -79,7 +79,7 @@ def cache_folder() -> Path:
 
 
 def _delete_older_caches(base: Path) -> None:
-    with suppress(OSError):  # another process does the same
+    with suppress(OSError):  # another process may delete them as well
         caches = sorted(base.glob(_PREFIX + "[0-9a-f]" * 16), key=lambda path: path.stat().st_mtime)
         for folder in caches[:-MAX_CACHES]:
             shutil.rmtree(folder, ignore_errors=True)
@@ -87,17 +87,17 @@ def _delete_older_caches(base: Path) -> None:
 
 @contextmanager
 def _caching_in(folder: Path) -> Iterator[None]:
-    """Let Numba cache what is decorated in a folder; functions of others stay where they are."""
+    """Return a context in which decorated functions are cached in a folder; those of other programs are not."""
     with _decorating:
-        before, _numba.CACHE_DIR = _numba.CACHE_DIR, str(folder)
+        previous, _numba.CACHE_DIR = _numba.CACHE_DIR, str(folder)
         try:
             yield
         finally:
-            _numba.CACHE_DIR = before
+            _numba.CACHE_DIR = previous
 
 
 def _cached_njit(function: Callable[..., Any] | None = None, **options: Any) -> Any:
-    """Decorate as `numba.njit` does, and keep what is compiled in `cache_folder`."""
+    """Decorate like `numba.njit`, with the cache in `cache_folder`."""
     if function is None:
         return partial(_cached_njit, **options)
     with _caching_in(cache_folder()):
@@ -105,16 +105,16 @@ def _cached_njit(function: Callable[..., Any] | None = None, **options: Any) -> 
 
 
 kernel: _Decorator = partial(_cached_njit, error_model="numpy", nogil=True)
-"""Compiles a function when it is first called, without checks of divisions and without Python's lock.
+"""Compiles a function at its first call, without checks for division by zero, and releases Python's lock.
 
-One that a single kernel calls is a `kernel(inline="always")`, which becomes a part of that one.
+A function that is called by a single kernel should be a `kernel(inline="always")`, which is compiled into that one.
 """
 
 
 class Compilations(events.Listener):
-    """Follows compilations, which Numba runs one at a time, each with those of what it calls.
+    """Logs one line when a process has compiled kernels for `PATIENCE_S`; none if it reads them from the cache.
 
-    It logs one line when a process has compiled kernels for PATIENCE_S; none if it reads them from the cache.
+    Numba runs one compilation at a time, with nested ones for the functions that are called.
     """
 
     def __init__(self) -> None:
@@ -125,9 +125,9 @@ class Compilations(events.Listener):
         if self._depth == 0:
             self._started_s = time.monotonic()
             self._collects = gc.isenabled()
-            gc.disable()  # a compiler's many objects are all in use: to look for others takes a sixth of the time
+            gc.disable()  # the compiler's many objects are all in use; to collect garbage takes a sixth of the time
             self._timer = Timer(max(PATIENCE_S - self._spent_s, 0), self._announce)
-            self._timer.daemon = True  # does not delay the end of the program
+            self._timer.daemon = True  # must not delay the end of the program
             self._timer.start()
         self._depth += 1
 

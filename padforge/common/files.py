@@ -1,8 +1,8 @@
-"""Files of every stage: atomic writes, sets of files replaced together, locks, self-describing JSON and provenance.
+"""Files of all stages: atomic writes, replacement of sets of files, locks, self-describing JSON and provenance.
 
-A set of files (a pad, a mould, a localizer) is written into a temporary folder beside its destination. Then the JSON
-documents of the old set go, the other files take the places of the old ones, and the new documents come last. A run
-that is killed meanwhile leaves files without a document, which readers refuse, and never those of two sets.
+A set of files (a pad, a mould, a localizer) is written into a temporary folder at its destination. Then the JSON
+documents of the old set are removed, the other files replaced, and the new documents added last. A run that is killed
+in between leaves files without a document, which readers refuse, and never a mixture of two sets.
 """
 
 import errno
@@ -27,17 +27,15 @@ from filelock import FileLock, Timeout
 from padforge.common.validation import InputError, short_repr
 
 UNFINISHED = ".unfinished-"  # prefix of the names of temporary files and folders
-LOCK = ".lock"  # name of the file by which a run has a folder for itself
-MAX_BYTES = 2**28  # size limit of a file; of what padforge writes only recordings are larger
+LOCK = ".lock"  # name of the file that locks a folder
+MAX_BYTES = 2**28  # size limit of a file; only recordings may be larger
 
-_LEFTOVER_S = 86400.0  # a temporary folder untouched for so long is that of a killed run
-_PACKAGES = ("padforge", "numpy", "scipy")
-_MORPHOLOGY = "padforge-morphology/"  # prefix of the format of pads: one derived from another stands on its own
+_MORPHOLOGY = "padforge-morphology/"  # prefix of the format of pads, which are independent of pads they derive from
 
 
 @contextmanager
 def reraise_as_input_error(path: Path) -> Iterator[None]:
-    """Report a document without the structure that padforge writes as an InputError that names its file."""
+    """Convert errors from a document of unexpected structure to an InputError that names its file."""
     try:
         yield
     except InputError:
@@ -48,7 +46,7 @@ def reraise_as_input_error(path: Path) -> Iterator[None]:
 
 @contextmanager
 def reraise_write_error(path: Path) -> Iterator[None]:
-    """Report an OSError of the body as an InputError that says why `path` cannot be written."""
+    """Convert an OSError of the body to an InputError that says why `path` cannot be written."""
     try:
         yield
     except OSError as error:
@@ -56,7 +54,7 @@ def reraise_write_error(path: Path) -> Iterator[None]:
 
 
 def check_writable(folder: Path) -> None:
-    """Check that files can be created in `folder`, or that it can be created itself."""
+    """Check that files can be created in `folder`, which may be missing."""
     with reraise_write_error(folder):
         existing = next(parent for parent in (folder.absolute(), *folder.absolute().parents) if parent.exists())
         if not existing.is_dir():
@@ -67,10 +65,10 @@ def check_writable(folder: Path) -> None:
 
 @contextmanager
 def locked(folder: Path, busy: str) -> Iterator[None]:
-    """Keep other processes that lock a folder out of it in the body.
+    """Lock a folder against other processes in the body.
 
     Raises:
-        InputError: with the message `busy`: another one has locked it; or it cannot be written.
+        InputError: another process has locked it (with the message `busy`), or it cannot be written.
     """
     lock = FileLock(folder / LOCK, thread_local=False)
     try:
@@ -82,16 +80,16 @@ def locked(folder: Path, busy: str) -> Iterator[None]:
         yield
     finally:
         if lock.is_locked:
-            with suppress(OSError):  # while it is locked, so that nobody else has it; Windows removes it by itself
+            with suppress(OSError):  # before the release, or another process could hold it; Windows removes it itself
                 (folder / LOCK).unlink()
             lock.release()
 
 
 @contextmanager
 def locked_folder(folder: Path) -> Iterator[None]:
-    """Keep other runs out of `folder` while results are made for it, and remove what killed ones left long ago.
+    """Lock `folder` against other runs, and remove old temporary files of killed runs.
 
-    A folder that did not exist is created, and removed again if it stays empty.
+    A missing folder is created, and removed at the end if it is empty.
 
     Raises:
         InputError: another run has locked it, or it cannot be written.
@@ -102,7 +100,7 @@ def locked_folder(folder: Path) -> Iterator[None]:
         make_folder(folder)
     try:
         with locked(folder, f"{folder}: another run is writing there; wait for its end, or choose another folder"):
-            remove_leftovers(folder, _LEFTOVER_S)
+            remove_leftovers(folder, 86400.0)  # unchanged for a day
             yield
     finally:
         with suppress(OSError):  # not empty
@@ -111,18 +109,18 @@ def locked_folder(folder: Path) -> Iterator[None]:
 
 
 def remove_leftovers(folder: Path, min_age_s: float = 0.0) -> None:
-    """Remove the temporary folders of killed runs that nobody has written into for so long; no links are followed."""
+    """Remove temporary folders of killed runs that have been unchanged for `min_age_s`; links are not followed."""
     for path in folder.glob(f"{UNFINISHED}*"):
-        with suppress(OSError):  # of another user, or gone meanwhile
+        with suppress(OSError):  # it belongs to another user, or was removed by another process
             if path.is_dir() and not path.is_symlink() and time.time() - path.stat().st_mtime >= min_age_s:
                 shutil.rmtree(path)
 
 
 @contextmanager
 def temporary_folder(folder: Path, prefix: str = UNFINISHED) -> Iterator[Path]:
-    """Create an empty folder in `folder`, its name with `prefix`; remove it with its content at the end."""
+    """Create an empty folder with a name that begins with `prefix`; remove it with its contents at the end."""
     path = folder / f"{prefix}{secrets.token_hex(8)}"
-    try:  # before it exists, so that no interrupt leaves it
+    try:  # begins before `mkdir`, so that an interrupt cannot leave the folder
         path.mkdir()
         yield path
     finally:
@@ -131,9 +129,9 @@ def temporary_folder(folder: Path, prefix: str = UNFINISHED) -> Iterator[Path]:
 
 @contextmanager
 def atomic_file(path: Path) -> Iterator[Path]:
-    """Write a file atomically: yield a temporary path of its name, which replaces it on success.
+    """Write a file atomically: yield a temporary path with the same name, which replaces it on success.
 
-    A path that is temporary itself is yielded as it is.
+    A path that is itself temporary is yielded unchanged.
     """
     if path.parent.name.startswith(UNFINISHED) or path.name.startswith(UNFINISHED):
         yield path
@@ -150,18 +148,18 @@ def atomic_file(path: Path) -> Iterator[Path]:
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write `text` atomically as UTF-8, its line ends unchanged; what UTF-8 cannot encode is written as \\udc80."""
+    """Write `text` atomically as UTF-8 with unchanged line ends; surrogates are escaped, as in \\udc80."""
     with atomic_file(path) as temporary:
         temporary.write_text(text, encoding="utf-8", errors="backslashreplace", newline="")
 
 
 def write_json(path: Path, document: Mapping[str, Any]) -> None:
-    """Write `document` atomically as JSON, which does not have NaN or infinity: these raise ValueError."""
+    """Write `document` atomically as JSON; NaN and infinity raise ValueError."""
     write_text(path, json.dumps(document, indent=1, allow_nan=False) + "\n")
 
 
 def make_folder(folder: Path) -> None:
-    """Create a folder, and those above it, such that they outlast a power cut; one that exists stays as it is."""
+    """Create a folder and its parents, unless they exist, and synchronise their names to the disk."""
     created = [path for path in (folder, *folder.parents) if not path.exists()]
     folder.mkdir(parents=True, exist_ok=True)
     for path in created:
@@ -169,7 +167,7 @@ def make_folder(folder: Path) -> None:
 
 
 def sync(path: Path) -> None:
-    """Synchronise a file, or the names in a folder, to the disk, so that they outlast a power cut; POSIX only."""
+    """Synchronise a file, or the names in a folder, to the disk, so that they survive a power cut; POSIX only."""
     if os.name != "posix":
         return
     try:
@@ -179,17 +177,17 @@ def sync(path: Path) -> None:
         finally:
             os.close(handle)
     except OSError as error:
-        # Of a folder this is more than some network disks can do, and than whoever may write there need be allowed.
+        # Some network disks cannot synchronise a folder, and it needs a permission that writing there does not.
         if error.errno not in (errno.EINVAL, errno.EACCES) or not path.is_dir():
             raise
 
 
 def to_disk(handle: int) -> None:
-    """Synchronise an open file to the disk; on macOS out of the drive's own cache too, where `os.fsync` leaves it."""
+    """Synchronise an open file to the disk; on macOS `os.fsync` would leave it in the drive's cache."""
     if sys.platform == "darwin":
         import fcntl
 
-        with suppress(OSError):  # a disk without that operation
+        with suppress(OSError):  # the disk does not support it
             fcntl.fcntl(handle, fcntl.F_FULLFSYNC)
             return
     os.fsync(handle)
@@ -197,10 +195,10 @@ def to_disk(handle: int) -> None:
 
 @contextmanager
 def atomic_files(folder: Path, without: Collection[str] = ()) -> Iterator[Path]:
-    """Replace a set of files together: yield an empty folder, whose files move to `folder` on success.
+    """Replace a set of files together: yield an empty folder, whose files are moved to `folder` on success.
 
-    If the body fails `folder` is as it was before. A kill while files move leaves no JSON document of either set.
-    Files named in `without` are removed as the others come.
+    If the body fails, `folder` is unchanged. A kill during the move leaves no JSON document of either set. Files named
+    in `without` are removed before the move.
     """
     with reraise_write_error(folder):
         make_folder(folder)
@@ -215,17 +213,17 @@ def atomic_files(folder: Path, without: Collection[str] = ()) -> Iterator[Path]:
             for name in (*documents, *without):
                 (folder / name).unlink(missing_ok=True)
             sync(folder)
-            for part in ([name for name in names if name not in documents], documents):
-                for name in part:
+            for group in ([name for name in names if name not in documents], documents):
+                for name in group:
                     (stage / name).replace(folder / name)
                 sync(folder)
 
 
 def check_file(path: Path, max_bytes: int = MAX_BYTES) -> Path:
-    """Return the path of a file of limited size; refuse a pipe or device, which may not end."""
+    """Return `path` if it is a regular file of at most `max_bytes`, otherwise raise InputError."""
     try:
         status = path.stat()
-    except (OSError, ValueError) as error:  # ValueError: a name that no file can have
+    except (OSError, ValueError) as error:  # ValueError: an invalid name
         raise InputError(f"{path}: cannot be read ({getattr(error, 'strerror', error)})") from error
     if not stat.S_ISREG(status.st_mode):
         kind = "Is a directory" if stat.S_ISDIR(status.st_mode) else "a pipe or device, expected a file"
@@ -236,7 +234,7 @@ def check_file(path: Path, max_bytes: int = MAX_BYTES) -> Path:
 
 
 def read_bytes(path: Path, max_bytes: int = MAX_BYTES) -> bytes:
-    """Read the content of a file of at most `max_bytes`, as `check_file`."""
+    """Read the contents of a file that passes `check_file`."""
     try:
         return check_file(path, max_bytes).read_bytes()
     except OSError as error:
@@ -261,7 +259,7 @@ def read_json(path: Path, *formats: str) -> dict[str, Any]:
 
 
 def sha256(path: Path) -> str:
-    """Compute the SHA-256 digest of a file, or of a folder's sorted file names and digests, in hexadecimal."""
+    """Return the hexadecimal SHA-256 digest of a file, or of the sorted digests and names of a folder's files."""
     if path.is_dir():
         children = [child for child in sorted(path.iterdir()) if child.is_file() and child.name != LOCK]
         lines = [f"{sha256(child)}  {child.name}" for child in children]
@@ -271,7 +269,7 @@ def sha256(path: Path) -> str:
 
 
 def find_unchanged(folder: Path, digests: Mapping[str, object]) -> set[str]:
-    """Return the names of the files directly in a folder that still have their digest; `digests` may hold anything."""
+    """Return the names of a folder's files that still have the digest in `digests`; invalid entries are ignored."""
     unchanged = set[str]()
     for name, digest in digests.items():
         with suppress(InputError, OSError):
@@ -283,33 +281,37 @@ def find_unchanged(folder: Path, digests: Mapping[str, object]) -> set[str]:
 def provenance(
     command: str, seed: int | None = None, inputs: Sequence[Path] = (), packages: Sequence[str] = ()
 ) -> dict[str, Any]:
-    """Describe where a result comes from; without time and output folder, so that equal work gives equal bytes.
+    """Return the provenance of a result, without time and output folder, so that equal runs give equal bytes.
 
-    Recorded are digests of the files and folders it was made from, and versions of `packages` besides the usual ones.
+    Args:
+        command: command that made the result.
+        seed: its seed.
+        inputs: files and folders that it was made from, recorded by their digests.
+        packages: packages to record the version of, besides the usual ones.
     """
     return {
         "command": command,
         "seed": seed,
         "versions": {"python": platform.python_version()}
-        | {name: installed_version(name) for name in (*_PACKAGES, *packages)},
+        | {name: installed_version(name) for name in ("padforge", "numpy", "scipy", *packages)},
         "inputs": {path.name: sha256(path) for path in inputs},
     }
 
 
 @cache
 def installed_version(package: str) -> str:
-    """Return the version of an installed package, which does not change while a process runs: it is read once."""
+    """Return the version of an installed package, which is read once a process."""
     return metadata.version(package)
 
 
 def find_dependents(path: Path, remade: Collection[str] = ()) -> list[str]:
-    """Return the names of what was made from a file beside it, directly or not, but for what is `remade` with it."""
+    """Return the names of the results in a file's folder made from it, also indirectly, except those `remade`."""
     documents = {file.name: _read_dict(file) for file in path.parent.glob("[!.]*.json") if file != path}
     documents |= {file.parent.name: _read_dict(file) for file in path.parent.glob("[!.]*/start.json") if file != path}
     sources, dependents = [path], set[str]()
     for source in sources:
         digest, origin = None, dict[str, Any]()
-        if not source.is_dir():  # documents hold other digests of a recording
+        if not source.is_dir():  # documents have another kind of digest of a recording, a folder
             digest, origin = sha256(source), _as_dict(_read_dict(source).get("provenance"))
         for name, document in documents.items():
             is_pad = str(document.get("format")).startswith(_MORPHOLOGY)
@@ -322,24 +324,24 @@ def find_dependents(path: Path, remade: Collection[str] = ()) -> list[str]:
 def check_replaceable(
     path: Path, by: Path | Mapping[str, Any], remade: Collection[str] = (), force: bool = False
 ) -> None:
-    """Check that replacing a file changes nothing, or that no other file beside it was made from it.
+    """Check that a file may be replaced: by an equal one, or if no other result in its folder was made from it.
 
     Args:
-        path: the file, which need not exist.
-        by: the file that replaces it, or, before there is one, its provenance as far as that is certain.
+        path: the file, which may be missing.
+        by: the file that replaces it, or the part of its provenance known in advance.
         remade: names of files that are replaced together with it.
-        force: skip the check.
+        force: whether to skip the check.
 
     Raises:
-        InputError: others were made from it; they are named.
+        InputError: other results were made from it; they are named.
     """
     if force or not path.is_file():
         return
     if isinstance(by, Path):
         is_same = sha256(by) == sha256(path)
     else:
-        before = _as_dict(_read_dict(path).get("provenance"))
-        is_same = all(before.get(key) == value for key, value in json.loads(json.dumps(by)).items())
+        stored = _as_dict(_read_dict(path).get("provenance"))
+        is_same = all(stored.get(key) == value for key, value in json.loads(json.dumps(by)).items())
     if not is_same and (dependents := find_dependents(path, remade)):
         *names, last = dependents
         listed = f"{', '.join(names)} and {last} were" if names else f"{last} was"
@@ -351,7 +353,7 @@ def _as_dict(value: object) -> dict[str, Any]:
 
 
 def _read_dict(path: Path) -> dict[str, Any]:
-    """Read a JSON object; an empty one from any other file, since a folder may hold whatever a user puts there."""
+    """Read a JSON object; return an empty one for any other file, which a user may have put there."""
     try:
         return _as_dict(json.loads(read_bytes(path)))
     except (InputError, ValueError, RecursionError):
@@ -359,7 +361,7 @@ def _read_dict(path: Path) -> dict[str, Any]:
 
 
 def _is_made_from(document: Mapping[str, Any], name: str, digest: str | None, origin: Mapping[str, Any]) -> bool:
-    """Whether a document names as its input a file of this digest, or a model of this provenance."""
+    """Return whether the inputs of a document include a file of this digest, or a model of this provenance."""
     inputs = _as_dict(_as_dict(document.get("provenance")).get("inputs"))
     if digest is None:
         return name in inputs

@@ -1,4 +1,4 @@
-"""MATLAB files of all versions and HDF5 files: their full matrices of real numbers, none of them from another file."""
+"""Reading of MATLAB files of all versions, and of HDF5 files: full matrices of real numbers, without external data."""
 
 import warnings
 from collections.abc import Iterator, Mapping
@@ -14,14 +14,14 @@ from padforge.common.validation import InputError
 
 MAX_BYTES = 2**33  # size limit of a file
 _OBJECTS = ("cell", "char", "table", "timetable", "string", "datetime", "duration", "categorical")
-"""Classes of MATLAB 7.3 whose datasets hold no numbers, or numbers of something else."""
+"""Classes of MATLAB 7.3 whose datasets are not matrices of numbers."""
 
 
 class Hdf5Reader:
     """The datasets of an open HDF5 file.
 
-    Its `names` are the paths of the datasets that are reached without a link and have all values in the file, and those
-    of the columns of tables among them.
+    Attributes:
+        names: paths of the datasets in the file, without links and external data; columns of tables are datasets.
     """
 
     def __init__(self, file: Any) -> None:
@@ -39,7 +39,7 @@ class Hdf5Reader:
         self.names = list(self._datasets)
 
     def read_text(self, name: str) -> str | None:
-        """Return a text attribute of the file; None if there is none of that name."""
+        """Return a text attribute of the file; None if it is missing."""
         import h5py
 
         if name not in self._file.attrs:
@@ -51,7 +51,7 @@ class Hdf5Reader:
         return value.decode() if isinstance(value, bytes) else str(value)
 
     def is_numeric(self, name: str) -> bool:
-        """Whether a dataset holds real numbers or truth values."""
+        """Return whether a dataset holds real numbers or Booleans."""
         return self._datasets[name].dtype.base.kind in "fiub"
 
     def describe(self, name: str) -> str:
@@ -64,12 +64,12 @@ class Hdf5Reader:
         return f"{getattr(dataset, 'shape', ('n',))} {dtype}"
 
     def matlab_class(self, name: str) -> str:
-        """Return the class that MATLAB 7.3 says a dataset is of; "" if none."""
+        """Return the class of a dataset by MATLAB 7.3; "" if it states none."""
         attribute = getattr(self._datasets[name], "attrs", {}).get("MATLAB_class", b"")
         return attribute.decode("ascii", "replace") if isinstance(attribute, bytes) else str(attribute)
 
     def read(self, name: str) -> NDArray[Any]:
-        """Read the values of a dataset; raise InputError if they are no real numbers."""
+        """Read the values of a dataset; raise InputError if they are not real numbers."""
         if (dataset := self._datasets.get(name)) is None:
             raise InputError(f"{name} is no dataset, expected one with all of its values in this file")
         if getattr(dataset, "size", 0) is None or not self.is_numeric(name):
@@ -79,7 +79,7 @@ class Hdf5Reader:
 
 @contextmanager
 def open_hdf5(path: Path) -> Iterator[Hdf5Reader]:
-    """Open an HDF5 file for reading; report errors of the body, too, as an InputError that names the file."""
+    """Open an HDF5 file for reading; all errors, also those of the body, become an InputError that names the file."""
     import h5py
 
     check_file(path, MAX_BYTES)
@@ -88,7 +88,7 @@ def open_hdf5(path: Path) -> Iterator[Hdf5Reader]:
             yield Hdf5Reader(file)
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
-    except Exception as error:  # h5py raises many kinds on torn files
+    except Exception as error:  # h5py raises many types for damaged files
         raise InputError(f"{path}: no HDF5 file that can be read ({' '.join(str(error).split())})") from error
 
 
@@ -96,20 +96,20 @@ def load_mat(path: Path, required: tuple[str, ...]) -> dict[str, Any]:
     """Read the variables of a MATLAB file.
 
     Args:
-        path: the file, of any version.
+        path: file of any version.
         required: names of variables that it must have.
 
     Returns:
-        By name: an array of a full real matrix, in its stored type; a dictionary of the fields of a structure; of
-        anything else what it is, as text ("a cell array").
+        Values by name: an array for a full real matrix, in its stored type; a dictionary of its fields for a structure;
+        a description such as "a cell array" for anything else.
     """
     try:
         with check_file(path, MAX_BYTES).open("rb") as file:
-            is_hdf5 = b"\x89HDF\r\n\x1a\n" in file.read(520)  # from 7.3 on, where 512 bytes of text precede it
+            is_hdf5 = b"\x89HDF\r\n\x1a\n" in file.read(520)  # MATLAB 7.3 writes 512 bytes of text before it
         content = _load_hdf5(path) if is_hdf5 else _load_matrices(path)
     except InputError:
         raise
-    except Exception as error:  # SciPy raises many kinds on torn files
+    except Exception as error:  # SciPy raises many types for damaged files
         raise InputError(f"{path}: not a readable MATLAB file, torn or of another kind ({error})") from error
     if missing := [name for name in required if name not in content]:
         present = ", ".join(sorted(content)) or "nothing"
@@ -118,7 +118,7 @@ def load_mat(path: Path, required: tuple[str, ...]) -> dict[str, Any]:
 
 
 def flatten_variables(content: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Return the variables of `load_mat` with the fields of structures by a dot, as `data.t`."""
+    """Return the variables of `load_mat` in one dictionary, with names such as `data.t` for fields of structures."""
     flat = dict[str, Any]()
     for name, value in content.items():
         flat |= flatten_variables(value, f"{prefix}{name}.") if isinstance(value, dict) else {prefix + name: value}
@@ -126,7 +126,7 @@ def flatten_variables(content: Mapping[str, Any], prefix: str = "") -> dict[str,
 
 
 def _load_hdf5(path: Path) -> dict[str, Any]:
-    """Read MATLAB 7.3: arrays are transposed, structures are groups, and #refs# holds what cell arrays refer to."""
+    """Read MATLAB 7.3: arrays are transposed, structures are groups, #refs# has the elements of cell arrays."""
     content = dict[str, Any]()
     with open_hdf5(path) as file:
         for name in file.names:
@@ -145,7 +145,7 @@ def _load_hdf5(path: Path) -> dict[str, Any]:
 
 
 def _name_object(kind: str, name: str) -> str:
-    """Say what a variable is that is no matrix, and how MATLAB writes it for others."""
+    """Describe a variable that is not a matrix, and how to export it from MATLAB."""
     if kind in ("table", "timetable"):
         return f"a {kind}, which only MATLAB reads: write{kind}({name}, '{name}.csv') there"
     return kind if kind.startswith("a ") else f"of class {kind or 'unknown'}"
@@ -155,11 +155,11 @@ def _load_matrices(path: Path) -> dict[str, Any]:
     """Read MATLAB 4 to 7.2."""
     import scipy.io
 
-    with warnings.catch_warnings(action="ignore"):  # variables of one name
+    with warnings.catch_warnings(action="ignore"):  # of duplicate names
         variables = scipy.io.loadmat(path, appendmat=False)
     content = dict[str, Any]()
     for name, value in variables.items():
-        if isinstance(value, scipy.io.matlab.MatlabOpaque):  # which SciPy names "None"
+        if isinstance(value, scipy.io.matlab.MatlabOpaque):  # SciPy's name for it is "None"
             name = value["s0"][0].decode("ascii", "replace")
         if not name.startswith("__"):
             content[name] = _to_plain(value, name)

@@ -1,4 +1,4 @@
-"""Self-contained HTML pages: everything inlined, without network access, readable on a phone and on paper.
+"""Self-contained HTML pages, without network access, readable on a phone and on paper.
 
 Their layout is in the templates `page.html`, `elements.html` and `page.css`.
 """
@@ -27,8 +27,7 @@ def read_resource(package: str, name: str) -> str:
 TEMPLATES = "padforge.common.templates"
 _TYPES = {".png": "image/png", ".svg": "image/svg+xml"}
 _NUMBER = re.compile(r"[-+]?\d[\d.]*(e[-+]?\d+)?( ?%| mm| ml| g)?")  # right-aligned in a table
-_SHORT, _LONG = 16, 30  # characters: columns of cells up to the one are not wrapped, words beyond the other broken
-_RESULTS = ("pass", "warn", "fail")  # cells of these words are coloured
+_RESULTS = ("pass", "warn", "fail")  # cells with these words are coloured
 
 
 @dataclass(frozen=True)
@@ -42,7 +41,7 @@ class PageSection:
 
     @property
     def anchor(self) -> str:
-        """The id of its heading."""
+        """Id of the heading."""
         return re.sub(r"[^a-z0-9]+", "-", self.title.lower()).strip("-")
 
 
@@ -92,7 +91,7 @@ def paragraph(text: str) -> str:
 
 
 def table(header: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
-    """Return a table; cells of the words pass, warn and fail are coloured, columns of numbers right-aligned."""
+    """Return a table; the words pass, warn and fail are coloured, columns of numbers right-aligned."""
     cells = [[_text(value) for value in row] for row in rows]
     kinds = [_column_style(column) for column in zip(*cells, strict=True)] or [""] * len(header)
     body = [
@@ -107,7 +106,7 @@ def columns(*columns: Sequence[str]) -> str:
 
 
 def collapsible(summary: str, body: Sequence[str]) -> str:
-    """Return elements that are visible once `summary` is clicked, and on paper."""
+    """Return elements that are visible after a click on `summary`, and on paper."""
     return _element("collapsible", summary, body)
 
 
@@ -120,7 +119,7 @@ def figures(pictures: Sequence[tuple[Path, str]]) -> str:
 def render_markdown(text: str) -> Iterator[str]:
     """Convert Markdown to HTML elements, without its title (level 1).
 
-    Understood are paragraphs, lists, tables, headings, **bold** and `code`; anything else, HTML too, is text.
+    It supports paragraphs, lists, tables, headings, **bold** and `code`; everything else, including HTML, is text.
     """
     from markdown_it import MarkdownIt
     from markdown_it.tree import SyntaxTreeNode
@@ -131,7 +130,7 @@ def render_markdown(text: str) -> Iterator[str]:
             if block.tag != "h1":
                 yield heading(block.children[0].content)
         elif block.type == "table":
-            head, *rows = ([cell.children[0].content for cell in row.children] for part in block for row in part)
+            head, *rows = ([cell.children[0].content for cell in row.children] for group in block for row in group)
             yield table(head, rows)
         else:
             yield reader.renderer.render(block.to_tokens(), reader.options, {})
@@ -141,7 +140,7 @@ def _embed_picture(path: Path, caption: str) -> dict[str, Any]:
     from PIL import Image
 
     content = read_bytes(path)
-    size = None  # an SVG states its own
+    size = None  # an SVG states its size
     if path.suffix == ".png":
         with Image.open(path) as picture:
             size = picture.size
@@ -161,6 +160,6 @@ def _column_style(column: Sequence[str]) -> str:
     """Return the CSS class of the cells of a column."""
     if any(column) and all(_NUMBER.fullmatch(text) for text in column if text not in ("", "-")):
         return "number"
-    if max(map(len, column)) <= _SHORT:
+    if max(map(len, column)) <= 16:  # not wrapped
         return "short"
-    return "long" if any(len(word) > _LONG for text in column for word in text.split()) else ""
+    return "long" if any(len(word) > 30 for text in column for word in text.split()) else ""  # such words are broken

@@ -1,7 +1,7 @@
 """Parallel tasks on the cores of this machine or on a cluster, and the checkpoints from which they resume.
 
-Threads serve on one machine, since torch and the kernels release the interpreter lock while they compute: nothing is
-copied, and compiled code is shared.
+On one machine tasks run in threads, since torch and the kernels release the interpreter lock: no data are copied, and
+compiled code is shared.
 """
 
 import io
@@ -32,7 +32,7 @@ POLL_S = 0.1  # interval at which Ctrl-C is noticed on systems where it does not
 
 _STATE_FILE = re.compile(r"start_([0-9]{4,})\.npz")
 
-active_threads = set[Thread]()  # those of `_DaemonThreads` that have not ended
+active_threads = set[Thread]()  # threads of `_DaemonThreads` that have not ended
 
 
 def run_tasks(
@@ -45,15 +45,15 @@ def run_tasks(
 ) -> Iterator[tuple[Key, Result]]:
     """Run tasks in parallel, and yield their results as they complete, each with the key of its task.
 
-    Tasks start only while the caller iterates. An exception or Ctrl-C in the caller starts no further task, and running
-    ones are not waited for; an exception in a task is raised here at once.
+    Tasks start only while the caller iterates. After an exception or Ctrl-C in the caller no further task starts, and
+    running ones are not waited for; an exception in a task is raised here at once.
 
     Args:
-        tasks: functions by key, in the order in which they start; for a cluster picklable, as `functools.partial` is.
-        executor: of the `concurrent.futures` kind; daemon threads of this machine if None.
-        max_parallel: limit of running tasks; by default the number of cores, or none with an executor.
-        follow_up: returns the next task of the same key, once the caller has used a result; None if there is none.
-        is_abandoned: whether to leave running tasks behind, as where an executor hangs.
+        tasks: functions by key, in the order in which they start; for a cluster they must be picklable.
+        executor: executor of `concurrent.futures`; daemon threads of this machine if None.
+        max_parallel: maximum number of running tasks; by default the number of cores, or no limit with an executor.
+        follow_up: returns the next task of a key, or None; called after the caller has used a result.
+        is_abandoned: returns whether to leave running tasks behind, for example because an executor hangs.
     """
     pool = executor or _DaemonThreads()
     limit = max_parallel or (None if executor else os.cpu_count() or 1)
@@ -75,7 +75,7 @@ def run_tasks(
 
 
 class _DaemonThreads(Executor):
-    """A thread for each task, which, unlike those of `ThreadPoolExecutor`, does not delay the end of the program."""
+    """A daemon thread for each task; unlike `ThreadPoolExecutor`, it does not delay the end of the program."""
 
     def submit(self, work: Callable[..., Any], /, *arguments: Any, **keywords: Any) -> Future[Any]:
         """Start a task at once."""
@@ -97,19 +97,20 @@ class _DaemonThreads(Executor):
 
 
 def makespan(parts: Sequence[float], workers: int) -> float:
-    """Return the time in which workers finish tasks of these lengths, each taking the next one when it is free."""
+    """Return the time in which workers finish tasks of these durations, by list scheduling."""
     ends = [0.0] * workers
-    for part in parts:
-        ends[ends.index(min(ends))] += part
+    for duration in parts:
+        ends[ends.index(min(ends))] += duration
     return max(ends)
 
 
 @contextmanager
 def cluster(address: str | None) -> Iterator[Executor | None]:
-    """Connect to the Dask cluster at `address` as an executor; None stands for this machine.
+    """Connect to the Dask cluster at `address` and yield its executor; None for this machine.
 
     Raises:
-        Fault: in the body, when the scheduler is lost, or a task has ended one worker after another.
+        InputError: Dask is not installed, or no scheduler answers.
+        Fault: the scheduler is lost in the body, or a task has ended several workers.
     """
     if address is None:
         yield None
@@ -133,7 +134,7 @@ def cluster(address: str | None) -> Iterator[Executor | None]:
 
 
 def map_chunks(work: Callable[[int, int], Result], count: int, min_chunk: int) -> list[Result]:
-    """Return work(begin, end) for chunks of at least `min_chunk` that partition range(count), one thread a core."""
+    """Return work(begin, end) for chunks, of at least `min_chunk`, of range(count), with one thread a core."""
     n_chunks = max(1, min(os.cpu_count() or 1, count // min_chunk))
     if n_chunks == 1:
         return [work(0, count)]
@@ -142,38 +143,44 @@ def map_chunks(work: Callable[[int, int], Result], count: int, min_chunk: int) -
         return list(pool.map(lambda bounds: work(*bounds), pairwise(edges)))
 
 
-_bodies, _limits, _limits_lock = list[None](), ExitStack(), Lock()  # torch and BLAS have one number of threads for all
+# The number of threads of torch and BLAS is global: the last body of `one_thread` to end restores it.
+_n_bodies = 0
+_limits = ExitStack()
+_limits_lock = Lock()
 
 
 @contextmanager
 def one_thread() -> Iterator[None]:
-    """Limit torch and BLAS to one thread in the body; from any thread, in parallel or nested, until the last body ends.
+    """Limit torch and BLAS to one thread in the body, which may be nested or run in several threads.
 
-    More threads gain little on small matrices, slow down where another program runs, and sum in another order. Those of
-    BLAS wait by spinning: beside other programs, uncertainty was calibrated in six times the processor time.
+    More threads gain little for small matrices, are slow beside other programs, and sum in another order. BLAS threads
+    spin while they wait: beside other programs, the calibration of uncertainty took six times the processor time.
     """
+    global _n_bodies
     import torch
     from threadpoolctl import threadpool_limits
 
     with _limits_lock:
-        if not _bodies:
+        if not _n_bodies:
             _limits.callback(torch.set_num_threads, torch.get_num_threads())
             _limits.enter_context(threadpool_limits(1, "blas"))
             torch.set_num_threads(1)
-        _bodies.append(None)
+        _n_bodies += 1
     try:
         yield
     finally:
         with _limits_lock:
-            _bodies.pop()
-            if not _bodies:
+            _n_bodies -= 1
+            if not _n_bodies:
                 _limits.close()
 
 
 class Checkpoints:
-    """The states of the tasks of a search, each in a small file of arrays, from which they resume after a kill.
+    """Checkpoints of the tasks of a search, each a small file of arrays, from which a killed search resumes.
 
-    The folder is created with the first state; states of other settings, by section and key, are refused.
+    Args:
+        folder: folder for the files, created with the first state.
+        settings: settings by section and key; states of other settings are refused.
     """
 
     def __init__(self, folder: Path, settings: dict[str, Any]) -> None:
@@ -181,7 +188,7 @@ class Checkpoints:
         self._file = folder / "search.json"
 
     def begin(self, resume: bool) -> dict[int, State]:
-        """Return the states of an earlier run by number to resume from, or remove them.
+        """Return the states of an earlier run by number if `resume`, otherwise remove them.
 
         Raises:
             InputError: the states belong to other settings, or cannot be read.
@@ -200,14 +207,14 @@ class Checkpoints:
         return {number: self._read(paths[number]) for number in sorted(paths)}
 
     def save(self, number: int, state: State) -> None:
-        """Write a state atomically in place of the last one of that number."""
+        """Write the state of a task atomically."""
         if not self._file.exists():
             files.write_json(self._file, {"format": FORMAT, "settings": self.settings})
         with files.atomic_file(self.folder / f"start_{number:04d}.npz") as temporary:
             np.savez(temporary, allow_pickle=False, **state)
 
     def clear(self) -> None:
-        """Remove all states, and the folder if nothing else is in it.
+        """Remove all states, and the folder if it is then empty.
 
         Raises:
             InputError: its search.json is not that of a search.
@@ -231,5 +238,5 @@ class Checkpoints:
                 return {name: arrays[name] for name in arrays.files}
         except InputError:
             raise
-        except Exception as error:  # NumPy and zipfile raise many kinds on torn files
+        except Exception as error:  # NumPy and zipfile raise many types for damaged files
             raise InputError(f"{path}: cannot be read ({error}); start anew without --resume") from error

@@ -1,4 +1,4 @@
-"""The style of all figures, in which each family of fibres has its colour, and how they are saved."""
+"""The common style of figures, with a colour for each family of fibres, and functions to save them."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -11,15 +11,15 @@ if TYPE_CHECKING:
 
 HORIZONTAL, VERTICAL = "#0b6e99", "#d9730d"
 ALARM, INK, FAINT, PAPER = "#c4161c", "#37352f", "#d3d1cb", "#f7f6f3"
-CURVES = (INK, VERTICAL, HORIZONTAL, ALARM, "#3f8f5b", "#8a63b0", "#b58900", "#7d7a75")  # of a figure, in order
+CURVES = (INK, VERTICAL, HORIZONTAL, ALARM, "#3f8f5b", "#8a63b0", "#b58900", "#7d7a75")  # colours of curves, in order
 
-DPI = 150  # of pictures, unless they say another
+DPI = 150  # default resolution of pictures
 
 
 def save_figure(figure: "Figure", path: Path, dpi: float | None = None) -> None:
-    """Save a figure as .svg or .png, atomically and byte-reproducibly (no dates, stable ids).
+    """Save a figure as .svg or .png, atomically and reproducibly to the byte (no dates, stable ids).
 
-    A PNG has a palette of 256 colours, a third of the size without visible difference.
+    A PNG has a palette of 256 colours, which reduces it to a third of the size without a visible difference.
     """
     import matplotlib as mpl
     import numpy as np
@@ -77,5 +77,5 @@ def draw_confusions(axes: Any, counts: Sequence[Sequence[int]]) -> None:
 
 
 def add_caption(axes: Any, text: str) -> None:
-    """Add an explanation of the marks under the title of axes."""
+    """Add an explanation of the markers below the title of axes."""
     axes.text(0, 1.015, text, transform=axes.transAxes, color=INK, fontsize=8.5)

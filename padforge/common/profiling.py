@@ -1,4 +1,4 @@
-"""Profile of a command: wall time by stage, and how much of the work was skipped; costs nothing unless enabled."""
+"""Profile of a command: wall time by stage, and the amount of work that was skipped."""
 
 import sys
 import threading
@@ -11,7 +11,7 @@ from importlib.machinery import PathFinder
 from types import ModuleType
 from typing import Any
 
-# libraries whose import takes noticeable time
+# Libraries that take noticeable time to import.
 HEAVY = (
     *("OCP", "build123d", "ezdxf", "h5py", "manifold3d", "matplotlib", "numba", "numpy", "pydantic", "pymoo"),
     *("rtde_control", "scipy", "serial", "shapely", "torch", "trimesh"),
@@ -20,7 +20,7 @@ _OTHER = "elsewhere"
 
 
 class Profile:
-    """Wall time of the main thread by stage, without the stages within it, and counts."""
+    """Wall time of the main thread by stage, excluding nested stages, and counts."""
 
     def __init__(self) -> None:
         self.seconds = defaultdict[str, float](float)
@@ -55,7 +55,7 @@ _active: Profile | None = None
 
 @contextmanager
 def profiled() -> Iterator[Profile]:
-    """Profile the body; imports of HEAVY libraries are stages of their own."""
+    """Profile the body; the import of each of the libraries in `HEAVY` is a stage."""
     global _active
     _active, finder = Profile(), _TimedImports()
     sys.meta_path.insert(0, finder)
@@ -83,7 +83,7 @@ def stage(name: str) -> Iterator[None]:
 
 
 def add_count(name: str, evaluated: int, total: int) -> None:
-    """Count how many of `total` items were evaluated, the others skipped; from any thread."""
+    """Count `evaluated` of `total` items, of which the others were skipped; thread-safe."""
     if _active is not None:
         with _active.lock:
             _active.counts[name][0] += evaluated
@@ -91,12 +91,12 @@ def add_count(name: str, evaluated: int, total: int) -> None:
 
 
 def is_profiling() -> bool:
-    """Whether a profile is being taken, for counts that take time themselves."""
+    """Return whether a command is being profiled, for counts that take time themselves."""
     return _active is not None
 
 
 class _TimedImports(MetaPathFinder):
-    """Makes the import of each of HEAVY a stage."""
+    """Makes the import of each of the libraries in `HEAVY` a stage."""
 
     def find_spec(self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None) -> Any:
         spec = PathFinder.find_spec(fullname, path, target) if fullname in HEAVY else None
@@ -104,7 +104,7 @@ class _TimedImports(MetaPathFinder):
         if loader is not None:
 
             def exec_timed(module: ModuleType) -> None:
-                del loader.exec_module  # uncovers the method of its class
+                del loader.exec_module  # restores the method of its class
                 with stage(f"import {fullname}"):
                     loader.exec_module(module)
 

@@ -1,10 +1,10 @@
-"""How functions that take long report their progress."""
+"""Callback for the progress of long functions."""
 
 from collections.abc import Callable
 
 OnProgress = Callable[[int, int, str], None]
-"""Called with steps done, steps in all (0 if unknown), and what is being done, in a few words or none."""
+"""Called with the number of completed steps, of all steps (0 if unknown), and a short description or ""."""
 
 
 def ignore_progress(done: int, total: int, what: str) -> None:
-    """Show nothing."""
+    """Do nothing."""

@@ -1,7 +1,7 @@
-"""A web page for browsers on this machine: it shows messages as they come, and may post to agreed addresses.
+"""A web page for browsers on this machine, which shows live messages and may post to given addresses.
 
-Messages are Server-Sent Events, each the whole of what the page shows, so that a browser that comes late, comes back or
-is slow needs nothing but the latest. Browsers state where a request comes from: those of other pages are refused.
+Messages are Server-Sent Events. Each contains everything that the page shows, so that a browser that connects late,
+reconnects or is slow needs only the latest. Requests of other pages, as stated by the browser, are refused.
 """
 
 import base64
@@ -28,32 +28,36 @@ from padforge.common.validation import InputError
 
 HOST = "127.0.0.1"  # the loopback interface; other addresses are served only with a token
 MIN_TOKEN = 16  # characters
-POLL_S = 0.05  # interval at which a server checks whether it is to end
-END_S = 1.0  # time limit for sending the last message at the end
+POLL_S = 0.05  # interval at which a server checks whether to end
 MIN_INTERVAL_S = 0.04  # between two messages to a browser
-KEEP_ALIVE_S = 5.0  # after this time without a message an empty one is sent, which fails if the browser has gone
-RETRY_MS = 1000  # after this time a browser that lost its connection tries again
-HTTP_PORT = 80  # which browsers omit from the Host header
+KEEP_ALIVE_S = 5.0  # time without a message after which an empty one is sent, to detect a closed browser
+HTTP_PORT = 80  # browsers omit it from the Host header
 
-# takes the body of a post and returns JSON or nothing; raises InputError on a body that it cannot use
+# Takes the body of a post, and returns JSON or None; raises InputError for an invalid body.
 Handler = Callable[[bytes], Mapping[str, Any] | None]
 
 
 class ConnectionServer(socketserver.ThreadingTCPServer):
-    """A TCP server that runs in the `with` block; connections that are still open at its end are cut off."""
+    """A TCP server that runs in the `with` block; connections still open at its end are closed."""
 
     daemon_threads = True
-    request_queue_size = socket.SOMAXCONN  # waiting to be accepted; one that finds no room there comes a second late
-    # On Windows the flag would let two programs share a port; elsewhere it frees a port that was used a minute ago.
+    request_queue_size = socket.SOMAXCONN  # a connection beyond a full queue is delayed by a second
+    # On Windows the flag would let two programs share a port; elsewhere it allows a port that was used a minute ago.
     allow_reuse_address = os.name == "posix"
 
     def __init__(
         self, address: tuple[str, int], handler: type[socketserver.BaseRequestHandler], token: str, option: str
     ) -> None:
-        """Bind the port, 0 for any that is free; `option` of the command line chooses another one.
+        """Bind the port.
+
+        Args:
+            address: host and port, 0 for any free one.
+            handler: handler of requests.
+            token: token of clients; required if other machines can connect.
+            option: option of the command line that sets the port, for messages.
 
         Raises:
-            InputError: the address cannot be used, or other machines can connect without a token of some length.
+            InputError: the address cannot be used, or the token is missing or too short.
         """
         host, port = address
         if token and not (len(token) >= MIN_TOKEN and token.isascii() and token.isprintable()):
@@ -82,11 +86,11 @@ class ConnectionServer(socketserver.ThreadingTCPServer):
 
     def __exit__(self, *error: object) -> None:
         self.shutdown()
-        self.end(END_S)
+        self.end(timeout_s=1.0)
         self.server_close()
 
     def end(self, timeout_s: float) -> None:
-        """Send no more, and wait until every client has got the last message, `timeout_s` at most."""
+        """Stop sending, and wait until every client has the last message, for at most `timeout_s`."""
         raise NotImplementedError
 
     def verify_request(self, request: Any, client_address: Any) -> bool:
@@ -102,39 +106,35 @@ class ConnectionServer(socketserver.ThreadingTCPServer):
         super().close_request(request)
 
     def server_close(self) -> None:
-        """Stop listening, and cut off all connections."""
+        """Stop listening, and close all connections."""
         super().server_close()
         with self._lock:
             for connection in self._connections:
                 _cut_off(connection)
 
     def handle_error(self, request: Any, client_address: Any) -> None:
-        """Report errors other than those of a connection that was closed by its client."""
+        """Report an error, unless it is that of a connection closed by its client."""
         if not isinstance(sys.exception(), OSError):
             super().handle_error(request, client_address)
 
 
 def is_this_machine(host: str, port: int) -> bool:
-    """Return whether the Host of a request names a port of this machine.
+    """Return whether the Host header of a request names this machine and the served port.
 
-    Otherwise a page from elsewhere could reach it by a host name that resolves to this machine (DNS rebinding).
-
-    Args:
-        host: the header.
-        port: that is served.
+    Without this check a foreign page could connect by a host name that resolves to this machine (DNS rebinding).
     """
     name, _, number = host.partition(":")
     return name in (HOST, "localhost") and (number or str(HTTP_PORT)) == str(port)
 
 
 def _cut_off(connection: socket.socket) -> None:
-    """End a connection, such that what was sent still arrives, and the thread that waits for it wakes up."""
+    """Shut a connection down: sent data still arrive, and the thread that waits for the connection wakes up."""
     with suppress(OSError):
         connection.shutdown(socket.SHUT_RDWR)
 
 
 class LocalPage(ConnectionServer):
-    """A page that is served in the `with` block, and its latest message to every browser that waits for it."""
+    """A page that is served in the `with` block, with its latest message for every browser."""
 
     def __init__(
         self,
@@ -146,13 +146,19 @@ class LocalPage(ConnectionServer):
         host: str = HOST,
         token: str = "",
     ) -> None:
-        """Bind the port for a page with one <script> and one <style>, as `page_text` returns it.
+        """Bind the port.
 
-        `handlers` take its posts by address, and are called from several threads at once.
+        Args:
+            port: port, 0 for any free one.
+            page: page with one <script> and one <style>, see `page_text`.
+            handlers: handlers of posts by address; called from several threads.
+            max_post_bytes: maximum size of a post.
+            host: address.
+            token: see `ConnectionServer`.
         """
         self.page, self.handlers, self.max_post_bytes = page.encode(), handlers, max_post_bytes
         self.policy = "default-src 'none'; connect-src 'self'; img-src data:; base-uri 'none'; form-action 'none'"
-        for tag in ("script", "style"):  # the page's own only
+        for tag in ("script", "style"):  # only those of the page
             digest = hashlib.sha256(page.split(f"<{tag}>")[1].split(f"</{tag}>")[0].encode()).digest()
             self.policy += f"; {tag}-src 'sha256-{base64.b64encode(digest).decode()}'"
         self.policy += "; frame-ancestors 'none'"
@@ -160,25 +166,24 @@ class LocalPage(ConnectionServer):
         self._message, self._number, self._n_readers, self._has_ended = "", 0, 0, False
         super().__init__((host, port), _PageHandler, token, "--port")
         query = f"?{urlencode({'token': token})}" if token else ""
-        # The address of the page, with the token.
         self.url = f"http://{host}:{self.server_address[1]}/{query}"
 
     def show(self, view: Mapping[str, Any]) -> None:
-        """Show `view`, a JSON object without NaN, from now on."""
+        """Make `view`, a JSON object without NaN, the latest message."""
         message = json.dumps(view, allow_nan=False)
         with self._changed:
             self._message, self._number = message, self._number + 1
             self._changed.notify_all()
 
     def end(self, timeout_s: float) -> None:
-        """Show no more, and wait until every browser has got the latest message, `timeout_s` at most."""
+        """Stop sending, and wait until every browser has the latest message, for at most `timeout_s`."""
         with self._changed:
             self._has_ended = True
             self._changed.notify_all()
             self._changed.wait_for(lambda: self._n_readers == 0, timeout_s)
 
     def send_messages(self, send: Callable[[bytes], object]) -> None:
-        """Send each message that is the latest when its turn comes, until the end."""
+        """Send the latest message, at most every `MIN_INTERVAL_S`, until `end` is called."""
         with self._changed:
             self._n_readers += 1
         number = 0
@@ -199,9 +204,9 @@ class LocalPage(ConnectionServer):
 
 
 def page_text(package: str, name: str, *parts: str) -> str:
-    """Read a page that a package ships, and insert the style and script that all local pages share.
+    """Return a page of a package with the inserted style and script of all local pages, and further `parts`.
 
-    Further `parts` are files of the package; each stands in the page as a line `/* its name */`.
+    Parts are files of the package; each replaces a line `/* NAME */` of the page.
     """
     text = read_resource(package, name)
     for owner, part in [(TEMPLATES, "local_page.css"), (TEMPLATES, "local_page.js"), *((package, p) for p in parts)]:
@@ -211,7 +216,7 @@ def page_text(package: str, name: str, *parts: str) -> str:
 
 class _PageHandler(BaseHTTPRequestHandler):
     server: LocalPage  # pyright: ignore[reportIncompatibleVariableOverride]
-    timeout = 10  # of a browser that neither sends nor receives
+    timeout = 10  # s, for a browser that neither sends nor receives
 
     def do_GET(self) -> None:
         if not self._is_authorised():
@@ -221,7 +226,7 @@ class _PageHandler(BaseHTTPRequestHandler):
             self._send(HTTPStatus.OK, "text/html; charset=utf-8", page, Content_Security_Policy=policy)
         elif self._url.path == "/events":
             self._send(HTTPStatus.OK, "text/event-stream")
-            self.wfile.write(f"retry: {RETRY_MS}\n\n".encode())
+            self.wfile.write(b"retry: 1000\n\n")  # ms after which a browser reconnects
             self.server.send_messages(self.wfile.write)
         else:
             self.send_error(HTTPStatus.NOT_FOUND)
@@ -248,7 +253,7 @@ class _PageHandler(BaseHTTPRequestHandler):
                 self._send(HTTPStatus.OK, "application/json", json.dumps(result, allow_nan=False).encode())
 
     def _is_authorised(self) -> bool:
-        """Whether the request has the token, or without one names this machine, and is not of another page."""
+        """Return whether the request has the token, or names this machine if there is none, and is of this page."""
         self._url = urlsplit(self.path)
         if self.server.token:
             token = parse_qs(self._url.query).get("token", [""])[0]
@@ -259,14 +264,13 @@ class _PageHandler(BaseHTTPRequestHandler):
         return is_authorised and not self._is_foreign()
 
     def _is_foreign(self) -> bool:
-        """Whether another page makes the request; links to the page itself are no requests of that kind.
+        """Return whether another page makes the request; links to the page itself are allowed.
 
-        Browsers leave out the origin of images and the like, and say in Sec-Fetch-Site that they are foreign.
+        For images and the like browsers send no Origin header, but state in Sec-Fetch-Site that they are foreign.
         """
         origin = f"http://{self.headers['Host']}"
-        is_linked = self._url.path == "/"
-        is_foreign = not is_linked and self.headers.get("Sec-Fetch-Site", "none") not in ("same-origin", "none")
-        return is_foreign or self.headers.get("Origin", origin) != origin
+        is_cross_site = self.headers.get("Sec-Fetch-Site", "none") not in ("same-origin", "none")
+        return (is_cross_site and self._url.path != "/") or self.headers.get("Origin", origin) != origin
 
     def _send(self, status: HTTPStatus, content_type: str = "", body: bytes = b"", **headers: str) -> None:
         self.send_response(status)
@@ -279,4 +283,4 @@ class _PageHandler(BaseHTTPRequestHandler):
         self.wfile.write(body)
 
     def log_message(self, format: str, *args: Any) -> None:
-        """Log nothing: the terminal shows the progress of the command."""
+        """Log nothing, since the terminal shows the progress of the command."""

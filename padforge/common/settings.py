@@ -1,4 +1,4 @@
-"""Reading, validating and writing of `pad.toml`; the packages that own its sections define their models."""
+"""Reading, validation and writing of `pad.toml`; each package defines the models of its sections."""
 
 import json
 import sys
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 
 class Settings(BaseModel):
-    """A table of `pad.toml`: immutable, without unknown keys and NaN; the description of a field is its comment."""
+    """A table of `pad.toml`: immutable, without unknown keys and NaN; descriptions of fields become comments."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, strict=True)
 
@@ -47,7 +47,7 @@ class Settings(BaseModel):
         """Return the name of the table: that of the model, without `Settings`."""
         return cls.__name__.removesuffix("Settings").lower()
 
-    # lets pydantic validate nested tables without this __init__, so that its errors name the whole path of a key
+    # Makes pydantic validate nested tables without this __init__, so that its errors have the full path of a key.
     __init__.__pydantic_base_init__ = True  # pyright: ignore[reportFunctionMemberAccess]
 
 
@@ -55,8 +55,8 @@ AnySettings = TypeVar("AnySettings", bound=Settings)
 
 
 def to_builtins(value: Any) -> object:
-    """Replace NumPy scalars and arrays by Python numbers and lists."""
-    numpy = sys.modules.get("numpy")  # without importing it: a caller who has such values has done so
+    """Convert NumPy scalars and arrays to Python numbers and lists."""
+    numpy = sys.modules.get("numpy")  # a caller with such values has imported it
     if numpy and isinstance(value, numpy.generic | numpy.ndarray):
         return value.tolist()
     if isinstance(value, list | tuple):
@@ -68,24 +68,24 @@ def to_builtins(value: Any) -> object:
 
 
 def as_tuple(value: object) -> object:
-    """Convert a list, as in files, to the tuple that a frozen model holds; return anything else unchanged."""
+    """Convert a list, as read from a file, to the tuple of a frozen model; return other values unchanged."""
     return tuple(value) if isinstance(value, list) else value
 
 
 @dataclass(frozen=True)
 class _NullWord:
-    """Annotates a key that is null in JSON Schema as what it is in files."""
+    """Annotation that replaces null in the JSON Schema of a key by a word."""
 
     word: str
 
     def __get_pydantic_json_schema__(self, schema: "CoreSchema", handler: "GetJsonSchemaHandler") -> dict[str, Any]:
-        """Return the JSON Schema of the key, with the word in place of null."""
+        """Return the JSON Schema of the key with the word in place of null."""
         options = handler(schema)["anyOf"]
         return {"anyOf": [{"const": self.word} if option == {"type": "null"} else option for option in options]}
 
 
 def null_as(word: str) -> tuple[BeforeValidator, PlainSerializer, _NullWord]:
-    """Annotate a key that is `word` in files where the model holds None: `Annotated[float | None, *null_as("any")]`."""
+    """Return annotations of a key whose None is `word` in files: `Annotated[float | None, *null_as("any")]`."""
 
     def read(value: object) -> object:
         return None if isinstance(value, str) and value == word else value
@@ -94,7 +94,7 @@ def null_as(word: str) -> tuple[BeforeValidator, PlainSerializer, _NullWord]:
 
 
 class Spec:
-    """The content of a `pad.toml`; `spec.section(PadSettings)` is a section of it, validated, with its defaults."""
+    """The contents of a `pad.toml`; `spec.section(PadSettings)` returns a validated section with its defaults."""
 
     def __init__(
         self,
@@ -102,15 +102,15 @@ class Spec:
         source: str = "built-in defaults",
         sections: Collection[str] | None = None,
     ) -> None:
-        """Check the names of sections; their content is validated when it is used.
+        """Check the names of sections; their contents are validated by `section`.
 
         Args:
             tables: sections by name.
-            source: what errors call them.
-            sections: names that are allowed; any if None.
+            source: name of the source in errors.
+            sections: allowed names; any if None.
 
         Raises:
-            InputError: an unknown section, or one that is no table.
+            InputError: a section is unknown, or not a table.
         """
         allowed = check_mapping("tables", tables) if sections is None else sections
         if unknown := [name for name in tables if name not in allowed]:
@@ -125,7 +125,7 @@ class Spec:
 
         Args:
             path: the file; None for the defaults.
-            sections: names that are allowed; any if None.
+            sections: allowed names; any if None.
 
         Raises:
             InputError: the file cannot be read, is not TOML, or has an unknown section.
@@ -144,39 +144,35 @@ class Spec:
         """Validate the section of `model`.
 
         Args:
-            model: of the section.
-            **overrides: values that replace those of the file, unless None; errors of these do not name the file.
+            model: model of the section.
+            **overrides: values that replace those of the file, unless None; their errors do not name the file.
 
         Raises:
-            InputError: an unknown key or a value out of range, with key, value and what is allowed.
+            InputError: a key is unknown or a value out of range.
         """
         changes = {key: value for key, value in overrides.items() if value is not None}
         return validate(model, {**self.stated(model), **changes}, f"{self.source}: [{model.section()}]", changes)
 
     def replaced(self, tables: Mapping[str, Mapping[str, Any]], source: str = "") -> "Spec":
-        """Return these settings with other values in place of theirs.
+        """Return a copy of these settings with other values.
 
         Args:
-            tables: the values, by section and key.
-            source: what errors call the result; as these settings if empty.
+            tables: other values, by section and key.
+            source: name of the source in errors; that of these settings if empty.
         """
         Spec(tables, source := source or self.source)
         names = {*self._tables, *tables}
         return Spec({name: {**self._tables.get(name, {}), **tables.get(name, {})} for name in names}, source)
 
     def stated(self, model: type[Settings] | str) -> Mapping[str, Any]:
-        """Return what the file states of a section, without defaults and not validated.
-
-        Args:
-            model: of the section, or the section's name.
-        """
+        """Return the values of a section, given by its model or name, that the file states; they are not validated."""
         return self._tables.get(model if isinstance(model, str) else model.section(), {})
 
 
 def or_default(
     name: str, value: AnySettings | None, model: type[AnySettings], default: AnySettings | None = None
 ) -> AnySettings:
-    """Return an argument that is a section of the settings; `default`, else that of the model, if it is None."""
+    """Return an argument that is a section of the settings; if it is None, `default` or the defaults of the model."""
     return (default or model()) if value is None else check_type(name, value, model)
 
 
@@ -185,7 +181,7 @@ def validate(
 ) -> AnySettings:
     """Return `model(**values)`; raise the first error of pydantic as an InputError.
 
-    It begins with `where`, or with the section if it is about one of the keys `overrides`.
+    The message begins with `where`, or, if its key is in `overrides`, with the section.
     """
     try:
         return model.model_validate(dict(values))
@@ -204,7 +200,7 @@ def _to_input_error(
     if first["loc"] and first["loc"][0] in overrides:
         where = f"[{model.section()}]"
     message = first["msg"].removeprefix("Value error, ")
-    if not first["loc"]:  # an error of the whole section names its keys itself
+    if not first["loc"]:  # the message of an error of the whole section has the keys
         return InputError(f"{where} {message}")
     key = _key_path(first["loc"], model, values)
     if first["type"] == "extra_forbidden":
@@ -215,25 +211,25 @@ def _to_input_error(
 
 
 def _key_path(loc: Sequence[str | int], model: type[Settings], values: object) -> str:
-    """Return where in the values of a model an error is, such as contacts[0].radius.
+    """Return the path of an error in the values of a model, such as contacts[0].radius.
 
-    Parts of `loc` that are neither keys nor indices are names of types, which pydantic puts between.
+    Items of `loc` that are neither keys nor indices are names of types, which pydantic inserts.
     """
     path = ""
-    for part in loc:
-        if isinstance(part, int):
-            path += f"[{part}]"
-        elif part in model.model_fields or (isinstance(values, Mapping) and part in values):
-            path += f".{part}"
+    for item in loc:
+        if isinstance(item, int):
+            path += f"[{item}]"
+        elif item in model.model_fields or (isinstance(values, Mapping) and item in values):
+            path += f".{item}"
         else:
             continue
-        with suppress(LookupError, TypeError):  # a number that stands for an array of one
-            values = cast("Any", values)[part]
+        with suppress(LookupError, TypeError):  # a number in place of an array of one
+            values = cast("Any", values)[item]
     return path.removeprefix(".")
 
 
 def commented_toml(models: Mapping[str, type[Settings]], preset: Mapping[str, Settings] | None = None) -> str:
-    """Write a `pad.toml` that states every key of `models`, by section, with the descriptions as comments."""
+    """Return a `pad.toml` with every key of `models`, by section, and the descriptions as comments."""
     head = "# padforge settings. Every key is optional; what stands here is the default"
     lines = [f"{head}, or of the preset." if preset else f"{head}."]
     lines += ["# Numbers are in the units of the comments."]
@@ -241,20 +237,20 @@ def commented_toml(models: Mapping[str, type[Settings]], preset: Mapping[str, Se
         lines += ["", f"[{name}]"]
         values = ((preset or {}).get(name) or model()).model_dump()
         for key, field in model.model_fields.items():
-            value = json.dumps(values[key], ensure_ascii=False)  # which TOML writes alike
+            value = json.dumps(values[key], ensure_ascii=False)  # also valid TOML
             lines.append(f"{key} = {value} ".ljust(36) + f"# {field.description}")
     return "\n".join(lines) + "\n"
 
 
 def settings_schema(models: Mapping[str, type[Settings]]) -> dict[str, Any]:
-    """Return the JSON Schema of a `pad.toml`, by which editors complete and check it.
+    """Return the JSON Schema of a `pad.toml`, with which editors complete and check it.
 
-    It is of draft 7, the latest one that editors for TOML know. What depends on several keys is beyond it.
+    It uses draft 7, the latest one that editors for TOML support. It has no rules on several keys.
 
     Args:
-        models: of the sections, by name.
+        models: models of the sections, by name.
     """
-    from pydantic.json_schema import models_json_schema  # takes a while, and one command needs it
+    from pydantic.json_schema import models_json_schema  # slow to import, and needed by one command only
 
     refs, schema = models_json_schema([(model, "validation") for model in models.values()])
     for model in models.values():
@@ -274,7 +270,7 @@ def settings_schema(models: Mapping[str, type[Settings]]) -> dict[str, Any]:
 
 
 def _as_in_files(schema: Any) -> Any:
-    """Return the schema of a key in which a tuple is that of draft 7."""
+    """Return the schema of a key, with tuples as in draft 7."""
     if isinstance(schema, list):
         return [_as_in_files(item) for item in schema]
     if not isinstance(schema, dict):

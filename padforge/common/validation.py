@@ -1,4 +1,4 @@
-"""Errors that users meet, each of one line without a traceback, and checks of arguments."""
+"""Errors reported to users in one line without a traceback, and checks of arguments."""
 
 import math
 import re
@@ -13,17 +13,13 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import ArrayLike, NDArray
 
-MAX_VALUES = 2**28  # size limit of an array that a public function takes or makes: 2 GiB of float64
+MAX_VALUES = 2**28  # size limit of arrays that public functions accept or create: 2 GiB of float64
 
 Kind = TypeVar("Kind")
 
 
 def printable(text: str) -> str:
-    """Escape what is not printable: that of a file could feign lines, and give orders to a terminal.
-
-    Args:
-        text: of one line.
-    """
+    """Escape the characters of a line that are not printable: text from a file could contain control sequences."""
     return "".join(char if char.isprintable() else ascii(char)[1:-1] for char in text)
 
 
@@ -31,35 +27,37 @@ class InputError(ValueError):
     """An error of the user: a file, setting or argument that cannot be used.
 
     Args:
-        message: one line that names the thing, the value and what is allowed.
+        message: one line with the name, the value and what is allowed.
     """
 
     exit_code = 2  # of the command line, which prints the message without a traceback
 
     def __init__(self, message: object = "") -> None:
-        super().__init__(" ".join(str(message).splitlines()))  # names of files and keys may hold line ends
+        super().__init__(" ".join(str(message).splitlines()))  # names of files and keys may contain line ends
 
 
-class Fault(Exception):  # noqa: N818  of things outside the program, not an error of it
-    """A fault outside the program that the user has to look at, such as a robot that was stopped.
+class Fault(Exception):  # noqa: N818  not an error of the program
+    """A fault outside the program that needs the user's attention, such as a robot that was stopped.
 
     Attributes:
-        exit_code: of the command line.
+        exit_code: exit code of the command line.
     """
 
     exit_code = 1
 
 
-# distributions by the module they bring, where the names differ
+# Distributions by their module, if the names differ.
 _DISTRIBUTIONS = {"OCP": "build123d", "PIL": "pillow", "markdown_it": "markdown-it-py", "serial": "pyserial"}
 _DISTRIBUTIONS |= {"foxglove": "foxglove-sdk", "rerun": "rerun-sdk"}
 _DISTRIBUTIONS |= dict.fromkeys(("rtde_control", "rtde_receive"), "ur-rtde")
 
 
 def missing_extra(error: ModuleNotFoundError, wanted: str = "") -> str | None:
-    """Say in one line how to install a missing library; None if no extra of padforge brings it.
+    """Return advice in one line on how to install a missing library; None if it belongs to no extra of padforge.
 
-    `wanted` are extras, separated by commas, that the command needs in any case.
+    Args:
+        error: error of the import.
+        wanted: extras, separated by commas, that the command needs in any case.
     """
     from importlib.metadata import PackageNotFoundError, requires
 
@@ -84,21 +82,21 @@ def short_repr(value: object) -> str:
 
 
 def check_type(name: str, value: object, kind: type[Kind]) -> Kind:
-    """Return `value` if it is a `kind`, else raise InputError."""
+    """Return `value` if it is a `kind`, otherwise raise InputError."""
     if not isinstance(value, kind):
         raise InputError(f"{name} is {short_repr(value)}, expected a {kind.__name__}")
     return value
 
 
 def check_int(name: str, value: object, minimum: int, maximum: int) -> int:
-    """Return a whole number within [minimum, maximum] as an int, else raise InputError."""
+    """Return a whole number within [minimum, maximum] as an int, otherwise raise InputError."""
     if isinstance(value, bool) or not isinstance(value, Integral) or not minimum <= int(value) <= maximum:
         raise InputError(f"{name} is {short_repr(value)}, allowed is a whole number from {minimum} to {maximum}")
     return int(value)
 
 
 def check_float(name: str, value: object, minimum: float, maximum: float) -> float:
-    """Return a number within [minimum, maximum] as a float, else raise InputError."""
+    """Return a number within [minimum, maximum] as a float, otherwise raise InputError."""
     number = float(value) if isinstance(value, Real) and not isinstance(value, bool) else math.nan
     if not minimum <= number <= maximum:
         raise InputError(f"{name} is {short_repr(value)}, allowed is {minimum:g} to {maximum:g}")
@@ -106,7 +104,7 @@ def check_float(name: str, value: object, minimum: float, maximum: float) -> flo
 
 
 def check_array(name: str, values: "ArrayLike", max_abs: float = math.inf) -> "NDArray[np.float64]":
-    """Return finite real numbers of any shape, at most `max_abs`, as an array of float64, else raise InputError."""
+    """Return finite real numbers of any shape, at most `max_abs`, as float64, otherwise raise InputError."""
     import numpy as np
 
     try:
@@ -126,14 +124,14 @@ def check_array(name: str, values: "ArrayLike", max_abs: float = math.inf) -> "N
 
 
 def check_path(name: str, value: object) -> Path:
-    """Return a text or path as a Path, else raise InputError."""
+    """Return a string or path as a Path, otherwise raise InputError."""
     if not isinstance(value, str | Path) or value == "":
         raise InputError(f"{name} is {short_repr(value)}, expected a path")
     return Path(value)
 
 
 def check_mapping(name: str, value: object) -> Mapping[str, Any]:
-    """Return a mapping with text keys, such as a JSON object, else raise InputError."""
+    """Return a mapping with string keys, such as a JSON object, otherwise raise InputError."""
     if not isinstance(value, Mapping) or not all(isinstance(key, str) for key in value):
         raise InputError(f"{name} is {short_repr(value)}, expected a table")
     return value

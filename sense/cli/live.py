@@ -1,4 +1,4 @@
-"""`padforge sense live`: presses are localized while they happen, and shown and sent at once."""
+"""`padforge sense live`: presses are localized in real time, displayed, and sent to other programs."""
 
 import json
 from collections.abc import Iterable
@@ -22,8 +22,8 @@ if TYPE_CHECKING:
     from padforge.sense.rig.streams import ReadingStream
 
 PORT = 8321
-RERUN_VIEWER = "rerun+http://127.0.0.1:9876/proxy"  # where a viewer that was started without options listens
-BAR = 12  # characters of a fibre's bar on a terminal, to either side
+RERUN_VIEWER = "rerun+http://127.0.0.1:9876/proxy"  # default address of a viewer
+BAR = 12  # maximum length of a fibre's bar on a terminal, to either side, characters
 
 
 @click.command()
@@ -160,7 +160,7 @@ def _open_outputs(
     host: str,
     token: str,
 ) -> "tuple[list[OutputStream], list[str]]":
-    """Return the outputs that were asked for, which `stack` closes, and lines with the addresses of servers."""
+    """Return the requested outputs, which `stack` closes, and lines with the addresses of servers."""
     from padforge.sense.live.outputs import JsonLines
     from padforge.sense.live.viewers import FoxgloveOutput, RerunOutput
 
@@ -180,7 +180,7 @@ def _open_outputs(
 
 
 def _load_health(model: Path) -> "HealthModel | None":
-    """Load the health model in the folder of a model, or say that there is none."""
+    """Load the health model in the folder of a model; print a line if there is none."""
     from padforge.sense.live.pad_sensor import load_health
 
     health = load_health(model)
@@ -190,7 +190,7 @@ def _load_health(model: Path) -> "HealthModel | None":
 
 
 class EventPrinter:
-    """Print events: all of them as JSON, or as text those estimates that say more than the last of their press."""
+    """Prints events: all as JSON, or as text without the estimates that add little to the last one of their press."""
 
     def __init__(self, as_json: bool) -> None:
         self._as_json = as_json
@@ -202,7 +202,7 @@ class EventPrinter:
 
         for event in events:
             is_estimate = isinstance(event, Estimate)
-            # echo flushes, so that each line appears at once
+            # `echo` flushes, so that each line appears at once.
             if self._as_json:
                 values = event.to_dict() if is_estimate else asdict(event) | {"text": event.text}
                 click.echo(json.dumps({"event": type(event).__name__.lower()} | values))
@@ -210,11 +210,15 @@ class EventPrinter:
                 echo(event.text)
 
     def _is_news(self, estimate: "Estimate") -> bool:
+        """Return whether to print an estimate, and remember it if so."""
         latest = self._latest
-        if latest is not None and latest.press == estimate.press:
-            is_news = estimate.final or estimate.is_sharper_than(latest) or estimate.has_moved_from(latest)
-        else:
-            is_news = True
+        is_news = (
+            latest is None
+            or latest.press != estimate.press
+            or estimate.final
+            or estimate.is_sharper_than(latest)
+            or estimate.has_moved_from(latest)
+        )
         self._latest = estimate if is_news else latest
         return is_news
 

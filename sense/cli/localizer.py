@@ -1,4 +1,4 @@
-"""Commands of `padforge sense` that fit models to recordings, evaluate and apply them."""
+"""Commands of `padforge sense` that fit, evaluate and apply models."""
 
 import re
 from collections.abc import Callable
@@ -309,7 +309,7 @@ def recalibrate(
         replaced = target / "localizer.json"
         check_replaceable(replaced, folder / replaced.name, ["recalibration.json", *HEALTH_FILES], force)
         write_json(folder / "recalibration.json", result.to_dict())
-        if detector:  # it does not depend on positions
+        if detector:  # faults do not depend on positions
             detector.include_rests(opened)
             detector.save(folder)
     common.show_result(result.to_dict(), recalibration.recalibration_lines(result), as_json)

@@ -1,4 +1,4 @@
-"""`padforge sense`: all its commands, and those that import and export recordings."""
+"""`padforge sense`: the group of its commands, and the commands `import` and `export`."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -100,7 +100,7 @@ def import_(
         for line in describe_file(file, encoding):
             echo(line)
         return
-    find_reader(file)  # refuses a file of another kind before its folder
+    find_reader(file)  # checks the kind of file before the folder
     folder = out or pad_folder(file) / "recording"
     check_new_folder(folder)
     recording = import_file(file, columns, encoding, presses, press_columns)
@@ -152,7 +152,7 @@ def export(recording: Path, file: Path, kind: str | None, model: Path | None) ->
 
 
 def _annotate(model: Path, recording: "Recording") -> "ModelAnnotations":
-    """Predict positions and faults by a model; a fibre at fault is masked from the press on at which it is named."""
+    """Return the predicted positions and faults; a faulty fibre is masked from the press of its detection on."""
     import numpy as np
 
     from padforge.sense.formats.annotations import FaultAnnotation, ModelAnnotations

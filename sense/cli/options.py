@@ -1,4 +1,4 @@
-"""Options and arguments that commands of sense share, the terminal, and a recording in one line."""
+"""Shared options and arguments of the commands of `padforge sense`, the terminal, and summaries of recordings."""
 
 import os
 import sys
@@ -21,11 +21,9 @@ if TYPE_CHECKING:
     from padforge.sense.recording.recording import Recording
 
 
-METHODS, SPLITS = ("ensemble", "published"), ("random", "chronological")
-PARTS = "health", "figures", "moments"
-"""Of a calibration, that may be left out."""
-REFRESH_HZ = 15
-"""How often lines on a terminal are redrawn."""
+METHODS = ("ensemble", "published")
+SPLITS = ("random", "chronological")
+PARTS = ("health", "figures", "moments")  # optional parts of a calibration
 FILE = click.Path(path_type=Path, dir_okay=False)
 FOLDER = click.Path(path_type=Path, file_okay=False)
 
@@ -37,11 +35,11 @@ max_failures_option = click.option(
 
 
 def fibres_option(name: str, text: str) -> Callable[..., Any]:
-    """Make an option that takes numbers of fibres, from 1, with commas between them."""
+    """Return an option that takes numbers of fibres, from 1, separated by commas."""
 
     def parse(context: click.Context, param: click.Parameter, value: str) -> tuple[int, ...]:
         try:
-            return tuple(int(part) for part in value.split(",") if part.strip())
+            return tuple(int(number) for number in value.split(",") if number.strip())
         except ValueError:
             message = f"got {value!r}, expected whole numbers with commas between them"
             raise click.BadParameter(message) from None
@@ -50,7 +48,7 @@ def fibres_option(name: str, text: str) -> Callable[..., Any]:
 
 
 def fibre_indices(numbers: Sequence[int], fibres: int) -> tuple[int, ...]:
-    """Convert numbers of fibres, from 1, to indices; raises InputError for one that the pad does not have."""
+    """Convert numbers of fibres, from 1, to indices; raises InputError for a missing fibre."""
     for number in numbers:
         if not 1 <= number <= fibres:
             raise InputError(f"fibre {number}: no such fibre, allowed are 1 to {fibres}")
@@ -58,7 +56,7 @@ def fibre_indices(numbers: Sequence[int], fibres: int) -> tuple[int, ...]:
 
 
 def read_recording(path: Path) -> "Recording":
-    """Open a recording, with a line on stderr where its end is torn off or the file has more than it."""
+    """Open a recording; print a line on stderr if its end is torn off, or parts of the file are omitted."""
     from padforge.sense.formats.import_export import open_recording
 
     recording = open_recording(path)
@@ -70,13 +68,13 @@ def read_recording(path: Path) -> "Recording":
 
 
 def echo_note(recording: "Recording", file: Path) -> None:
-    """Print on stderr which part of a file is not in its recording."""
+    """Print on stderr which parts of a file are not in its recording."""
     if note := recording.source.get("note"):
         echo(f"{file}: {note}", err=True)
 
 
 def pressed_line(recording: "Recording") -> str:
-    """Describe in one line what was pressed and read, with what is missing."""
+    """Describe the presses and readings of a recording, and missing values, in one line."""
     import numpy as np
 
     from padforge.sense.recording.doubts import area_mm
@@ -98,21 +96,25 @@ def recording_line(recording: "Recording", out: Path) -> str:
 
 
 class Prediction(NamedTuple):
-    """What a folder of models says of a recording; without a health model, nothing of its fibres."""
+    """Predictions of the models in a folder for a recording; without a health model no faults and shifts."""
 
-    localization: "Localization"  # without a faulty fibre from where it is detected
+    localization: "Localization"  # faulty fibres are masked from the press of their detection on
     faults: "list[FibreFault]"
     shifts: "list[DomainShift]"
     detector: "FaultDetector | None"
-    is_other_pad: bool  # then no fibre is said to be at fault, nor masked
+    is_other_pad: bool  # then no fibre is reported as faulty or masked
 
 
 def predict_despite_faults(
     model: Path, recording: "Recording", failed: Sequence[int] = (), moment: tuple[str, float] | None = None
 ) -> Prediction:
-    """Localize all presses without some fibres by number, and without a faulty one from where it is detected.
+    """Localize all presses, with faulty fibres masked from the press of their detection on.
 
-    `moment` is "touch" or "lift" and s since then, by what is known then; None for whole presses.
+    Args:
+        model: folder of the models.
+        recording: presses to localize.
+        failed: numbers of further fibres to mask, from 1.
+        moment: "touch" or "lift" and the time since, s, to use only readings until then; None for complete presses.
     """
     from padforge.sense.health.domain_shift import detect_shifts
     from padforge.sense.health.fault_detector import FaultDetector, has_health, mask_faults
@@ -130,13 +132,13 @@ def predict_despite_faults(
         presses = localizer.scaled_features(recording, _until(localizer, recording, *moment))
     localization = localizer.localize(replace(presses, fibre_mask=presses.fibre_mask & fibre_mask), excluded)
     fibre_mask[:, list(excluded)] = False
-    is_known = detector is not None and not is_other_pad
-    shifts = detect_shifts(localizer, detector.model_, recording, fibre_mask) if is_known else []
+    has_shifts = detector is not None and not is_other_pad
+    shifts = detect_shifts(localizer, detector.model_, recording, fibre_mask) if has_shifts else []
     return Prediction(localization, faults, shifts, detector, is_other_pad)
 
 
 def _until(localizer: "LocalizerModel", recording: "Recording", since: str, time_s: float) -> "Indices":
-    """Return the first frames (Q,) of presses that are not known at a moment."""
+    """Return the indices (Q,) of the first frames of the presses after a moment."""
     from padforge.sense.localizer.moments import Moment
     from padforge.sense.recording.frames import framed
     from padforge.sense.signals.press_detection import first_readings
@@ -152,7 +154,7 @@ def _until(localizer: "LocalizerModel", recording: "Recording", since: str, time
 
 @contextmanager
 def redrawn_lines() -> Iterator[Callable[[Sequence[str]], None] | None]:
-    """Yield a function that shows lines on stdout in place of those before; None where that is no terminal."""
+    """Yield a function that replaces the lines shown on stdout; None if stdout is not a terminal."""
     from rich.console import Console
     from rich.live import Live
     from rich.text import Text
@@ -161,13 +163,13 @@ def redrawn_lines() -> Iterator[Callable[[Sequence[str]], None] | None]:
     if not console.is_terminal:
         yield None
         return
-    with Live(console=console, refresh_per_second=REFRESH_HZ) as display:
+    with Live(console=console, refresh_per_second=15) as display:
         yield lambda lines: display.update(Text("\n".join(lines)))
 
 
 @contextmanager
 def typed_keys() -> Iterator[Callable[[], str]]:
-    """Yield a function that returns the keys typed since its last call, without echo; none off POSIX terminals."""
+    """Yield a function that returns the keys typed since its last call; "" if stdin is not a POSIX terminal."""
     if os.name != "posix" or not sys.stdin.isatty():
         yield lambda: ""
         return
@@ -178,12 +180,12 @@ def typed_keys() -> Iterator[Callable[[], str]]:
     stdin = sys.stdin.fileno()
 
     def read_keys() -> str:
-        waiting = bool(select.select([stdin], [], [], 0)[0])
-        return os.read(stdin, 64).decode(errors="ignore") if waiting else ""
+        is_ready = bool(select.select([stdin], [], [], 0)[0])
+        return os.read(stdin, 64).decode(errors="ignore") if is_ready else ""
 
-    before = termios.tcgetattr(stdin)
+    attributes = termios.tcgetattr(stdin)
     tty.setcbreak(stdin)
     try:
         yield read_keys
     finally:
-        termios.tcsetattr(stdin, termios.TCSADRAIN, before)
+        termios.tcsetattr(stdin, termios.TCSADRAIN, attributes)

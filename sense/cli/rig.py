@@ -1,5 +1,6 @@
 """The commands `padforge sense record` and `doctor`."""
 
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, closing
 from functools import partial
 from pathlib import Path
@@ -14,6 +15,7 @@ from padforge.sense.cli.options import FILE, FOLDER, recording_line, redrawn_lin
 if TYPE_CHECKING:
     from padforge.design.morphology import Morphology
     from padforge.design.settings import PadSettings
+    from padforge.sense.live.outputs import LivePage
     from padforge.sense.recording.recording import Recording
     from padforge.sense.rig.config import RigConfig
 
@@ -25,7 +27,7 @@ _warn = partial(common.echo, err=True)
 
 
 def check_rig(name: str, simulated: bool = True) -> None:
-    """Raise InputError unless `--rig` names a rig, a real one if none is `simulated`."""
+    """Raise InputError unless `--rig` is the name of a rig; "simulated" is allowed if `simulated`."""
     from importlib.metadata import entry_points
 
     names = [*["simulated"] * simulated, "hand", *sorted(entry_points(group="padforge.arms").names)]
@@ -102,7 +104,7 @@ def record(
         raise InputError("--twin is of the simulated pad, allowed with --rig simulated")
     like = Twin.load(twin) if twin else None
     if not (simulated or morphology):
-        morphology = target.parent / "morphology.json"  # a real pad is named, never guessed
+        morphology = target.parent / "morphology.json"  # a real pad has no default
         if not morphology.is_file():
             raise InputError(f"--morphology is needed, of the pad under the arm: there is none at {morphology}")
         folder = common.pad_folder(morphology)
@@ -140,12 +142,12 @@ def record(
 
 
 def _bag_path(target: Path, dry_run: bool, resume: bool) -> Path:
-    """Return the path of the bag of a recording; raise InputError, before anything moves, if it cannot be written."""
+    """Return the path of the bag of a recording; raise InputError if it cannot be written."""
     from padforge.sense.formats.ros_writer import load_typestore
 
     if dry_run:
         raise InputError("--mcap exports what is recorded, and --dry-run keeps nothing")
-    named = target if target.name.strip(".") else target.resolve()  # "." and ".." are no names
+    named = target if target.name.strip(".") else target.resolve()  # "." and ".." have no name
     path = named.with_name(f"{named.name}.mcap")
     load_typestore(f"{path}: MCAP")
     if path.exists() and not resume:
@@ -176,9 +178,9 @@ def _record_with(rig: str, config: "RigConfig", model: Path | None, dry_run: boo
 
 
 def _record_by_hand(config: "RigConfig", resume: bool) -> "Recording":
-    """Show a person where to press, on a page and in the terminal, and take commands of both."""
+    """Record by hand, with the view and the commands on a page and in the terminal."""
     from padforge.sense.live.outputs import LivePage
-    from padforge.sense.rig.by_hand import COMMANDS, pad_view, record_by_hand, view_lines
+    from padforge.sense.rig.by_hand import COMMANDS, pad_view, record_by_hand
     from padforge.sense.rig.operation import make_board
 
     commands = {row["key"]: row["command"] for row in COMMANDS}
@@ -187,28 +189,39 @@ def _record_by_hand(config: "RigConfig", resume: bool) -> "Recording":
         page = stack.enter_context(LivePage(0, "hand.html", commands.values()))
         _warn(f"page: {page.url} (q ends)")
         draw, typed = stack.enter_context(redrawn_lines()), stack.enter_context(typed_keys())
-        latest = pad = pad_view(config.pad, str(config.out), bool(config.rig.mirrored))
-
-        @stack.push
-        def show_end(kind: object, error: BaseException | None, trace: object) -> None:
-            if latest is not pad:
-                page.show(latest | {"ended": str(error or "") or "ended"})
-
-        def show(view: dict[str, Any]) -> None:
-            nonlocal latest
-            if draw is None and view["message"] != latest.get("message", ""):
-                common.echo(view["message"])
-            if draw is not None and view["phase"] == "lift" != latest.get("phase"):
-                click.echo("\a", nl=False)  # eyes are on the pad
-            latest = pad | view
-            page.show(latest)
-            if draw is not None:
-                draw(view_lines(latest))
+        display = _HandDisplay(page, draw, pad_view(config.pad, str(config.out), bool(config.rig.mirrored)))
+        stack.push(display.show_end)
 
         def poll_commands() -> list[str]:
             return [*page.read_commands(), *(commands[key] for key in typed() if key in commands)]
 
-        return record_by_hand(config, board, show, poll_commands, resume)
+        return record_by_hand(config, board, display.show, poll_commands, resume)
+
+
+class _HandDisplay:
+    """Shows the views of a session on a page, and in a terminal if there is one (`draw`)."""
+
+    def __init__(self, page: "LivePage", draw: Callable[[Sequence[str]], None] | None, pad: Mapping[str, Any]) -> None:
+        self._page, self._draw, self._pad = page, draw, pad
+        self._latest: dict[str, Any] = {}
+
+    def show(self, view: dict[str, Any]) -> None:
+        """Show a view; without a terminal, print its message if that has changed."""
+        from padforge.sense.rig.by_hand import view_lines
+
+        previous, self._latest = self._latest, {**self._pad, **view}
+        if self._draw is None and view["message"] != previous.get("message", ""):
+            common.echo(view["message"])
+        if self._draw is not None and view["phase"] == "lift" != previous.get("phase"):
+            click.echo("\a", nl=False)  # a sound, since the person looks at the pad
+        self._page.show(self._latest)
+        if self._draw is not None:
+            self._draw(view_lines(self._latest))
+
+    def show_end(self, kind: object, error: BaseException | None, trace: object) -> None:
+        """Show the reason of the end on the page, if the session has begun."""
+        if self._latest:
+            self._page.show(self._latest | {"ended": str(error or "") or "ended"})
 
 
 @click.command()

@@ -42,7 +42,7 @@ def study() -> None:
 
 
 def _command(name: str, argument: str = "PAD") -> Callable[..., Any]:
-    """Return a decorator that makes the command of a study, with the options of all, from a function to the study."""
+    """Return a decorator that makes a command, with the options of all studies, of a function that returns a study."""
 
     def decorate(make: "Callable[..., Study]") -> click.Command:
         @wraps(make)
@@ -95,7 +95,7 @@ def _pads(
 
 
 def _press_model(settings: "Spec") -> "PressModel":
-    """Return the contact and the scatter that settings state, those of the paper if they state no contact."""
+    """Return the stated contact with the scatter of the settings, or those of the paper if no contact is stated."""
     from padforge.design.settings import SearchSettings
     from padforge.sense.studies.press_model import PressModel
 
@@ -104,7 +104,7 @@ def _press_model(settings: "Spec") -> "PressModel":
 
 
 def _stated_contact(settings: "Spec") -> "Contact | None":
-    """Return the contact that settings state, with a line on stderr if it strains the silicone too much."""
+    """Return the stated contact, if any; print a line on stderr if it strains the silicone too much."""
     from padforge.design.contact import describe_large_strain
     from padforge.design.settings import Contact, read_contact
 
@@ -224,7 +224,7 @@ def drift(names: tuple[str, ...], *, seed: int) -> "Study":
 
 
 def _add_study(name: str, module: str, text: str, example: str) -> None:
-    """Add the command of a study without options of its own; `example` are its pads in the help."""
+    """Add the command of a study without further options; `example` has the pads for its help."""
 
     def make(names: tuple[str, ...], *, seed: int, spec: Path | None = None) -> "Study":
         from padforge.design.settings import read_contact

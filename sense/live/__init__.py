@@ -1,1 +1,1 @@
-"""Touches as they happen."""
+"""Localization of touches in real time, and its outputs."""

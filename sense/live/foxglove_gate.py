@@ -1,7 +1,7 @@
-"""The port that Foxglove connects to: its server takes whoever connects, so that any web page could read the pad.
+"""A gate to Foxglove's server, which accepts every connection, so that any web page could read the pad.
 
-Browsers let pages open WebSockets to any address, and state who asks: the origin of the page, and the host that it
-named. Requests of foreign ones are refused; others are passed on to the server, whose own address no page can guess.
+Browsers let pages open WebSockets to any address, and state the origin of the page and the host of the request. The
+gate refuses requests of foreign pages, and forwards others to the server, whose address a page cannot guess.
 """
 
 import secrets
@@ -18,16 +18,15 @@ from urllib.parse import urlsplit
 
 from padforge.common.server import HOST, ConnectionServer, is_this_machine
 
-APP_ORIGIN = "https://app.foxglove.dev"  # of the app in a browser; the one on the desktop is no page of the web
-MAX_HEAD = 2**14  # bytes of the request of a connection
-CHUNK = 2**16  # bytes that are passed on at once, at most
+APP_ORIGIN = "https://app.foxglove.dev"  # of the app in a browser; the desktop app has no web origin
+CHUNK = 2**16  # maximum number of bytes forwarded at once
 
 
 class FoxgloveGate(ConnectionServer):
-    """A port of this machine, within `with`, that passes connections on to a server.
+    """A port of this machine that forwards connections to a server in the `with` block.
 
     Args:
-        port: 0 for any that is free.
+        port: port, 0 for any free one.
         target: address of the server.
 
     Raises:
@@ -36,25 +35,23 @@ class FoxgloveGate(ConnectionServer):
 
     def __init__(self, port: int, target: tuple[str, int]) -> None:
         self.target = target
-        super().__init__((HOST, port), _Visitor, "", "--foxglove")
+        super().__init__((HOST, port), _GateHandler, "", "--foxglove")
 
     def end(self, timeout_s: float) -> None:
-        """Do nothing: the server ends its connections itself."""
+        """Do nothing, since the server closes its connections."""
 
 
 def hidden_host() -> str:
-    """Draw an address of this machine that no page can guess; macOS has but one."""
+    """Return a random loopback address, which a page cannot guess; macOS has only one."""
     return HOST if sys.platform == "darwin" else ".".join(["127", *(str(1 + secrets.randbelow(254)) for _ in range(3))])
 
 
 def is_welcome(headers: Message, port: int) -> bool:
-    """Return whether a request for `port` is not that of a foreign page.
-
-    Pages of this machine and the Foxglove app are none. "null" is the origin of pages that hide theirs.
+    """Return whether a request is not that of a foreign page; pages of this machine and the Foxglove app are allowed.
 
     Args:
-        headers: of the request.
-        port: that was connected to.
+        headers: headers of the request; the origin "null" stands for a hidden one and is refused.
+        port: port of the connection.
     """
     origin = headers["Origin"]
     if not is_this_machine(headers["Host"] or "", port):
@@ -68,7 +65,7 @@ def is_welcome(headers: Message, port: int) -> bool:
     return url.hostname in (HOST, "localhost") if url.scheme in ("http", "https") else bool(url.scheme)
 
 
-class _Visitor(socketserver.StreamRequestHandler):
+class _GateHandler(socketserver.StreamRequestHandler):
     server: FoxgloveGate  # pyright: ignore[reportIncompatibleVariableOverride]
 
     def handle(self) -> None:
@@ -78,26 +75,26 @@ class _Visitor(socketserver.StreamRequestHandler):
             return
         with socket.create_connection(self.server.target) as server:
             server.sendall(head)
-            back = Thread(target=_pass_on, args=(lambda: server.recv(CHUNK), self.request), daemon=True)
-            back.start()
-            _pass_on(lambda: self.rfile.read1(CHUNK), server)  # pyright: ignore[reportAttributeAccessIssue]
-            back.join()
+            answers = Thread(target=_forward, args=(lambda: server.recv(CHUNK), self.request), daemon=True)
+            answers.start()
+            _forward(lambda: self.rfile.read1(CHUNK), server)  # pyright: ignore[reportAttributeAccessIssue]
+            answers.join()
 
     def _read_head(self) -> bytes:
-        """Read up to the empty line that ends the request of a WebSocket."""
+        """Read the request of a WebSocket up to the empty line at its end."""
         head = b""
         while not head.endswith(b"\r\n\r\n"):
-            line = self.rfile.readline(MAX_HEAD - len(head))
+            line = self.rfile.readline(2**14 - len(head))  # requests are short
             if not line:
                 raise ConnectionAbortedError
             head += line
         return head
 
 
-def _pass_on(receive: Callable[[], bytes], to: socket.socket) -> None:
-    """Pass on what comes until its end, or that of the other side, and then end both directions of the other side."""
+def _forward(receive: Callable[[], bytes], target: socket.socket) -> None:
+    """Forward data until either side closes, then shut the target down."""
     with suppress(OSError):
         while data := receive():
-            to.sendall(data)
+            target.sendall(data)
     with suppress(OSError):
-        to.shutdown(socket.SHUT_RDWR)
+        target.shutdown(socket.SHUT_RDWR)

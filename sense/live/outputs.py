@@ -1,7 +1,7 @@
 """Outputs of a live pad: messages (docs/live-protocol.md), and the streams and the page that send them.
 
-A message is a `publish` operation of the rosbridge protocol with a standard message of ROS 2, under the topic that it
-has in an exported bag, so that a bridge has nothing to convert. Beside it stand the same values in mm and V.
+A message is a `publish` operation of the rosbridge protocol with a standard message of ROS 2, under the same topic as
+in an exported bag, so that a bridge needs no conversion. It also contains the same values in mm and V.
 """
 
 import hmac
@@ -24,35 +24,34 @@ from padforge.sense.live.pipeline import Estimate, Event, Live, OtherPad
 from padforge.sense.localizer.doubts import OTHER_PAD
 
 FORMAT = "padforge-live/1"
-MAX_QUEUED = 4096  # lines that wait for a subscriber; one that is further behind is disconnected
-SEND_TIMEOUT_S = 10.0  # a subscriber that receives nothing for this time is disconnected
+MAX_QUEUED = 4096  # lines queued for a subscriber, which is disconnected if it falls further behind
 _OK, _ERROR = 0, 2  # levels of a `DiagnosticStatus`
 
 
 @dataclass(frozen=True)
 class Message:
-    """One message."""
+    """A message to other programs."""
 
     topic: str  # a key of `TOPICS`
-    msg: dict[str, Any]  # of ROS 2, as JSON
+    msg: dict[str, Any]  # the ROS 2 message as JSON
     pad: dict[str, Any]  # the same values in mm and V, with the name of the "event"
 
     def to_json(self, number: int) -> str:
-        """Return the message as a line of JSON, the `number`-th of its stream, from 0."""
+        """Return the message as a line of JSON, with its number in the stream, from 0."""
         operation = {"op": "publish", "topic": self.topic, "type": TOPICS[self.topic].msgtype, "msg": self.msg}
         pad = {"format": FORMAT, "number": number, **self.pad}
         return json.dumps(operation | {"pad": pad}, allow_nan=False)
 
 
 class MessageBuilder:
-    """Build the messages of a pipeline; of a pad `mirrored`, with its tracks up, z points into it as in a bag."""
+    """Builds the messages of a pipeline; if the pad is `mirrored`, with its tracks up, z points into it."""
 
     def __init__(self, pipeline: Live, mirrored: bool = False) -> None:
         self._pipeline, self._pressed, self._is_first = pipeline, False, True
         self._z_sign = 1.0 if mirrored else -1.0
 
     def build(self, times_s: Array, readings: Array, events: Sequence[Event]) -> Iterator[Message]:
-        """Yield the messages of a block of readings, (n,) s and (n, C) V, and of the events that it led to."""
+        """Yield the messages of a block of readings, times (n,), s, and voltages (n, C), and of its events."""
         if not len(times_s):
             return
         now_s = float(times_s[-1])
@@ -104,31 +103,36 @@ def _touch_message(estimate: Estimate, z_sign: float) -> Message:
 
 
 def _header(time_s: float) -> dict[str, Any]:
-    """Return the header of a time by the clock of the readings, which starts with them."""
+    """Return the header of a time by the clock of the readings."""
     whole_s = math.floor(time_s)
     seconds, nanoseconds = divmod(whole_s * 10**9 + round((time_s - whole_s) * 1e9), 10**9)
     return {"stamp": {"sec": seconds, "nanosec": nanoseconds}, "frame_id": FRAME}
 
 
 class OutputStream(Protocol):
-    """Anything that sends messages to other programs."""
+    """An output to other programs."""
 
     def send(self, message: Message) -> None:
-        """Send one message, if it is of a kind that this sends; never wait for who receives it."""
+        """Send a message, if its topic is supported, without waiting for receivers."""
 
 
 def broadcast(outputs: Iterable[OutputStream], messages: Iterable[Message]) -> None:
-    """Send messages by all outputs, in their order."""
+    """Send messages through all outputs, in their order."""
     for message in messages:
         for output in outputs:
             output.send(message)
 
 
 class JsonLines(ConnectionServer):
-    """Lines of JSON over TCP, within `with`: the latest state of the fibres, then all messages from then on.
+    """A TCP server of JSON lines in the `with` block: the latest state of the fibres, then all later messages.
 
-    Port 0 is any that is free; the token is the first line that a subscriber must send, "" for none. Raises InputError
-    if the port cannot be used, or other machines could listen without a token.
+    Args:
+        host: address.
+        port: port, 0 for any free one.
+        token: first line that a subscriber must send, "" for none.
+
+    Raises:
+        InputError: the port cannot be used, or other machines could connect without a token.
     """
 
     def __init__(self, host: str, port: int, token: str = "") -> None:
@@ -149,7 +153,7 @@ class JsonLines(ConnectionServer):
                 subscriber.put(line)
 
     def end(self, timeout_s: float) -> None:
-        """Send no more, and wait until every subscriber has got all, `timeout_s` at most."""
+        """Stop sending, and wait until every subscriber has all messages, for at most `timeout_s`."""
         with self._changed:
             for subscriber in self._subscribers:
                 subscriber.put(None)
@@ -169,7 +173,7 @@ class JsonLines(ConnectionServer):
 
 class _Subscriber(socketserver.StreamRequestHandler):
     server: JsonLines  # pyright: ignore[reportIncompatibleVariableOverride]
-    timeout = SEND_TIMEOUT_S
+    timeout = 10.0  # s, after which a subscriber that does not receive is disconnected
 
     def setup(self) -> None:
         super().setup()
@@ -195,10 +199,7 @@ class _Subscriber(socketserver.StreamRequestHandler):
 
 
 class LivePage(LocalPage):
-    """A page of a pad that is pressed, a file in `pages`, served as `LocalPage` in the `with` block.
-
-    It may send `commands`.
-    """
+    """A page of the folder `pages`, served like a `LocalPage`, that shows a pad and may send `commands`."""
 
     def __init__(
         self, port: int, page: str = "live.html", commands: Collection[str] = (), *, host: str = HOST, token: str = ""

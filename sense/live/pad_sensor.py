@@ -15,20 +15,20 @@ from padforge.sense.rig.devices import Board, RigFault, load_device
 from padforge.sense.rig.streams import stream_board
 from padforge.sense.settings import RigSettings
 
-START_S = 20.0  # within which the first reading must arrive
+START_S = 20.0  # longest wait for the first reading
 
 
 def open_board(rig: str, model: Path, options: RigSettings, fibres: int) -> Board:
-    """Return the board of a rig, alone and not yet connected: a person presses the pad, not its arm.
+    """Return the board of a rig without its arm, not yet connected.
 
     Args:
-        rig: "simulated" for the pad that the model was trained on; any other stands for the board of `[rig]`.
-        model: folder that `calibrate` wrote.
-        options: `[rig]`.
-        fibres: number of fibres that are read.
+        rig: "simulated" for the pad that the model was trained on; otherwise the board is that of `[rig]`.
+        model: folder written by `calibrate`.
+        options: settings `[rig]`.
+        fibres: number of fibres.
 
     Raises:
-        InputError: a board that is not installed, or a model of no simulated pad.
+        InputError: the board is not installed, or the model is not that of a simulated pad.
     """
     if rig == "simulated":
         from padforge.sense.rig.simulated_board import simulated_board_of
@@ -43,24 +43,24 @@ def load_health(model: Path) -> HealthModel | None:
 
 
 class PadSensor:
-    """Follow a live pad in a thread.
+    """A live pad, localized in a thread.
 
     Args:
-        rig: as for `open_board`.
-        model: folder that `calibrate` wrote.
-        options: `[rig]`.
+        rig: see `open_board`.
+        model: folder written by `calibrate`.
+        options: settings `[rig]`.
 
     Attributes:
-        names: of the values that `read` returns.
+        names: names of the values that `read` returns.
 
     Raises:
-        InputError: a model that cannot be loaded.
+        InputError: the model cannot be loaded.
     """
 
     def __init__(self, rig: str, model: Path, options: RigSettings) -> None:
         self._rig, self._model, self._options = rig, model, options
         self._localizer = LocalizerModel.load(model)
-        measures = [column for each in self._localizer.scaler.measures for column in MEASURE_COLUMNS[each.name]]
+        measures = [column for measure in self._localizer.scaler.measures for column in MEASURE_COLUMNS[measure.name]]
         fibres = [f"fibre_{fibre}_v" for fibre in range(self._localizer.fibres)]
         self._touch_names = ["x_mm", "y_mm", "r90_mm", "unlike", *measures]
         self.names = (*fibres, "pressed", "valid", *self._touch_names)
@@ -89,11 +89,11 @@ class PadSensor:
             raise self._error
 
     def read(self) -> dict[str, float]:
-        """Return the latest state by name: readings in V, NaN where one is missing, and the touch.
+        """Return the latest state by name: readings in V, NaN where missing, and the touch.
 
         `pressed` is 1 while the pad is pressed. While `valid` is 1, position, radius, depth and force are those of the
-        press under way, or else of the last one; they are 0 before the first estimate of a press. `unlike` is 1 where
-        no single press explains the responses, as of two fingers.
+        current press, otherwise of the last one; they are 0 before the first estimate. `unlike` is 1 if no single press
+        explains the responses, for example with two fingers.
 
         Raises:
             RigFault: the board failed.
@@ -127,13 +127,13 @@ class PadSensor:
                         self._started.set()
                     if self._stop.is_set():
                         return
-        except Exception as error:  # whatever it is, the program that reads has to know
+        except Exception as error:  # raised by the next `read`
             self._error = error
             self._started.set()
 
     def _summarize(self, pipeline: Live, volts: Array) -> Mapping[str, float]:
         latest = pipeline.presses[-1] if pipeline.presses else None
-        # a model of method `published` has no estimate of the press under way, and the latest is that of the one before
+        # A model of method `published` does not estimate the current press: its latest estimate is of the one before.
         is_valid = latest is not None and not (pipeline.pressed and latest.final)
         touch = [float(getattr(latest, name)) if is_valid else 0.0 for name in self._touch_names]
         return dict(zip(self.names, [*volts.tolist(), float(pipeline.pressed), float(is_valid), *touch], strict=True))

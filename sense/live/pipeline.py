@@ -1,8 +1,8 @@
-"""The pipeline behind `padforge sense live`: from readings as they arrive to the position of each press.
+"""The pipeline of `padforge sense live`: from blocks of readings to the positions of presses.
 
-Blocks of readings of any size go in; events come out: the position of a press at every reading from its touch until
-its release is complete, with radii that hold at that moment; faulty fibres, which are masked from the next press on;
-and that the latest presses are those of another pad, of which no fibre is masked.
+It returns events: the position of a press at every reading from its touch to the end of its release, with radii that
+are valid at that moment; faulty fibres, which are masked from the next press on; and a notice if the latest presses are
+those of another pad, for which no fibre is masked.
 """
 
 from collections import deque
@@ -40,13 +40,12 @@ from padforge.sense.recording.frames import FrameStream
 from padforge.sense.rig.streams import HISTORY, SLACK, RingBuffer
 from padforge.sense.signals.press_detection import RELEASE_DELAY_S, TOUCH_DELAY_S, PressDetector
 
-MAX_SHOWN = 12  # latest presses that are shown
-MAX_TRACK = 64  # latest places of the press under way that are shown
-SHARPER = 0.75  # share of its radius from which on an estimate is worth telling again
-LEAD = MEDIAN_OFFSET + MEDIAN // 2  # readings before `down_command` that features look at, their history aside
-OPENING = DOWN[-1][1]  # readings after `down_command` that features look at
-LATEST = 20  # readings before the moment, or the release, that are kept of a press that is held for longer
-RELEASE = max(UP[-1][1], RELEASED)  # readings after `up_command` with which a press is complete
+MAX_TRACK = 64  # latest positions of the current press in the view
+SHARPER = 0.75  # ratio of radii below which a new estimate at the same position replaces the earlier one
+LEAD = MEDIAN_OFFSET + MEDIAN // 2  # readings before `down_command` that features use, without their history
+OPENING = DOWN[-1][1]  # readings after `down_command` that features use
+LATEST = 20  # readings before the present or the release that features of a long press use
+RELEASE = max(UP[-1][1], RELEASED)  # readings after `up_command` that complete a press
 
 
 @dataclass(frozen=True)
@@ -54,28 +53,28 @@ class Estimate:
     """The position of a press, estimated at one moment."""
 
     press: int  # index, from 0
-    time_s: float  # of its touch, by the clock of the readings
-    now_s: float  # of the latest reading that it looks at
-    since: Literal["touch", "lift"]  # whether the finger still rested, by what was known
-    readings: int  # that it looks at since the touch showed, or since the lift
-    since_s: float  # from the touch, or the lift, to the latest reading
-    final: bool  # whether it is the last of the press
+    time_s: float  # time of the touch, by the clock of the readings
+    now_s: float  # time of the latest reading
+    since: Literal["touch", "lift"]  # "lift" if a release has been detected
+    readings: int  # number of readings since the touch was detected, or since the lift
+    since_s: float  # time from the touch, or the lift, to the latest reading
+    final: bool  # whether it is the last estimate of the press
     x_mm: float
     y_mm: float
     std_x_mm: float
     std_y_mm: float
-    r50_mm: float  # radius that holds the true position in 50 % of cases
+    r50_mm: float  # radius that contains the true position in 50 % of cases
     r90_mm: float
-    failed: tuple[int, ...]  # indices of the fibres that were masked
-    unlike: bool = False  # whether no single press explains the responses, as of two fingers; it may be anywhere
-    depth_mm: float | None = None  # None where the localizer does not predict it, as the three that follow
-    depth_r90_mm: float | None = None  # half width of its 90 % interval
+    failed: tuple[int, ...]  # indices of the masked fibres
+    unlike: bool = False  # whether no single press explains the responses, for example with two fingers
+    depth_mm: float | None = None  # None, like the next three, if the localizer does not predict it
+    depth_r90_mm: float | None = None  # half width of the 90 % interval
     force_n: float | None = None
     force_r90_n: float | None = None
 
     @property
     def measures_text(self) -> str:
-        """Depth and force, as far as they were learnt."""
+        """Depth and force, if the localizer predicts them."""
         depth = "" if self.depth_mm is None else f", {self.depth_mm:.1f} ± {self.depth_r90_mm:.1f} mm deep"
         return depth + ("" if self.force_n is None else f", {self.force_n:.1f} ± {self.force_r90_n:.1f} N")
 
@@ -93,32 +92,24 @@ class Estimate:
         )
 
     def has_moved_from(self, earlier: "Estimate") -> bool:
-        """Return whether the finger is so far from where it was that no error explains it.
-
-        Args:
-            earlier: estimate of the same press.
-        """
+        """Return whether the distance to an earlier estimate of the same press exceeds both radii of 90 %."""
         distance = hypot(self.x_mm - earlier.x_mm, self.y_mm - earlier.y_mm)
         return distance > max(self.r90_mm, earlier.r90_mm)
 
     def is_sharper_than(self, earlier: "Estimate") -> bool:
-        """Return whether its radius is smaller by a quarter or more.
-
-        Args:
-            earlier: estimate of the same press.
-        """
+        """Return whether the radius of 90 % is at most `SHARPER` times that of an earlier estimate."""
         return self.r90_mm <= SHARPER * earlier.r90_mm
 
     def to_dict(self) -> dict[str, Any]:
-        """Return it as JSON, without what was not learnt."""
+        """Return the estimate as JSON, without values that are not predicted."""
         return {name: value for name, value in asdict(self).items() if value is not None}
 
 
 @dataclass(frozen=True)
 class OtherPad:
-    """The latest presses are those of another pad than that of the calibration, or of one cast again by its plan."""
+    """The latest presses are those of another pad than the calibrated one, or of one cast again by its plan."""
 
-    press: int  # index of the last of them
+    press: int  # index of the latest press
     text: str = OTHER_PAD
 
 
@@ -127,35 +118,36 @@ Event = Estimate | FibreFault | OtherPad
 
 @dataclass
 class BufferedPress:
-    """The press under way; indices are those of readings in the stream."""
+    """The current press; indices are those of readings in the stream."""
 
-    number: int  # of presses before it
-    time_s: float  # when the pad was touched
-    touched: int  # first reading that shows it
-    down_command: int  # first reading after the probe was sent down, or would have been
-    previous_end: int  # `up_command` of the press before, < `down_command`
-    baseline: Array  # (1, C) V before it
-    history: Array  # (1, C, J) V, see `PressFeatures`
-    up_command: int | None = None  # first reading after the probe was sent up; None while it is held
-    up_s: float = 0.0  # its time
+    number: int  # index of the press, from 0
+    time_s: float  # time of the touch
+    touched: int  # first reading that shows the touch
+    down_command: int  # first reading after the command of a probe with the same touch
+    previous_end: int  # `up_command` of the previous press, < `down_command`
+    baseline: Array  # readings (1, C) before the press, V
+    history: Array  # history features (1, C, J), V, see `PressFeatures`
+    up_command: int | None = None  # first reading after the command up; None while the press is held
+    up_s: float = 0.0  # time of `up_command`
     _opening: Array | None = None
 
     def release(self, up_command: int, buffer: RingBuffer) -> None:
-        """End the press, one reading after its begin at the earliest."""
+        """End the press, at least one reading after `down_command`."""
         self.up_command = max(up_command, self.down_command + 1)
         last = min(self.up_command, buffer.end - 1)
         self.up_s = float(buffer.rows(last, last + 1)[0, 0])
 
     def store_opening(self, buffer: RingBuffer) -> None:
-        """Copy its first readings, and those just before it, once they have arrived: it may be held for hours."""
+        """Copy the first readings, and those just before the press, since a long hold removes them from the buffer."""
         if self._opening is None and buffer.end >= self.down_command + OPENING:
             self._opening = buffer.rows(self.down_command - LEAD, self.down_command + OPENING)[:, 1:].copy()
 
     def excerpt(self, buffer: RingBuffer, until: int) -> tuple[Array, int, int, int]:
-        """Return its readings before index `until`, without those in its middle that no features look at.
+        """Return the readings of the press before index `until`, without those in its middle that no feature uses.
 
-        And the indices in them of its commands, and of the end of the press before. A press that is held has
-        `up_command` at their end.
+        Returns:
+            Readings (n, C), and the indices in them of `down_command`, of `up_command`, n while the press is held, and
+            of the end of the previous press.
         """
         up_command = until if self.up_command is None else min(self.up_command, until)
         opened = min(self.down_command + OPENING, until)
@@ -171,22 +163,22 @@ class BufferedPress:
 
 
 class Live:
-    """Follow the readings of a pad. Memory is bounded, however long it runs and a press is held.
+    """Localizes presses in a stream of readings, with bounded memory.
 
     Args:
-        localizer: of the pad.
+        localizer: localizer of the pad.
         rate_hz: readings per second.
-        fibres: number of fibres that are read; None for those of the localizer.
-        health: of the pad; None to look for no faults.
+        fibres: number of fibres that are read; None for that of the localizer.
+        health: health model of the pad; None for no detection of faults.
 
     Attributes:
         presses: the latest estimate of each of the last presses, oldest first.
-        track: estimates of the latest press at the last places that it has moved to, oldest first.
+        track: estimates of the latest press at the last positions to which it has moved, oldest first.
         faults: all faults so far, oldest first.
         is_other_pad: whether the latest presses are those of another pad; then no fibre is masked.
 
     Raises:
-        InputError: a localizer that was fitted to arrays, or a model that `check_same_pad` refuses.
+        InputError: the localizer was fitted to arrays, or `check_same_pad` refuses a model.
     """
 
     def __init__(
@@ -209,13 +201,13 @@ class Live:
         self._localizer, scaler = localizer, localizer.scaler
         n_windows = scaler.mean_v.shape[1] - (len(MODULATED) if localizer.features == "windows" else 0)
         response_v = (np.abs(scaler.mean_v) + 2 * scaler.scale_v)[:, :n_windows].max(axis=1)
-        self._response_v = np.where(response_v > 0, response_v, 1.0)  # that a press goes up to
+        self._response_v = np.where(response_v > 0, response_v, 1.0)  # typical maximum, the scale of the view
         self._detector = PressDetector(fibres)
         self._frames, self._last_s = FrameStream(rate_hz, fibres), -np.inf  # time of the last reading
-        self._buffer = RingBuffer(1 + fibres)  # times of frames, then volts
+        self._buffer = RingBuffer(1 + fibres)  # times and voltages of frames
         self._press: BufferedPress | None = None
         self._n_presses = self._previous_end = 0
-        self.presses: deque[Estimate] = deque(maxlen=MAX_SHOWN)
+        self.presses: deque[Estimate] = deque(maxlen=12)  # latest presses in the view
         self.track: deque[Estimate] = deque(maxlen=MAX_TRACK)
         self.faults: list[FibreFault] = []
         self._misfits: deque[Array] = deque(maxlen=MIN_PRESSES)  # of the latest presses, see `find_misfits`
@@ -234,17 +226,17 @@ class Live:
         return self._monitor.model.dead if self.is_other_pad else self._monitor.failed
 
     def feed(self, times_s: ArrayLike, readings: ArrayLike) -> list[Event]:
-        """Process readings. The events do not depend on how readings are cut into blocks.
+        """Process readings; the events do not depend on the division of readings into blocks.
 
         Args:
-            times_s: of one reading, or of several, ascending; s, scalar or of shape (n,).
-            readings: NaN where missing; V, shape (C,) or (n, C).
+            times_s: time of a reading, or ascending times; s, scalar or shape (n,).
+            readings: readings, NaN where missing; V, shape (C,) or (n, C).
 
         Returns:
-            Estimates and faults in the order in which they were made.
+            Estimates and faults in chronological order.
 
         Raises:
-            InputError: arrays that `check_stream` refuses, or times that do not follow those of the last block.
+            InputError: `check_stream` refuses the arrays, or times do not follow those of the last block.
         """
         events: list[Event] = []
         times, rows = check_stream(np.atleast_1d(times_s), np.atleast_2d(readings), len(self._response_v))
@@ -266,10 +258,11 @@ class Live:
         """Return the state of the pad as JSON.
 
         Returns:
-            "pressed"; "fibres", for each its "swing" (deviation from its rest in units of its typical response, None
-            without a reading) and "state"; "presses": `Estimate.to_dict` with "measures_text", "moment_text" and
-            "text"; "track": places [x, y] of the latest press in mm, more than one if the finger has moved; "faults": a
-            line each, and one of another pad.
+            "pressed": whether the pad is pressed.
+            "fibres": "swing" (deviation from the baseline over the typical response, None if missing) and "state".
+            "presses": `Estimate.to_dict` with "measures_text", "moment_text" and "text".
+            "track": positions [x, y] of the latest press, mm, more than one if the finger has moved.
+            "faults": a line for each fault, or one on another pad.
         """
         swings, end = np.full(len(self._response_v), np.nan), self._buffer.end
         if end:
@@ -285,7 +278,7 @@ class Live:
                 press.to_dict() | {name: getattr(press, name) for name in ("measures_text", "moment_text", "text")}
                 for press in self.presses
             ],
-            "track": [[place.x_mm, place.y_mm] for place in self.track],
+            "track": [[estimate.x_mm, estimate.y_mm] for estimate in self.track],
             "faults": [OTHER_PAD] if self.is_other_pad else [fault.text for fault in self.faults],
         }
 
@@ -298,8 +291,8 @@ class Live:
         ]
 
     def _begin(self, touched: int) -> list[Event]:
-        """Begin a press, after the press before has given all that is still to come of it."""
-        touched = max(touched, self._buffer.end - SLACK)  # an unclear change may be seen to be a touch hours later
+        """Start a press, and return the remaining events of the previous one."""
+        touched = max(touched, self._buffer.end - SLACK)  # a slow change may be recognised as a touch hours later
         down_command = self._buffer.command_index(touched, TOUCH_DELAY_S)
         if self._press is not None and self._press.up_command is not None:
             down_command = max(down_command, self._press.up_command + 1)
@@ -318,20 +311,22 @@ class Live:
         return events
 
     def _advance(self, cut: int | None = None) -> list[Event]:
-        """Return the events at the latest reading, or the last of a press that the next one cuts off at `cut`."""
-        press, now = self._press, self._buffer.end
+        """Return the events at the latest reading; with `cut`, the last ones of a press that ends there."""
+        press, until = self._press, self._buffer.end
         if press is None:
             return []
         if cut is not None:
-            now = max(cut, press.down_command + 1)
+            until = max(cut, press.down_command + 1)
             if press.up_command is None:
                 press.release(cut, self._buffer)
         press.store_opening(self._buffer)
-        end = None if press.up_command is None else press.up_command + RELEASE
-        is_complete = end is not None and (now >= end or cut is not None)
-        until = now if end is None else min(now, end)
+        is_complete = False
+        if press.up_command is not None:
+            end = press.up_command + RELEASE
+            is_complete = until >= end or cut is not None
+            until = min(until, end)
         events: list[Event] = []
-        if is_complete or self._localizer.features == "windows":  # the published features are those of a whole press
+        if is_complete or self._localizer.features == "windows":  # published features need a complete press
             events.append(self._estimate(press, until, is_complete))
         if press.up_command is not None and is_complete:
             events += [*self._check_pad(press, until), *self._check_fibres(press, until)]
@@ -361,11 +356,11 @@ class Live:
         return estimate
 
     def _features(self, press: BufferedPress, until: int) -> PressFeatures:
-        """Return what `compute_features` would of all readings before `until`."""
+        """Return the features of the press, as `compute_features` of all readings before `until` would."""
         readings, down, up, previous_end = press.excerpt(self._buffer, until)
         if self._localizer.features == "published":
             downs, ups = [down], [up]
-            if previous_end > 0:  # a stand-in for the press before: the rest of this one reaches back no further
+            if previous_end > 0:  # a dummy previous press, which limits the baseline of this one
                 downs, ups = [previous_end - 1, down], [previous_end, up]
             return compute_features(readings, np.array(downs), np.array(ups), is_published=True)[-1:]
         moment = np.array([down]), np.array([up]), np.array([len(readings)])
@@ -373,25 +368,25 @@ class Live:
         return PressFeatures(windows, press.history, valid_fibres(readings, *moment), complete_windows(*moment))
 
     def _show(self, estimate: Estimate) -> None:
-        """Show an estimate in place of the one before of the same press, and where the finger has moved."""
+        """Replace the previous estimate of the press in `presses`, and add to `track` if the finger has moved."""
         if self.presses and self.presses[-1].press == estimate.press:
             self.presses.pop()
         self.presses.append(estimate)
         if self.track and not estimate.has_moved_from(self.track[-1]):
             if not estimate.is_sharper_than(self.track[-1]):
                 return
-            self.track.pop()  # the same place, better known
+            self.track.pop()  # the same position with a smaller radius
         self.track.append(estimate)
 
     def _check_pad(self, press: BufferedPress, end: int) -> list[OtherPad]:
-        """Return whether a complete press makes the latest ones those of another pad."""
+        """Update `is_other_pad` from a complete press; return an event if it becomes true."""
         scaled, was_other_pad = self._localizer.scaler.transform(self._features(press, end)), self.is_other_pad
         self._misfits.extend(find_misfits(self._localizer.single_press, scaled))
         self.is_other_pad = is_other_pad(self._localizer.single_press, np.array(self._misfits))
         return [OtherPad(press.number)] * (self.is_other_pad and not was_other_pad)
 
     def _check_fibres(self, press: BufferedPress, end: int) -> list[FibreFault]:
-        """Return the faults that a complete press brings to light; of another pad, none."""
+        """Return the faults detected in a complete press; none for another pad."""
         if self._monitor is None:
             return []
         readings, down_command, up_command, previous_end = press.excerpt(self._buffer, end)

@@ -1,7 +1,7 @@
-"""Viewers of robotics as outputs of a live pad: Foxglove, which connects to a server here, and Rerun.
+"""Robotics viewers as outputs of a live pad: Foxglove, which connects to a server of this process, and Rerun.
 
-Both show the readings, the state of the pad and its fibres, and in 3D the latest touch: a disc as large as its radius
-of 90 % on the sensed area.
+Both show the readings, the state of the pad and its fibres, and in 3D the latest touch: a disc with its radius of 90 %
+on the sensed area.
 """
 
 import contextlib
@@ -18,18 +18,19 @@ from padforge.sense.localizer.doubts import OTHER_PAD
 
 SCENE = "/pad/scene"
 THICKNESS_MM = 1.0  # of the disc
-BLUE, GREY = (0.13, 0.47, 0.71, 0.8), (0.5, 0.5, 0.5, 0.3)  # red, green, blue, alpha of disc and area
+BLUE = (0.13, 0.47, 0.71, 0.8)  # red, green, blue and alpha of the disc
+GREY = (0.5, 0.5, 0.5, 0.3)  # of the area
 
 
 class FoxgloveOutput(contextlib.AbstractContextManager["FoxgloveOutput"]):
-    """A WebSocket server of this machine for Foxglove: all messages as JSON, and the scene; in m, frame `pad`.
+    """A WebSocket server of this machine for Foxglove: all messages as JSON, and the scene in m, frame `pad`.
 
-    Web pages cannot read it, but for the Foxglove app.
+    No web page can read it, except the Foxglove app.
 
     Args:
-        port: 0 for any that is free.
+        port: port, 0 for any free one.
         centre_mm: x and y of the middle of the sensed area.
-        half_mm: half its width and height.
+        half_mm: half the width and height of that area.
 
     Raises:
         InputError: the port cannot be used.
@@ -45,14 +46,14 @@ class FoxgloveOutput(contextlib.AbstractContextManager["FoxgloveOutput"]):
         latest: dict[str, dict[str, Any]] = {}
 
         class Listener(foxglove.websocket.ServerListener):
-            """Repeats the health to a client that comes later, as it is sent only when it changes."""
+            """Repeats the state of the fibres, which is sent only when it changes, to clients that connect later."""
 
             def on_subscribe(self, client: Any, channel: Any) -> None:
                 if channel.topic == HEALTH and HEALTH in latest:
                     channels[HEALTH].log(latest[HEALTH])
 
         self._channels, self._latest = channels, latest
-        self._context = foxglove.Context()  # not that of the process, which may show two pads
+        self._context = foxglove.Context()  # not the global one, since a process may show two pads
         options = {"context": self._context, "server_listener": Listener()}
         host = hidden_host()
         with contextlib.ExitStack() as stack:
@@ -106,9 +107,9 @@ class FoxgloveOutput(contextlib.AbstractContextManager["FoxgloveOutput"]):
 
 
 def _json_schema(value: Any) -> dict[str, Any]:
-    """Return the JSON Schema of values like this one; None stands for a number that is missing."""
+    """Return the JSON Schema of values like this one, in which None is a missing number."""
     if isinstance(value, dict):
-        return {"type": "object", "properties": {name: _json_schema(part) for name, part in value.items()}}
+        return {"type": "object", "properties": {name: _json_schema(item) for name, item in value.items()}}
     if isinstance(value, list):
         return {"type": "array", "items": _json_schema(value[0] if value else None)}
     return {"type": {bool: "boolean", str: "string"}.get(type(value), "number")}
@@ -117,24 +118,24 @@ def _json_schema(value: Any) -> dict[str, Any]:
 class RerunOutput(contextlib.AbstractContextManager["RerunOutput"]):
     """A stream for Rerun, in V and mm by the clock of the readings, to a viewer or into a file.
 
-    The file is complete at the end of the `with` block, and not there before.
+    The file appears, complete, at the end of the `with` block.
 
     Args:
         target: address of a viewer, rerun+http://HOST:PORT/proxy, or a file that ends in .rrd.
-        fibres: number of fibres that are read.
+        fibres: number of fibres.
         centre_mm: x and y of the middle of the sensed area.
-        half_mm: half its width and height.
+        half_mm: half the width and height of that area.
 
     Raises:
-        InputError: neither of them, or a file that cannot be written.
+        InputError: the target is invalid, or the file cannot be written.
     """
 
     def __init__(self, target: str, fibres: int, centre_mm: list[float], half_mm: list[float]) -> None:
         import rerun
         from rerun import blueprint
 
-        x, y, far = *centre_mm, 3 * max(half_mm)
-        eye = blueprint.EyeControls3D(position=[x, y, far], look_target=[x, y, 0.0], eye_up=[0.0, 1.0, 0.0])  # the plan
+        x, y, height = *centre_mm, 3 * max(half_mm)
+        eye = blueprint.EyeControls3D(position=[x, y, height], look_target=[x, y, 0.0], eye_up=[0.0, 1.0, 0.0])
         scene = blueprint.Spatial3DView(origin="pad", eye_controls=eye)
         plots = [blueprint.TimeSeriesView(origin=name) for name in ("readings", "pressed")]
         data = blueprint.Vertical(*plots, blueprint.TextLogView(origin="health"))
@@ -149,7 +150,7 @@ class RerunOutput(contextlib.AbstractContextManager["RerunOutput"]):
             except (RuntimeError, UnicodeError) as error:
                 expected = "an address like rerun+http://HOST:PORT/proxy, or a file that ends in .rrd"
                 raise InputError(f"--rerun is {short_repr(target)}, expected {expected}") from error
-            stack.callback(self._stream.disconnect)  # which flushes, before the file gets its name
+            stack.callback(self._stream.disconnect)  # flushes the file before it is renamed
             self._stream.send_blueprint(blueprint.Blueprint(blueprint.Horizontal(scene, data)))
             area = rerun.Boxes3D(centers=[[*centre_mm, 0.0]], half_sizes=[[*half_mm, 0.0]], colors=[GREY])
             self._stream.log("pad", rerun.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
@@ -159,7 +160,7 @@ class RerunOutput(contextlib.AbstractContextManager["RerunOutput"]):
             self._stack = stack.pop_all()
 
     def __exit__(self, *error: object) -> None:
-        self._stack.close()  # whatever the error: Ctrl-C is the usual end of a live pad
+        self._stack.close()  # completes the file also after Ctrl-C, the usual end of a live pad
 
     def send(self, message: Message) -> None:
         import rerun
@@ -171,7 +172,7 @@ class RerunOutput(contextlib.AbstractContextManager["RerunOutput"]):
                 volts = [math.nan if value is None else value for value in pad["volts"]]
                 self._stream.log("readings", rerun.Scalars(volts))
             self._pressed = pad.get("pressed", self._pressed)
-            # at every reading, and once more at a change: points are joined by lines, and an edge must not slope
+            # Sent at every reading and at every change, since Rerun joins points by lines, and an edge must be steep.
             self._stream.log("pressed", rerun.Scalars([float(self._pressed)]))
         elif message.topic == TOUCHES:
             z_mm = 1000 * message.msg["pose"]["pose"]["position"]["z"]

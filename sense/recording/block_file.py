@@ -1,8 +1,8 @@
 """An append-only file of readings in blocks, each with a checksum.
 
-Blocks have one size: a header (magic, sequence number, index of the first reading, number of readings, CRC-32 of all
-but itself), rows of float64 (time in s, then one voltage per fibre) and zeros. A writer that dies leaves at worst a
-torn last block, which is cut off by readers; damage before an intact block has another cause, and is an error.
+All blocks have the same size: a header (magic number, sequence number, index of the first reading, number of readings,
+CRC-32 of the block without this field), rows of float64 (time in s, then one voltage per fibre) and zeros. A writer
+that is killed leaves at worst a torn last block, which readers ignore; damage before an intact block is an error.
 """
 
 import zlib
@@ -17,13 +17,13 @@ from padforge.common.validation import InputError
 from padforge.sense.arrays import MAX_BYTES, Array, Mask
 
 _MAGIC = b"PFB1"
-_UNIT = 256
-_CRC_OFFSET = 20
-_HEADER = 24
+_UNIT = 256  # the size of a block is a multiple, bytes
+_CRC_OFFSET = 20  # bytes
+_HEADER = 24  # size, bytes
 
 
 def block_dtype(fibres: int) -> np.dtype[np.void]:
-    """Return the layout of a block: little-endian, four or more rows of 1 + `fibres` numbers, n x 256 bytes."""
+    """Return the layout of a block: little-endian, at least four rows of 1 + `fibres` numbers."""
     row = 8 * (1 + fibres)
     size = -(-(_HEADER + 4 * row) // _UNIT) * _UNIT
     rows = (size - _HEADER) // row
@@ -34,10 +34,15 @@ def block_dtype(fibres: int) -> np.dtype[np.void]:
 
 
 class BlockWriter:
-    """Appends rows to an open file: full blocks at once, the remaining rows at `flush`.
+    """Appends rows to a file: full blocks at once, the remaining rows at `flush`.
 
-    A write that fails adds nothing, and the next one overwrites what it left. `blocks` and `rows` count what the file,
-    open for writing in place, has already.
+    A failed write adds nothing; the next one overwrites its remains.
+
+    Args:
+        file: file open for writing in place.
+        fibres: number of fibres C.
+        blocks: number of blocks in the file.
+        rows: number of rows in the file.
     """
 
     def __init__(self, file: BinaryIO, fibres: int, blocks: int = 0, rows: int = 0) -> None:
@@ -45,7 +50,7 @@ class BlockWriter:
         self.fibres = fibres
         self._dtype = block_dtype(fibres)
         self._rows = self._dtype["rows"].shape[0]
-        self._waiting = np.empty((0, 1 + fibres))
+        self._pending = np.empty((0, 1 + fibres))
         self._sequence = blocks
         self._first = rows
 
@@ -61,15 +66,15 @@ class BlockWriter:
 
     def append(self, rows: Array) -> None:
         """Add (n, 1 + C) rows of time and volts."""
-        rows = np.concatenate([self._waiting, rows])
+        rows = np.concatenate([self._pending, rows])
         n_full = len(rows) // self._rows * self._rows
         self._write(rows[:n_full])
-        self._waiting = rows[n_full:]
+        self._pending = rows[n_full:]
 
     def flush(self) -> None:
-        """Write the waiting rows as a block that is not full."""
-        self._write(self._waiting)
-        self._waiting = self._waiting[:0]
+        """Write the pending rows as an incomplete block."""
+        self._write(self._pending)
+        self._pending = self._pending[:0]
         self._file.flush()
 
     def _write(self, rows: Array) -> None:
@@ -89,7 +94,7 @@ class BlockWriter:
 
 
 def write_at(file: BinaryIO, position: int, data: bytes) -> None:
-    """Write all data at a position; after a failure, writing again repairs what is there in part."""
+    """Write all data at a position; after a failure, another call overwrites data that were written in part."""
     file.seek(position)
     remaining = memoryview(data)
     while remaining:
@@ -97,26 +102,26 @@ def write_at(file: BinaryIO, position: int, data: bytes) -> None:
 
 
 def read_blocks(path: Path, fibres: int) -> tuple[Array, Array]:
-    """Return times (R,) and values (R, C) of all intact rows, without a torn tail; raise InputError on other damage."""
+    """Return times (R,) and values (R, C) of all rows before a torn tail; raise InputError for other damage."""
     blocks = _intact_blocks(path, fibres)
     has_row = _has_row(blocks)
     return blocks["rows"][has_row, 0], blocks["rows"][has_row, 1:]
 
 
 def _has_row(blocks: NDArray[np.void]) -> Mask:
-    """Return which rows of (B,) blocks are filled: (B, rows of a block)."""
+    """Return which rows of blocks (B,) are filled; shape (B, rows of a block)."""
     return np.arange(blocks.dtype["rows"].shape[0]) < blocks["count"][:, None]
 
 
 def _intact_blocks(path: Path, fibres: int) -> NDArray[np.void]:
-    """Return the blocks before the first without its magic and checksum, or that was written elsewhere.
+    """Return the blocks before the first one with a wrong magic number, checksum or position.
 
-    The file is mapped, not read: it may have gigabytes.
+    The file is memory-mapped, since it may have gigabytes.
     """
     dtype = block_dtype(fibres)
     try:
         n_blocks = check_file(path, MAX_BYTES).stat().st_size // dtype.itemsize
-        # A file without a block cannot be mapped.
+        # An empty file cannot be mapped.
         blocks = np.asarray(np.memmap(path, dtype, "r", shape=(n_blocks,))) if n_blocks else np.empty(0, dtype)
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror})") from error
@@ -133,8 +138,8 @@ def _intact_blocks(path: Path, fibres: int) -> NDArray[np.void]:
 
 
 def _checksums(blocks: NDArray[np.void]) -> NDArray[np.uint32]:
-    """Return (B,) CRC-32 of each block without its checksum field."""
-    view = np.ascontiguousarray(blocks).view(np.uint8).data  # no copy of what was read, which may be gigabytes
+    """Return the CRC-32 (B,) of each block without its checksum field."""
+    view = np.ascontiguousarray(blocks).view(np.uint8).data  # copies nothing of a mapped file
     size = blocks.dtype.itemsize
     crcs = np.empty(len(blocks), np.uint32)
     for i in range(len(blocks)):

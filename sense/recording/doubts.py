@@ -1,4 +1,4 @@
-"""Doubts about a recording: units that cannot be right, and presses far outside of the others."""
+"""Doubts about a recording: implausible units, and presses far outside of the others."""
 
 import re
 from collections.abc import Mapping, Sequence
@@ -9,31 +9,28 @@ import numpy as np
 from padforge.sense.arrays import Array, Mask
 from padforge.sense.recording.recording import Recording
 
-MIN_SPAN_MM, MAX_SPAN_MM = 2.0, 2000.0
-"""How far apart presses lie at most, on pads of a few mm to a metre or two: in m they are 0.01 to 2 apart."""
-MIN_RATE_HZ, MAX_RATE_HZ = 1.5, 10_000.0
-"""Readings a second of multimeters to fast boards: what reads 200 times a second seems to do so at 0.2 Hz in ms."""
-MAX_REST_V = 50.0
-COMMON_BITS, REFERENCE_V = (10, 12, 14, 16), 3.3
-"""Bits of the converters of common boards, and their highest voltage."""
-MARGIN = 0.5  # of the span of most presses, by which one may lie beside them
-MIN_PRESSES = 20  # from which it is known where most lie
+MIN_SPAN_MM = 2.0  # span of the presses on the smallest pad; positions in m have a smaller one
+MIN_RATE_HZ = 1.5  # of multimeters; 200 readings a second with times in ms, read as s, have 0.2 Hz
+MAX_RATE_HZ = 10_000.0  # of fast boards
+REFERENCE_V = 3.3  # of common boards
+MARGIN = 0.5  # distance, in spans of most presses, beyond which a press is far outside
+MIN_PRESSES = 20  # for an estimate of that span
 MAX_NAMED = 5
 
 
 def area_mm(recording: Recording) -> Array | None:
-    """Return the extent (2,) of the known positions along x and y, mm; None of fewer than two presses."""
+    """Return the extent (2,) of the known positions along x and y, mm; None for fewer than two."""
     positions_mm = recording.presses_mm[recording.has_position]
     return np.ptp(positions_mm, axis=0) if len(positions_mm) > 1 else None
 
 
 def find_doubts(recording: Recording) -> list[str]:
-    """Return what makes a recording doubtful, each in a line; presses count from 0."""
+    """Return the doubts about a recording, a line each; presses count from 0."""
     return [*_unit_doubts(recording), *_far_presses(recording)]
 
 
 def name_presses(recording: Recording, mask: Mask) -> str:
-    """Name the presses of a (Q,) mask, with positions in mm: the first of them, and how many more there are."""
+    """Describe the presses of a mask (Q,): positions of the first `MAX_NAMED`, and the number of the others."""
     presses = np.flatnonzero(mask)
     named = ["press {} at ({:.4g}, {:.4g}) mm".format(press, *recording.presses_mm[press]) for press in presses]
     more = [f"{len(presses) - MAX_NAMED} more"] if len(presses) > MAX_NAMED else []
@@ -43,13 +40,13 @@ def name_presses(recording: Recording, mask: Mask) -> str:
 def suggest_unit(
     source: Mapping[str, Any], quantity: str, readings: Array | None = None, rate_hz: float = MIN_RATE_HZ / 1000
 ) -> str:
-    """Return the unit that a quantity may be in, and the entry of the mapping that says so.
+    """Return the probable unit of a quantity, and the entry of the mapping that states it.
 
     Args:
-        source: of the recording, with its mapping as `columns`.
+        source: source of the recording, with its mapping as `columns`.
         quantity: `time`, `positions` or `fibres`.
-        readings: as they were taken, V; whether they are counts of a converter, and of how many bits.
-        rate_hz: as times were taken, Hz; whether they are ms, us or ns.
+        readings: readings as interpreted, V; they tell the number of bits of a converter.
+        rate_hz: rate as interpreted; it tells whether times are ms, us or ns.
     """
     columns = str(source.get("columns", ""))
     names = [piece.partition("=")[::2] for piece in columns.split(",")] if columns else []
@@ -68,13 +65,13 @@ def suggest_unit(
     if quantity == "positions":
         return f"in m ({entry(['x', 'y'] if 'x=' in columns or not columns else ['positions'], 'm')})"
     highest = float(np.nanmax(readings)) if readings is not None else 0.0
-    bits = next((bits for bits in COMMON_BITS if highest < 2**bits), 24)
+    bits = next((bits for bits in (10, 12, 14, 16) if highest < 2**bits), 24)
     volts = f"{entry(['fibres'], format(REFERENCE_V / (2**bits - 1), '.3g'))} for {bits} bits of {REFERENCE_V:g} V"
     return f"counts ({volts}), or mV ({entry(['fibres'], 'mV')})"
 
 
 def rate_doubts(rate_hz: float, source: Mapping[str, Any]) -> list[str]:
-    """Return what makes a number of readings a second doubtful, by the mapping in the source of a recording."""
+    """Return the doubts about a number of readings a second, with advice by the mapping in a recording's source."""
     if rate_hz < MIN_RATE_HZ:
         return [
             f"there are {rate_hz:.2g} readings a second; is time in {suggest_unit(source, 'time', rate_hz=rate_hz)}?"
@@ -90,10 +87,10 @@ def _unit_doubts(recording: Recording) -> list[str]:
     rest_v = float(np.nanmedian(np.abs(recording.readings)))
     if area is not None and 0 < area.max() < MIN_SPAN_MM:
         doubts.append(f"positions span {area[0]:.4g} x {area[1]:.4g} mm; are they {suggest_unit(source, 'positions')}?")
-    if area is not None and area.max() > MAX_SPAN_MM:
+    if area is not None and area.max() > 2000.0:
         doubts.append(f"positions span {area[0]:.4g} x {area[1]:.4g} mm; are they in another unit (x=NAME:UNIT)?")
     doubts += rate_doubts(rate_hz, source)
-    if rest_v > MAX_REST_V:
+    if rest_v > 50.0:
         doubts.append(f"fibres rest at {rest_v:.4g} V; are they {suggest_unit(source, 'fibres', recording.readings)}?")
     return doubts
 

@@ -1,4 +1,4 @@
-"""Press plans: where and how deep a probe presses, real or simulated, in this order."""
+"""Press plans: ordered positions and depths of the presses of a real or simulated probe."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -18,10 +18,8 @@ from padforge.sense.recording.tables import read_table
 from padforge.sense.settings import RigSettings
 
 COLUMNS = ("x_mm", "y_mm", "depth_mm")
-MIN_PRESSABLE = 0.01
-"""Share of the sensed area that keep-outs must leave."""
-PositionTest = Callable[[Array], Mask]
-"""Says which of (Q, 2) positions, mm, may be pressed: (Q,)."""
+MIN_PRESSABLE = 0.01  # minimum fraction of the sensed area outside of keep-outs
+PositionTest = Callable[[Array], Mask]  # returns which positions (Q, 2), mm, may be pressed; shape (Q,)
 
 
 @dataclass(frozen=True)
@@ -29,8 +27,8 @@ class PressPlan:
     """Presses to be made.
 
     Attributes:
-        positions_mm: (Q, 2) from the pad's centre.
-        depths_mm: (Q,) below the pad's surface, > 0.
+        positions_mm: positions (Q, 2) from the pad's centre.
+        depths_mm: depths (Q,) below the pad's surface, > 0.
     """
 
     positions_mm: Array
@@ -56,12 +54,12 @@ class PressPlan:
         return len(self.positions_mm)
 
     def to_rows(self) -> list[list[float]]:
-        """Return the plan as JSON: one [x_mm, y_mm, depth_mm] a press."""
+        """Return the plan as JSON: [x_mm, y_mm, depth_mm] for each press."""
         return np.column_stack([self.positions_mm, self.depths_mm]).tolist()
 
     @classmethod
     def from_rows(cls, rows: ArrayLike) -> "PressPlan":
-        """Make a plan of (Q, 3) rows, as `to_rows` returns them."""
+        """Return the plan of rows (Q, 3), see `to_rows`."""
         table = check_numbers(rows, np.float64, "plan")
         if table.ndim != 2 or table.shape[1] != 3:
             raise InputError(f"plan has shape {table.shape}, expected (Q, 3): {', '.join(COLUMNS)}")
@@ -69,7 +67,7 @@ class PressPlan:
 
 
 def fit_pad_settings(pad: Morphology, pad_settings: PadSettings | None = None) -> PadSettings:
-    """Return `[pad]`, or the default, for the layout of a pad; keep-outs must leave MIN_PRESSABLE of what is sensed."""
+    """Return `[pad]`, or the default, for the layout of a pad; raise InputError if keep-outs leave too little of it."""
     pad_settings = or_default("size", pad_settings, PadSettings).for_layout(pad.layout)
     if pad_settings.keep_out_mm:
         import shapely
@@ -85,54 +83,41 @@ def fit_pad_settings(pad: Morphology, pad_settings: PadSettings | None = None) -
 
 
 def pad_source(pad: Morphology) -> dict[str, Any]:
-    """Return the entry of a pad in the source of a recording, which `Morphology.from_dict` reads."""
+    """Return a pad as it is stored in the source of a recording; `Morphology.from_dict` reads it."""
     document = pad.to_dict()
     return {key: document[key] for key in ("fibres", "pitch_mm", "knots")}
 
 
 def pressable_test(pad: Morphology, pad_settings: PadSettings) -> PositionTest:
-    """Return the test whether positions on the plan of a pad are outside of its keep-outs."""
+    """Return the test for positions on the plan of a pad outside of its keep-outs."""
     return lambda positions_mm: is_outside(pad.to_grid(positions_mm), pad_settings)
 
 
 def planned_depths_mm(rig: RigSettings) -> Array:
-    """Return the depths of the presses of `[rig]`, or of the file of its plan; shape (n,), mm."""
+    """Return the depths (n,), mm, of the presses of `[rig]`, or of its plan file."""
     file = rig.plan_file
     return np.array(rig.press_depths_mm) if file is None else read_plan(file, rig.press_depths_mm).depths_mm
 
 
 def check_depths(depths_mm: Array, thickness_mm: float, pad: str) -> None:
-    """Check that presses do not go through a pad.
+    """Raise InputError if a press is as deep as the pad is thick.
 
     Args:
         depths_mm: depths of the presses; shape (n,).
         thickness_mm: thickness of the pad.
-        pad: what says so.
-
-    Raises:
-        InputError: a press is as deep as the pad is thick.
+        pad: source of the thickness, for the message.
     """
     if (deepest := float(depths_mm.max())) >= thickness_mm:
         raise InputError(f"[rig] presses {deepest:g} mm deep, allowed is less than {thickness_mm:g} mm, by {pad}")
 
 
 def deepest_contact(contact: Contact, depths_mm: Array) -> Contact:
-    """Return a layer contact as the deepest of some presses has it.
-
-    Args:
-        contact: a layer.
-        depths_mm: depths of the presses, less than its thickness; shape (n,).
-    """
+    """Return a layer contact with the maximum of some depths (n,), which are less than its thickness."""
     return contact.model_copy(update={"depth_mm": float(depths_mm.max())})
 
 
 def describe_other_depth(depths_mm: Array, contact: Contact) -> str:
-    """Say that no press is as deep as the pad is designed for; return "" if one is, or the contact knows no depth.
-
-    Args:
-        depths_mm: depths of the presses; shape (n,).
-        contact: contact that the pad is designed for.
-    """
+    """Return a notice if no press has the depth of the contact that the pad is designed for, otherwise ""."""
     if contact.model != "layer" or contact.depth_mm in depths_mm:
         return ""
     low, high = f"{depths_mm.min():g}", f"{depths_mm.max():g}"
@@ -143,7 +128,7 @@ def describe_other_depth(depths_mm: Array, contact: Contact) -> str:
 def make_plan(
     pad: Morphology, rig: RigSettings, rng: np.random.Generator, pad_settings: PadSettings | None = None
 ) -> PressPlan:
-    """Make the plan of `[rig]` for the sensed area of a pad, see `fit_pad_settings` and `make_plan_in`."""
+    """Return the plan of `[rig]` for the sensed area of a pad, see `fit_pad_settings` and `make_plan_in`."""
     pad_settings = fit_pad_settings(pad, pad_settings)
     return make_plan_in(pad.to_mm(pad_settings.sensed), rig, rng, pressable_test(pad, pad_settings))
 
@@ -151,18 +136,18 @@ def make_plan(
 def make_plan_in(
     corners_mm: Array, rig: RigSettings, rng: np.random.Generator, is_pressable: PositionTest
 ) -> PressPlan:
-    """Make the plan of `[rig]`: that of its file, or `presses` positions between two corners.
+    """Return the plan of `[rig]`: that of its file, or `presses` positions between two corners.
 
-    A grid has about one step along both axes, and as many of its rows as hold `presses` pressable positions; a
-    serpentine plan alternates the direction of its rows. Depths alternate along a row, and each row begins
-    with the next one: columns of one depth would correlate depth with position. An adaptive plan is uniform until a
-    localizer steers it.
+    A grid has about equal steps along both axes, and as many rows as contain `presses` pressable positions; a
+    serpentine plan alternates the direction of its rows. Depths alternate along a row, and each row starts with the
+    next depth, since columns of equal depth would correlate depth with position. An adaptive plan is uniform until a
+    localizer moves its presses.
 
     Args:
-        corners_mm: (2, 2) low and high.
+        corners_mm: low and high corner; shape (2, 2).
         rig: plan, file, presses and depths.
-        rng: of random positions.
-        is_pressable: which positions may be pressed.
+        rng: generator of random positions.
+        is_pressable: returns which positions may be pressed.
     """
     if rig.plan_file is not None:
         return check_pressable(read_plan(rig.plan_file, rig.press_depths_mm), rig.plan_file, is_pressable)
@@ -191,12 +176,12 @@ def sample_uniform(corners_mm: Array, count: int, rng: np.random.Generator, is_p
 
 
 def _grid(corners_mm: Array, count: int, serpentine: bool) -> tuple[Array, Indices]:
-    """Return at least `count` positions (Q, 2) of a grid row by row, and the index of the depth of each (Q,)."""
+    """Return at least `count` positions (Q, 2) of a grid, row by row, and the index (Q,) of the depth of each."""
     low, high = corners_mm
     width, height = (high - low).tolist()
     if width == height:
         n_columns = n_rows = int(np.ceil(np.sqrt(count)))
-    else:  # one step along both axes: (1 + width / step) (1 + height / step) = count
+    else:  # equal steps along both axes: (1 + width / step) (1 + height / step) = count
         per_mm = 2 * (count - 1) / (width + height + np.sqrt((width + height) ** 2 + 4 * width * height * (count - 1)))
         n_rows = round(1 + per_mm * height)
         n_columns = -(-count // n_rows)
@@ -210,7 +195,7 @@ def _grid(corners_mm: Array, count: int, serpentine: bool) -> tuple[Array, Indic
 
 
 def check_pressable(plan: PressPlan, path: Path, is_pressable: PositionTest) -> PressPlan:
-    """Return the plan of a file; raise InputError where it presses a keep-out."""
+    """Return a plan from a file; raise InputError if it presses a keep-out."""
     valid = is_pressable(plan.positions_mm)
     if not valid.all():
         press = int(np.argmin(valid))
@@ -227,7 +212,7 @@ def read_plan(path: Path, depths_mm: Sequence[float]) -> PressPlan:
 
     Args:
         path: file with the columns x_mm, y_mm and, optionally, depth_mm.
-        depths_mm: depths that presses take in turn where the file has none.
+        depths_mm: depths that presses take in turn if the file has none.
     """
     table = read_table(path)
     if tuple(table.names) not in (COLUMNS, COLUMNS[:2]):

@@ -54,32 +54,30 @@ from padforge.sense.recording.run_directory import (
 
 _ARRAYS = dict.fromkeys(("readings", "times_s", "presses_mm"), np.float64)
 _ARRAYS |= dict.fromkeys(("down_command", "up_command"), np.int64)
-_CHUNK_BYTES = 2**18  # of readings that are written at once
 FIBRE_NAMES = "fibre_names"
-"""Key in the source of a recording for what its fibres are called in the file that it was imported from."""
-NOTE = "note"
-"""Key in the source of a recording that says what was left out of it, or filled in."""
+"""Key in the source of a recording: names of its fibres in the file that it was imported from."""
+NOTE = "note"  # key in the source of a recording: what was omitted in the import, or filled in
 PRESSES_DETECTED = {"presses": "detected"}
 """Entry of the source of a recording whose presses were detected in its readings."""
-_MIN_READINGS = 100  # of a recording that was meant as one
+_MIN_READINGS = 100  # fewer may be a table with a line for each press
 _MEASURES = {"depths_mm": (MAX_MM, "mm"), "reached_mm": (MAX_MM, "mm"), "forces_n": (MAX_N, "N")}
 
 
 @dataclass(frozen=True)
 class Recording:
-    """Readings of a pad and the presses made meanwhile.
+    """Readings of the fibres of a pad, and the presses on it.
 
     Attributes:
-        readings: (R, C) volts, one row per reading, one column per fibre; NaN where one is missing.
-        times_s: (R,) ascending, s.
-        presses_mm: (Q, 2) commanded positions, mm from the pad's centre; NaN where unknown.
-        down_command: (Q,) index of the first reading after the probe was sent down.
-        up_command: (Q,) index of the first reading after it was sent up; R without one.
-        source: where the recording came from; JSON.
-        torn_presses: presses that were left out because the end of the readings was torn off.
-        depths_mm: (Q,) commanded depth below the surface, mm, > 0; NaN where unknown.
-        reached_mm: (Q,) depth that the arm measured while it held the press, mm; NaN where unknown.
-        forces_n: (Q,) force on the probe meanwhile, N, >= 0; NaN where unknown.
+        readings: voltages (R, C), a row per reading and a column per fibre; NaN where missing.
+        times_s: times (R,), ascending, s.
+        presses_mm: commanded positions (Q, 2), mm from the pad's centre; NaN where unknown.
+        down_command: index (Q,) of the first reading after the probe was commanded down.
+        up_command: index (Q,) of the first reading after it was commanded up; R if there is none.
+        source: origin of the recording; JSON.
+        torn_presses: number of presses that were omitted because the end of the readings was torn off.
+        depths_mm: commanded depths (Q,) below the surface, mm, > 0; NaN where unknown.
+        reached_mm: depths (Q,) measured by the arm while it held the press, mm; NaN where unknown.
+        forces_n: forces (Q,) on the probe during the press, N, >= 0; NaN where unknown.
     """
 
     readings: Array
@@ -96,7 +94,7 @@ class Recording:
     def __post_init__(self) -> None:
         for name, kind in _ARRAYS.items():
             values = getattr(self, name)
-            # What can change no more is taken as it is: it may have gigabytes.
+            # Arrays that cannot change are not copied, since they may have gigabytes.
             is_frozen = isinstance(values, np.ndarray) and values.flags.owndata and not values.flags.writeable
             self._freeze(name, check_numbers(values, kind, name, copy=not is_frozen))
         _check_source(self.source)
@@ -104,7 +102,7 @@ class Recording:
         _check_presses(self)
         for name in _MEASURES:
             values = check_numbers(getattr(self, name), np.float64, name)
-            is_unknown = np.isnan(values).all()  # of any length: `replace` may have left some presses out
+            is_unknown = np.isnan(values).all()  # whatever the length, which `replace` may have changed for the presses
             self._freeze(name, np.full(len(self.presses_mm), np.nan) if is_unknown else values)
             _check_measure(self, name)
 
@@ -122,12 +120,12 @@ class Recording:
 
     @property
     def fibres(self) -> int:
-        """C, the number of recorded fibres."""
+        """Number of fibres C."""
         return self.readings.shape[1]
 
     @property
     def shape(self) -> tuple[int]:
-        """(Q,), as an array of presses has it."""
+        """Shape (Q,) of the presses, as if they were an array."""
         return (len(self),)
 
     def __len__(self) -> int:
@@ -138,33 +136,33 @@ class Recording:
 
     @property
     def has_position(self) -> Mask:
-        """(Q,) whether the position of each press is known."""
-        return ~np.isnan(self.presses_mm[:, 0])  # of a checked recording, also of y
+        """Whether the position of each press is known; shape (Q,)."""
+        return ~np.isnan(self.presses_mm[:, 0])  # x and y are both known or both unknown
 
     @property
     def actual_depths_mm(self) -> Array:
-        """(Q,) depth of each press, mm: as reached, or else as commanded; NaN where neither is known."""
+        """Depths (Q,) of the presses, mm: as measured, otherwise as commanded; NaN where unknown."""
         return np.where(np.isnan(self.reached_mm), self.depths_mm, self.reached_mm)
 
     @property
     def measures(self) -> dict[str, Array]:
-        """Depth and force of each press, (Q,), by name; NaN where unknown."""
+        """Depths and forces of the presses, each (Q,), by name; NaN where unknown."""
         return {"depth_mm": self.actual_depths_mm, "force_n": self.forces_n}
 
     @property
     def mirrored(self) -> bool:
-        """Whether the pad lay with its tracks up, by `[rig]`: seen from above, x ran to the left of y."""
+        """Whether the pad lay with its tracks up, by `[rig]`, so that x pointed to the left of y seen from above."""
         return is_mirrored(self.source)
 
     @property
     def fibre_names(self) -> tuple[str, ...]:
-        """What the C fibres are called in the file that they were imported from; () where they have no names."""
+        """Names (C,) of the fibres in the file that they were imported from; () if unknown."""
         names = self.source.get(FIBRE_NAMES)
         return tuple(map(str, names)) if isinstance(names, list) and len(names) == self.fibres else ()
 
     @property
     def pad_digest(self) -> str:
-        """Hex SHA-256 of the plan of the pad, to a millionth of its units; "" where the source does not hold it."""
+        """Hexadecimal SHA-256 of the plan of the pad, rounded to 1e-6; "" if the source has none."""
         if (plan := self.source.get("morphology")) is None:
             return ""
         rounded = json.loads(json.dumps(plan), parse_float=lambda number: round(float(number), 6))
@@ -172,16 +170,16 @@ class Recording:
 
     @property
     def rate_hz(self) -> float:
-        """Readings per second, by the median interval."""
+        """Readings per second, from the median interval."""
         return median_rate_hz(self.times_s)
 
     @property
     def digest(self) -> str:
-        """Hex SHA-256 of the readings and presses, without depths and forces."""
+        """Hexadecimal SHA-256 of the readings and presses, without depths and forces."""
         digest = hashlib.sha256()
         for array in (getattr(self, name) for name in _ARRAYS):
-            plain = np.where(np.isnan(array), np.nan, array) if array.dtype.kind == "f" else array  # one NaN of many
-            digest.update(repr(array.shape).encode() + plain.tobytes())
+            normalised = np.where(np.isnan(array), np.nan, array) if array.dtype.kind == "f" else array  # bits of NaN
+            digest.update(repr(array.shape).encode() + normalised.tobytes())
         return digest.hexdigest()
 
     @classmethod
@@ -195,19 +193,19 @@ class Recording:
         presses_mm: ArrayLike | None = None,
         **measures: ArrayLike,
     ) -> "Recording":
-        """Make a recording of arrays.
+        """Return a recording of arrays.
 
         Args:
-            readings: NaN where one is missing; shape (R, C), V.
-            times_s: of the readings, ascending; shape (R,), s.
-            down_s: when the pad began to be pressed, by the same clock; shape (Q,), s. Without it and `up_s`, presses
-                are detected in the readings.
-            up_s: when each press ended; shape (Q,), s.
+            readings: voltages, NaN where missing; shape (R, C), V.
+            times_s: times of the readings, ascending; shape (R,), s.
+            down_s: start of each press, by the same clock; shape (Q,), s. Without it and `up_s`, presses are detected
+                in the readings.
+            up_s: end of each press; shape (Q,), s.
             presses_mm: position of each press from the pad's centre; shape (Q, 2), mm. By default unknown.
-            **measures: `depths_mm`, `reached_mm`, `forces_n`, as of a `Recording`; shape (Q,).
+            **measures: `depths_mm`, `reached_mm` and `forces_n` of a `Recording`; shape (Q,).
 
         Raises:
-            InputError: arrays that do not fit together, or hold no press.
+            InputError: arrays are inconsistent, or there is no press.
         """
         readings, times = check_stream(times_s, readings)[::-1]
         source: dict[str, Any] = {"kind": "arrays"}
@@ -227,14 +225,14 @@ class Recording:
         """Read a run directory, finished or not; `import_export.open_recording` reads files as well.
 
         Args:
-            path: of the run directory. A torn end of its readings is cut off, with the presses in it.
+            path: the run directory. A torn end of its readings is ignored, with the presses in it.
 
         Raises:
-            InputError: other damage, or no run directory.
+            InputError: there is other damage, or no run directory.
         """
         path = check_path("path", path)
         fibres = read_fibres(path)
-        # The journal first, which never precedes the readings: some may be recorded meanwhile.
+        # The journal is read first, since its presses are never ahead of the readings, which may be being recorded.
         done = np.array(list(read_journal(path / JOURNAL).values()), dtype=np.float64).reshape(-1, len(Press._fields))
         times_s, readings = read_blocks(path / READINGS, fibres)
         table = done[done[:, 3] <= len(times_s)]
@@ -257,13 +255,13 @@ class Recording:
             raise InputError(f"{path}: {error}") from error
 
     def save(self, path: str | Path, provenance: Mapping[str, Any] | None = None, replacing: bool = False) -> None:
-        """Write a run directory that appears complete or not at all.
+        """Write a run directory atomically.
 
         Args:
-            path: of the folder.
-            provenance: of the recording; JSON. By default the versions of padforge and what it uses.
-            replacing: whether an existing simulated recording is replaced, see `check_replaceable`; no other one is
-                ever written over, not even one that appeared meanwhile.
+            path: the run directory.
+            provenance: provenance of the recording, JSON; by default versions of padforge and its dependencies.
+            replacing: whether to replace an existing simulated recording, see `check_replaceable`; any other one is
+                never overwritten.
         """
         provenance = origin("padforge.sense.Recording.save") if provenance is None else provenance
         check_target = check_replaceable if check_type("replacing", replacing, bool) else check_new_folder
@@ -282,12 +280,12 @@ class Recording:
                         path.rmdir()
                     (folder / path.name).rename(path)
                 except OSError:
-                    check_new_folder(path)  # another one came first
+                    check_new_folder(path)  # another process may have created it
                     raise
                 sync(path.parent)
 
     def _write(self, path: Path, provenance: Mapping[str, Any]) -> None:
-        step = max(1, _CHUNK_BYTES // (8 * (1 + self.fibres)))
+        step = max(1, 2**18 // (8 * (1 + self.fibres)))  # readings written at once, 256 KiB
         with Recorder(path, self.fibres, self.source, provenance) as recorder:
             for first in range(0, len(self.readings), step):
                 recorder.append(self.times_s[first : first + step], self.readings[first : first + step])
@@ -302,13 +300,13 @@ class Recording:
 
 @dataclass(frozen=True)
 class PressSelection:
-    """Some presses of a recording, `recording[presses]`, as cross-validation splits them.
+    """A selection of presses, `recording[presses]`, for cross-validation.
 
-    The readings of all presses stay, as the history of these.
+    It has the readings of all presses, since earlier presses influence later ones.
 
     Attributes:
-        recording: with S or more presses.
-        presses: indices of the selected ones; shape (S,).
+        recording: the recording.
+        presses: indices of the selected presses; shape (S,).
     """
 
     recording: Recording
@@ -316,26 +314,26 @@ class PressSelection:
 
     @property
     def presses_mm(self) -> Array:
-        """(S, 2) positions of the selected presses, mm; NaN where unknown."""
+        """Positions (S, 2) of the selected presses, mm; NaN where unknown."""
         return self.recording.presses_mm[self.presses]
 
     @property
     def shape(self) -> tuple[int]:
-        """(S,), as an array of presses has it."""
+        """Shape (S,) of the presses, as if they were an array."""
         return (len(self),)
 
     def __len__(self) -> int:
         return len(self.presses)
 
     def __getitem__(self, presses: Any) -> "PressSelection":
-        rows = presses[0] if isinstance(presses, tuple) else presses  # scikit-learn asks for [rows, ...]
+        rows = presses[0] if isinstance(presses, tuple) else presses  # scikit-learn indexes by [rows, ...]
         return PressSelection(self.recording, np.atleast_1d(self.presses[rows]))
 
 
 def check_replaceable(path: Path) -> None:
-    """Raise InputError unless a path is absent or a simulated recording, which the same seed makes again.
+    """Raise InputError unless a path is absent or a simulated recording, which can be made again by its seed.
 
-    Links are not followed, and nobody may be recording into it.
+    A link, or a recording in progress, is refused.
     """
     advice = "choose another --out"
     if path.is_symlink():
@@ -357,15 +355,15 @@ def check_replaceable(path: Path) -> None:
 
 
 def detect_commands(readings: Array, times_s: Array, source: Mapping[str, Any]) -> tuple[Indices, Indices]:
-    """Return the down and up commands (Q,) of presses that are detected in readings (R, C).
+    """Detect the presses in readings (R, C) and return their down and up commands (Q,).
 
     Raises:
-        InputError: the readings are none of a pad, or hold no press.
+        InputError: the readings are invalid, or have no press.
     """
     from padforge.sense.signals.press_detection import detect_presses, estimate_commands
 
     placeholder = np.array([1])
-    Recording(readings, times_s, np.zeros((1, 2)), placeholder, placeholder + 1, source)  # checks the readings first
+    Recording(readings, times_s, np.zeros((1, 2)), placeholder, placeholder + 1, source)  # checks the readings
     presses = detect_presses(readings, times_s)
     if len(presses.touched) == 0:
         what = "no position or number tells of one, and none is detected in the readings"
@@ -421,7 +419,7 @@ def _check_measure(recording: Recording, name: str) -> None:
     if values.shape != (len(recording.presses_mm),):
         raise InputError(f"{name} have shape {values.shape}, expected ({len(recording.presses_mm)},)")
     check_magnitude(name, values[:, None], limit, unit, missing=True)
-    # An arm may measure that it is above the pad.
+    # Reached depths may be negative, if the arm measures that it is above the pad.
     is_wrong = {"depths_mm": values <= 0, "forces_n": values < 0}.get(name, np.zeros(len(values), bool))
     if is_wrong.any():
         press = int(np.argmax(is_wrong))
@@ -430,11 +428,11 @@ def _check_measure(recording: Recording, name: str) -> None:
 
 
 def is_mirrored(source: object) -> bool:
-    """Whether the source of a recording says that the pad lay with its tracks up, see `Recording.mirrored`."""
+    """Return whether the pad lay with its tracks up, by the source of a recording; see `Recording.mirrored`."""
     rig = source.get("rig") if isinstance(source, Mapping) else None
     return isinstance(rig, Mapping) and rig.get("mirrored") is True
 
 
 def median_rate_hz(times_s: Array) -> float:
-    """Return the readings per second, by the median interval of (R,) times."""
+    """Return the readings per second, from the median interval of times (R,)."""
     return 1 / float(np.median(np.diff(times_s)))

@@ -1,10 +1,10 @@
-"""The run directory of a recording: written so that no finished press is ever lost.
+"""The run directory of a recording, written so that no finished press is lost.
 
-It holds `start.json` (what was recorded, and with what), `readings.bin` and, for an arm, `states.bin`
-(see `block_file`), and `journal.ndjson`: one line as a press begins, with its position and the index of its first
-reading, and one as it is done or aborted. Readings are on the disk before the journal says that a press is done: after
-a kill all presses that the journal calls done can be used, and the others are repeated. `start.json` is written last
-when a recording is created: a folder without it holds nothing, and a recording can begin there.
+It contains `start.json` (source and provenance), `readings.bin` and, for an arm, `states.bin` (see `block_file`), and
+`journal.ndjson`, with a line when a press starts, with its position and the index of its first reading, and a line when
+it is done or aborted. Readings are on the disk before the journal says that a press is done: after a kill all presses
+that are done according to the journal can be used, and the others are repeated. `start.json` is written last when a
+recording is created; a folder without it is empty or was abandoned, and can be used for a recording.
 """
 
 import contextlib
@@ -38,12 +38,11 @@ START, JOURNAL, READINGS, STATES = FILES = "start.json", "journal.ndjson", "read
 STATE_COLUMNS = ("time_s", "x_mm", "y_mm", "z_mm", "rx", "ry", "rz", "speed_mm_s", "force_n", "safety")
 """Columns of a state of the arm; force is NaN without a sensor, safety 1 normal and 0 stopped."""
 _NEW_START = UNFINISHED + START
-_BEFORE_START = (JOURNAL, READINGS, _NEW_START)
-"""Files that are created before `start.json`, in this order."""
+_BEFORE_START = (JOURNAL, READINGS, _NEW_START)  # files that are created before `start.json`, in this order
 
 
 class Press(NamedTuple):
-    """A press that is done: an entry of the arrays of a `Recording`; NaN where a number is unknown."""
+    """A press that is done, with the values of the arrays of a `Recording`; NaN if unknown."""
 
     x_mm: float
     y_mm: float
@@ -55,8 +54,8 @@ class Press(NamedTuple):
 
 
 def read_journal(path: Path) -> dict[int, Press]:
-    """Return the presses that are done by their numbers, ascending; one that was repeated counts as begun last."""
-    started: dict[int, Mapping[str, Any]] = {}  # and neither done nor aborted
+    """Return the presses that are done by their ascending numbers; of a repeated press the last one counts."""
+    started: dict[int, Mapping[str, Any]] = {}  # entries of presses that are neither done nor aborted
     done: dict[int, Press] = {}
     for line_number, line in enumerate(io.BytesIO(read_bytes(path)), start=1):
         if not line.endswith(b"\n"):
@@ -80,27 +79,27 @@ def read_journal(path: Path) -> dict[int, Press]:
 
 
 def _finished_press(started: Mapping[str, Any], done: Mapping[str, Any]) -> Press:
-    depth_mm, reached_mm, force_n = started.get("depth_mm"), done.get("at_mm", [None] * 3)[2], done.get("force_n")
-    x_y_and_measures = (started["x_mm"], started["y_mm"], depth_mm, reached_mm, force_n)
-    x, y, depth, reached, force = (float("nan") if value is None else float(value) for value in x_y_and_measures)
-    return Press(x, y, int(started["reading"]), int(done["reading"]), depth, reached, force)
+    position = started["x_mm"], started["y_mm"]
+    measures = started.get("depth_mm"), done.get("at_mm", [None] * 3)[2], done.get("force_n")
+    x, y, *numbers = (float("nan") if value is None else float(value) for value in (*position, *measures))
+    return Press(x, y, int(started["reading"]), int(done["reading"]), *numbers)
 
 
 class Recorder:
-    """Writes a run directory while it is recorded: append readings, begin a press, finish it, `sync`.
+    """Writes a run directory during a recording: append readings, begin a press, finish it, `sync`.
 
-    Nothing is sure to be on the disk before `sync` returns; leaving the `with` block syncs and closes.
+    Data are guaranteed to be on the disk when `sync` returns; leaving the `with` block syncs and closes.
 
     Args:
-        path: of the folder.
-        fibres: C, values of a reading.
-        source: what is recorded; JSON.
-        provenance: of the recording; JSON.
+        path: the run directory.
+        fibres: number of fibres C.
+        source: source of the recording; JSON.
+        provenance: provenance of the recording; JSON.
 
     Attributes:
         done: numbers of the presses that are done.
         n_readings: number of readings so far.
-        last_s: time of the last reading or state, s; -inf without any.
+        last_s: time of the last reading or state, s; -inf if there is none.
     """
 
     def __init__(self, path: Path, fibres: int, source: Mapping[str, Any], provenance: Mapping[str, Any]) -> None:
@@ -112,7 +111,7 @@ class Recorder:
         with reraise_write_error(path), contextlib.ExitStack() as lock:
             path.mkdir(parents=True, exist_ok=True)
             lock.enter_context(locked(path, busy_message(path)))
-            check_new_recording(path)  # another one may have come first
+            check_new_recording(path)  # again, under the lock
             present = {file.name for file in path.iterdir()}
             with contextlib.ExitStack() as undo:
                 for name in {*_BEFORE_START, START} - present:
@@ -140,19 +139,12 @@ class Recorder:
 
     @classmethod
     def resume(cls, path: Path) -> "Recorder":
-        """Continue an unfinished run directory; torn ends are cut off.
-
-        Args:
-            path: of the run directory.
-
-        Raises:
-            InputError: other damage.
-        """
+        """Continue an unfinished run directory; torn ends are cut off, other damage raises InputError."""
         fibres = read_fibres(path := check_path("path", path))
         self = cls.__new__(cls)
         with reraise_write_error(path), contextlib.ExitStack() as lock:
             lock.enter_context(locked(path, busy_message(path)))
-            if is_uncommitted(path):  # broken off before the first reading
+            if is_uncommitted(path):  # interrupted before the first reading
                 for name in (JOURNAL, READINGS):
                     (path / name).touch()
             self._journal = (path / JOURNAL).open("r+b", buffering=0)
@@ -160,7 +152,7 @@ class Recorder:
                 journal = read_journal(path / JOURNAL)
                 times_s, _ = read_blocks(path / READINGS, fibres)
                 if (journal and not len(times_s)) or not (np.diff(times_s) > 0).all():
-                    # No break leaves that, so nothing may be cut off.
+                    # No interruption causes this, so that nothing may be cut off.
                     what = f"the readings of {len(journal)} presses of {fibres} fibres in the journal"
                     raise InputError(f"{path / READINGS}: not {what}")
                 blocks, self._stream, times_s = BlockWriter.resume(path / READINGS, fibres)
@@ -168,7 +160,7 @@ class Recorder:
                 self._journal.close()
                 raise
             end = (path / JOURNAL).read_bytes().rfind(b"\n") + 1
-            self._journal.truncate(end)  # of a torn line
+            self._journal.truncate(end)  # without a torn line
             self._set_state(path, blocks, end)
             self._update_last_time(times_s)
             if (path / STATES).exists():
@@ -178,19 +170,14 @@ class Recorder:
             self._lock = lock.pop_all()
         self.n_readings = len(times_s)
         self.done = {number for number, press in journal.items() if press.up_command <= len(times_s)}
-        for number in sorted(journal.keys() - self.done):  # or they would count again as soon as enough rows follow
+        for number in sorted(journal.keys() - self.done):  # otherwise further readings would make them valid again
             self._write_event("aborted", number, len(times_s), reason="its readings were torn off")
         self.sync()
         self._press = max(self.done, default=-1) + 1
         return self
 
     def append(self, times_s: ArrayLike, readings: ArrayLike) -> None:
-        """Add readings; after an OSError (the disk is full or gone) nothing was added.
-
-        Args:
-            times_s: (n,) ascending.
-            readings: (n, C) V.
-        """
+        """Add readings (n, C), V, at ascending times (n,), s; after an OSError (a full disk) none is added."""
         times, volts = check_numbers(times_s, np.float64, "times"), check_numbers(readings, np.float64, "readings")
         if times.ndim != 1 or volts.shape != (len(times), self.fibres) or not np.isfinite(times).all():
             raise InputError(
@@ -203,11 +190,7 @@ class Recorder:
         self.n_readings += len(rows)
 
     def append_states(self, rows: Array) -> None:
-        """Add states of the arm.
-
-        Args:
-            rows: (n, 10), by `STATE_COLUMNS`.
-        """
+        """Add states (n, 10) of the arm, by `STATE_COLUMNS`."""
         if self._states is None:
             file = (self._path / STATES).open("xb", buffering=0)
             sync(self._path)
@@ -220,13 +203,13 @@ class Recorder:
             self.last_s = max(self.last_s, float(times_s[-1]))
 
     def begin(self, position_mm: ArrayLike, reading: int, press: int | None = None, **more: Any) -> None:
-        """Note that the probe is sent down.
+        """Record the start of a press.
 
         Args:
-            position_mm: (2,); NaN where it is unknown.
-            reading: index of the reading that follows.
-            press: its number, by default one more than that of the last.
-            more: JSON that is added to the entry, such as `depth_mm`.
+            position_mm: position (2,); NaN if unknown.
+            reading: index of the first reading after the command.
+            press: number of the press, by default that of the last one plus 1.
+            more: further JSON of the entry, such as `depth_mm`.
         """
         position = check_numbers(position_mm, np.float64, "position")
         if position.shape != (2,) or not (np.isnan(position).all() or np.isfinite(position).all()):
@@ -238,11 +221,11 @@ class Recorder:
         self._press, self._is_down = number, True
 
     def finish(self, reading: int, **more: Any) -> None:
-        """Note that the probe is sent up.
+        """Record the end of a press.
 
         Args:
-            reading: index of the reading that follows.
-            more: JSON that is added to the entry, such as `at_mm` and `force_n`.
+            reading: index of the first reading after the command.
+            more: further JSON of the entry, such as `at_mm` and `force_n`.
         """
         if not self._is_down:
             raise InputError(f"press {self._press} was not begun, so it cannot be finished")
@@ -251,11 +234,7 @@ class Recorder:
         self._press, self._is_down = self._press + 1, False
 
     def abort(self, reason: str) -> None:
-        """Note that the press that has begun, if any, did not come to its end.
-
-        Args:
-            reason: in words.
-        """
+        """Record that the current press, if any, was aborted for a reason."""
         if self._is_down:
             self._is_down = False
             self._write_event("aborted", self._press, self.n_readings, reason=reason)
@@ -268,7 +247,7 @@ class Recorder:
             raise InputError(f"press {press}: {short_repr(document)}, expected what JSON can hold") from error
 
     def sync(self) -> None:
-        """Put everything on the disk: first the readings and states, then the journal about them."""
+        """Write everything to the disk: first readings and states, then the journal."""
         self._blocks.flush()
         to_disk(self._stream.fileno())
         if self._states is not None:
@@ -287,14 +266,14 @@ class Recorder:
         with self._lock, contextlib.ExitStack() as files:
             for file in (self._journal, self._stream, *(self._states or ())[1:]):
                 files.enter_context(file)
-            with contextlib.suppress(*([OSError] if kind else [])):  # do not hide the error under way
+            with contextlib.suppress(*([OSError] if kind else [])):  # do not hide the error of the body
                 self.sync()
 
 
 def read_fibres(path: Path) -> int:
     """Return the number of fibres of a run directory."""
     if not (path / START).is_file():
-        inner = path / "recording"  # what every command calls the one that it writes into the folder of a pad
+        inner = path / "recording"  # name of the recording in the folder of a pad
         expected = inner if (inner / START).is_file() else f"a folder with {START}, {JOURNAL} and {READINGS}"
         raise InputError(f"{path}: no recording, expected {expected}")
     fibres = read_json(path / START, FORMAT).get("fibres")
@@ -311,14 +290,14 @@ def check_new_folder(path: Path) -> None:
 
 
 def check_new_recording(path: Path) -> None:
-    """As `check_new_folder`, but allow a recording that was broken off while it was created."""
+    """Check like `check_new_folder`, but allow a recording that was interrupted while it was created."""
     check_writable(path)
     if path.exists() and ((path / START).exists() or not is_uncommitted(path)):
         check_new_folder(path)
 
 
 def is_uncommitted(path: Path) -> bool:
-    """Whether a folder holds only files that are created up to `start.json`, without a reading or press."""
+    """Return whether a folder has only files that are created up to `start.json`, without a reading or press."""
     return all(
         file.name in (START, _NEW_START) or (file.name in _BEFORE_START and file.stat().st_size == 0)
         for file in path.iterdir()

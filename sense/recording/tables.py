@@ -1,8 +1,8 @@
-"""Columns of numbers from tables of text, as programs, loggers and spreadsheets write them.
+"""Columns of numbers from text tables of programs, loggers and spreadsheets.
 
-What the first lines show decides how a table is read: its encoding by the byte order mark, its separator by which one
-gives most numbers, its header as the last line of names before them, and whether a comma is a decimal point. A line
-of units may follow the header, and lines of anything may precede it. Lines are split by the module csv.
+The dialect of a table is detected from its first lines: the encoding by the byte order mark, the separator as the one
+that gives most numbers, the header as the last line of names before the numbers, and whether commas are decimal points.
+A line of units may follow the header, and any lines may precede it. Lines are split by the module csv.
 """
 
 import codecs
@@ -22,19 +22,17 @@ from padforge.common.files import check_file
 from padforge.common.validation import InputError, short_repr
 from padforge.sense.arrays import MAX_BYTES, Array
 
-UNKNOWN = -1.7e308
-"""Stands for `?` among numbers, far from all others."""
+UNKNOWN = -1.7e308  # represents `?` among numbers, and is far from all others
 MISSING = {"", "nan", "na", "n/a", "#n/a", "#na", "null", "none", "-", "--", "inf", "-inf", "+inf", "#num!", "#value!"}
 MISSING |= {"ovf", "overflow", "over", "ol", "#div/0!", "missing", "infinity", "-infinity", "nan(ind)", "-nan"}
 """Words for a value that is missing or out of range, in lower case."""
 SEPARATORS = ",;\t| "
-FALLBACK = "cp1252"
-"""Encoding of what is no UTF-8: that of Windows in western Europe and America."""
+FALLBACK = "cp1252"  # encoding of text that is not UTF-8: that of Windows in western Europe and America
 _TRUTH = {"true": 1.0, "false": 0.0, "yes": 1.0, "no": 0.0, "on": 1.0, "off": 0.0}
 _BYTE_ORDER_MARKS = {codecs.BOM_UTF8: "utf-8-sig", codecs.BOM_UTF16_LE: "utf-16", codecs.BOM_UTF16_BE: "utf-16"}
-_N_SAMPLED = 400  # lines that show how a table is written
-_MAX_BAD_SHARE = 0.05  # of lines or cells that are left out; more say that the table is understood wrongly
-_MIN_BAD = 3
+_N_SAMPLED = 400  # lines from which the dialect is detected
+_MAX_BAD_SHARE = 0.05  # fraction of omitted lines or cells; more indicate a wrong dialect
+_MIN_BAD = 3  # omitted lines or cells that are always allowed
 _MAX_NAMED = 5
 _MONITOR = re.compile(r"^(\d{1,2}:\d\d:\d\d(?:[.,]\d+)?) -> ?")  # time stamps of the Arduino IDE's monitor
 _GARBAGE = re.compile("^[\x00-\x08\x0e-\x1f\x7f-\xff\ufffd]*[\x00-\x08\x0e-\x1f\xfe\xff\ufffd]")  # sent while booting
@@ -47,16 +45,16 @@ _THOUSANDS = re.compile(r"[-+]?\d{1,3}(,\d{3})+(\.\d*)?")
 
 @dataclass(frozen=True)
 class _Dialect:
-    """How a table is written."""
+    """Format of a table."""
 
     separator: str
     decimal_comma: bool
-    header: int  # number of the line of names; 0 without one
+    header: int  # number of the line of names, from 1; 0 if there is none
     first: int  # number of the first line of values
-    width: int  # usual number of values in a line; a header may name more
+    width: int  # most frequent number of values in a line; a header may have more
     names: list[str]
     units: list[str]
-    dates: frozenset[int]  # columns of dates or times of day
+    dates: frozenset[int]  # indices of columns of dates or times of day
 
 
 @dataclass
@@ -64,13 +62,13 @@ class Table:
     """A table whose columns are read by their indices.
 
     Attributes:
-        path: of the file.
-        encoding: of its text.
-        names: of the columns; numbers from 1 without a header.
-        units: of the columns, from a line below the header; "" without.
-        rows: first cells of the table, for people.
-        dialect: how it is written.
-        notes: what was left out in reading, each in one line.
+        path: the file.
+        encoding: encoding of its text.
+        names: names of the columns; numbers from 1 if there is no header.
+        units: units of the columns, from a line below the header; "" if there is none.
+        rows: cells of the first lines, for people.
+        dialect: format of the table.
+        notes: what was omitted in reading, a line each.
     """
 
     path: Path
@@ -95,17 +93,17 @@ class Table:
         """Return columns of numbers.
 
         Args:
-            columns: indices.
-            may_be_unknown: columns in which `?` is UNKNOWN.
+            columns: indices of n columns.
+            may_be_unknown: indices of columns in which `?` is read as `UNKNOWN`.
 
         Returns:
-            (R, n), NaN where a value is missing; dates as seconds since 1970, or since midnight without a day.
+            Values (R, n), NaN where missing; dates as seconds since 1970, times of day as seconds since midnight.
         """
         dialect, width = self.dialect, len(self.names)
         numbers, self._lines, self.notes = array("d"), array("q"), []
         dates: dict[int, list[str]] = {column: [] for column in columns if column in dialect.dates}
-        words: dict[int, dict[int, str]] = {column: {} for column in columns}  # by column and line, what is no number
-        torn: list[tuple[int, int]] = []
+        words: dict[int, dict[int, str]] = {column: {} for column in columns}  # invalid cells by column and line
+        torn: list[tuple[int, int]] = []  # lines with a wrong number of values, and that number
         n_headers, last = 0, 0
         garbled: list[int] = []
         for line, row in _split(_iterate_lines(self.path, self.encoding, garbled=garbled), dialect.separator):
@@ -113,7 +111,7 @@ class Table:
                 continue
             last = line
             cells = [cell.strip() for cell in row]
-            if len(cells) != width and not any(cells[width:]):
+            if len(cells) != width and not any(cells[width:]):  # drop empty cells, or fill columns of a wider header
                 cells = cells[:width] if len(cells) != dialect.width else cells + [""] * (width - dialect.width)
             if len(cells) != width:
                 torn.append((line, len(cells)))
@@ -126,10 +124,8 @@ class Table:
                 for column in columns:
                     if column in dates:
                         dates[column].append(cells[column])
-                        numbers.append(np.nan)
-                        continue
-                    value = _parse(cells[column], dialect, column in may_be_unknown)
-                    if value is None:
+                        value = np.nan  # filled in below
+                    elif (value := _parse(cells[column], dialect, column in may_be_unknown)) is None:
                         words[column][line], value = cells[column], np.nan
                     numbers.append(value)
         if not self._lines:
@@ -145,7 +141,7 @@ class Table:
         return values
 
     def _report(self, words: dict[int, dict[int, str]], torn: list[tuple[int, int]], n_headers: int, last: int) -> None:
-        """Note what was left out; raise InputError if it is too much."""
+        """Add notes on what was omitted; raise InputError if it is too much."""
         limit = max(_MIN_BAD, _MAX_BAD_SHARE * len(self._lines))
         if len(torn) > limit:
             line, n_values = torn[0]
@@ -168,7 +164,7 @@ class Table:
 
 
 def name_lines(lines: Sequence[int]) -> str:
-    """Name lines by their numbers and how many more there are, as "line 3 is" or "lines 3, 4 and 2 more are"."""
+    """Name lines by their numbers, as "line 3 is" or "lines 3, 4 and 2 more are"."""
     named = ", ".join(map(str, lines[:_MAX_NAMED]))
     more = f" and {len(lines) - _MAX_NAMED} more" if len(lines) > _MAX_NAMED else ""
     return f"lines {named}{more} are" if len(lines) > 1 else f"line {named} is"
@@ -178,11 +174,11 @@ def read_table(path: Path, encoding: str = "") -> Table:
     """Open a table; its columns are read by `Table.read_columns`.
 
     Args:
-        path: of the file.
-        encoding: of its text; by default by its byte order mark, else UTF-8, else Windows' cp1252.
+        path: the file.
+        encoding: encoding; by default that of the byte order mark, UTF-8 if valid, or Windows' cp1252.
 
     Raises:
-        InputError: it cannot be read, or is no text.
+        InputError: the file cannot be read, or is not text.
     """
     encoding = encoding or _find_encoding(check_file(path, MAX_BYTES))
     sample = list(islice(_iterate_lines(path, encoding, comments=True), _N_SAMPLED))
@@ -226,11 +222,12 @@ def _find_encoding(path: Path) -> str:
 def _iterate_lines(
     path: Path, encoding: str, comments: bool = False, garbled: list[int] | None = None
 ) -> Iterator[tuple[int, str]]:
-    """Yield the lines of a file that hold anything, with their numbers from 1; comments begin with #.
+    """Yield the lines of a file that are not blank, with their numbers from 1; comments begin with #.
 
-    Bytes that are no text, of a board that boots or a card that lost power, are left out; `garbled` gets their lines.
+    Bytes that are not text, from the boot of a board or a card that lost power, are omitted; their line numbers are
+    added to `garbled`.
     """
-    errors = "replace" if encoding == FALLBACK else "strict"  # a few of its bytes are nothing
+    errors = "replace" if encoding == FALLBACK else "strict"  # some bytes of cp1252 are undefined
     with _readable(path), path.open(encoding=encoding, errors=errors) as file:
         for number, line in enumerate(file, 1):
             text = _GARBAGE.sub("", line).replace("\0", "")
@@ -242,12 +239,12 @@ def _iterate_lines(
 
 
 def _split(lines: Iterator[tuple[int, str]], separator: str) -> Iterator[tuple[int, list[str]]]:
-    """Yield the cells of lines, with the number of the last line of each row: a quoted cell may go over several."""
+    """Yield the cells of each row with the number of its last line; quoted cells may span several lines."""
     number = 0
 
     def texts() -> Iterator[str]:
         nonlocal number
-        for number, line in lines:  # noqa: B007  it is that of the row below
+        for number, line in lines:  # noqa: B007  the number is yielded below
             line = _MONITOR.sub(rf"\1{separator}", line)
             yield " ".join(line.split()) if separator == " " else line
 
@@ -262,17 +259,17 @@ def _find_dialect(sample: list[tuple[int, str]]) -> _Dialect:
     if lines and re.fullmatch(r"\W?sep=.\W*", lines[0][1]):  # Excel writes it, in quotes or not
         separator, first = lines[0][1].strip('"')[4], 1
     lines = lines[first:]
-    split = {each: list(_split(iter(lines), each)) for each in separator or SEPARATORS}
-    separator = max(split, key=lambda each: _n_values([row for _, row in split[each]]))
-    rows = [(number, [cell.strip() for cell in row]) for number, row in split[separator]]
-    # 1. columns of values, and the first line that holds nothing else in them
+    candidates = {candidate: list(_split(iter(lines), candidate)) for candidate in separator or SEPARATORS}
+    separator = max(candidates, key=lambda candidate: _n_values([row for _, row in candidates[candidate]]))
+    rows = [(number, [cell.strip() for cell in row]) for number, row in candidates[separator]]
+    # 1. Find the columns of values, and the first line with values only in them.
     width = _width([row for _, row in rows])
     table = [row for _, row in rows if len(row) == width]
     shares = [np.mean([_is_value(cell) for cell in cells if cell] or [True]) for cells in zip(*table, strict=True)]
     is_first = (len(row) == width and any(map(_is_number, row)) and _fits(row, shares) for _, row in rows)
     start = next((i for i, is_data in enumerate(is_first) if is_data), len(rows))
     number = rows[start][0] if start < len(rows) else (rows[-1][0] + 1 if rows else 1)
-    # 2. the lines of names and units before it
+    # 2. Find the lines of names and units before it.
     header, names, units = _find_names(rows[:start], width, [item for item in comments if item[0] < number], separator)
     unnamed = list(zip(*table, strict=True))[len(names) :]
     columns = list(zip(*[row for _, row in rows[start:] if len(row) == width], strict=True))
@@ -281,7 +278,7 @@ def _find_dialect(sample: list[tuple[int, str]]) -> _Dialect:
         names, unnamed = [match[1] for match in measured if match], []
     units = units or [(match and match[3]) or "" for match in measured]
     names += ["" if header and not any(cells) else str(len(names) + i) for i, cells in enumerate(unnamed, 1)]
-    # 3. how numbers are written
+    # 3. Find the format of numbers and dates.
     values = [match[2] for _, row in rows[start:] for cell in row if (match := _MEASURED.fullmatch(cell))]
     has_comma = any(re.fullmatch(r"[-+]?\d*,\d+", value) for value in values)
     has_point = any(re.fullmatch(r"[-+]?\d*\.\d+", value) for value in values)
@@ -303,7 +300,7 @@ def _find_dialect(sample: list[tuple[int, str]]) -> _Dialect:
 def _find_names(
     rows: list[tuple[int, list[str]]], width: int, comments: list[tuple[int, str]], separator: str
 ) -> tuple[int, list[str], list[str]]:
-    """Return the line of names among the rows above the values, or the last comment, its names, and units below it."""
+    """Return the number of the line of names above the values, or of the last comment, its names, and the units."""
     above = [(line, row) for line, row in rows if 2 * sum(map(bool, row)) >= width]
     while above and len(above[-1][1]) == width != len(above[0][1]):
         above.pop(0)
@@ -319,13 +316,13 @@ def _find_names(
 
 
 def _n_values(rows: list[list[str]]) -> int:
-    """Return the number of values in the rows of usual width; 0 of one column."""
+    """Return the number of values in the rows of the most frequent width; 0 for a single column."""
     width = _width(rows)
     return sum(_is_number(cell) for row in rows if len(row) == width for cell in row) if width > 1 else 0
 
 
 def _width(rows: list[list[str]]) -> int:
-    """Return the usual number of cells of rows that hold numbers."""
+    """Return the most frequent number of cells in rows with numbers."""
     widths = Counter(len(row) for row in rows if any(map(_is_number, row))) or Counter(map(len, rows))
     return widths.most_common(1)[0][0] if widths else 0
 
@@ -348,11 +345,11 @@ def _is_value(cell: str) -> bool:
 
 
 def _parse(cell: str, dialect: _Dialect, may_be_unknown: bool) -> float | None:
-    """Return the number of a cell, NaN of one that is missing; None of one that is neither."""
+    """Return the number in a cell, NaN if it is missing, None for anything else."""
     try:
         value = float(cell)
         if value - value == 0 and "_" not in cell and not (dialect.decimal_comma and "." in cell):
-            return value  # most cells
+            return value  # the fast path of most cells
     except ValueError:
         pass
     word = cell.lower()
@@ -377,15 +374,15 @@ def _parse(cell: str, dialect: _Dialect, may_be_unknown: bool) -> float | None:
 
 
 def _parse_dates(texts: list[str], what: str) -> Array:
-    """Return (R,) dates in s since 1970, or times of day in s since midnight; NaN where one is missing."""
+    """Return dates as seconds since 1970, or times of day as seconds since midnight; shape (R,), NaN where missing."""
     texts = [text.replace(",", ".") for text in texts]
     clocks = [_CLOCK.fullmatch(text) for text in texts]
     if any(clocks):
-        parts = [[float(part or 0) for part in clock.groups()] if clock else [np.nan] * 3 for clock in clocks]
-        return np.array(parts) @ [3600.0, 60.0, 1.0]
+        fields = [[float(text or 0) for text in clock.groups()] if clock else [np.nan] * 3 for clock in clocks]
+        return np.array(fields) @ [3600.0, 60.0, 1.0]
     try:
         times = np.array([text.removesuffix("Z") or "NaT" for text in texts], "datetime64[ns]")
-    except ValueError:  # not as ISO 8601 has them
+    except ValueError:  # not ISO 8601
         try:
             import pandas
         except ImportError as error:

@@ -29,7 +29,6 @@ KIND = "hand"  # kind of source of such a recording, whose depths are unknown
 # A uniform plan is ordered by short distances within rounds of this many targets. Each round covers the whole pad, so
 # that a session may end early, and drift with time is not confused with position.
 ROUND = 25
-TRAIL = 12  # latest presses in the view
 UNKNOWN = (np.nan, np.nan)  # position of a rejected press
 COMMANDS = (
     {"key": "b", "command": "back", "text": "Take the last press back"},
@@ -470,7 +469,7 @@ class HandSession:
             "rejected": self._rejected_mm,
             "done": done,
             "total": done + len(sequence.remaining),
-            "presses": [{"x_mm": x, "y_mm": y} for x, y in sequence.accepted_mm[-TRAIL:]],
+            "presses": [{"x_mm": x, "y_mm": y} for x, y in sequence.accepted_mm[-12:]],
             "fibres": [
                 {"swing": None, "state": "missing"} if np.isnan(swing) else {"swing": round(swing, 3), "state": ""}
                 for swing in swings.tolist()

@@ -36,7 +36,6 @@ from padforge.sense.settings import SIMULATED, Millimetres, RigSettings
 
 FABRICATION_FILE = "fabrication.json"
 FABRICATION_FORMAT = "padforge-fabrication/1"
-_ROUNDING_MM = 1e-6
 
 KIND = "rig"  # kind of source of a recording that an arm pressed
 _PLAN_KEYS = ("presses", "plan", "seed")
@@ -138,7 +137,7 @@ def locate_on_bed(rig: RigSettings, folder: Path) -> RigSettings:
     box = (
         *(max(x - half_x, dx), min(x + half_x, width + dx)),
         *(max(y - half_y, dy), min(y + half_y, depth + dy)),
-        *(max(contact - rig.max_depth_mm, frame.walls_mm) - _ROUNDING_MM, height + dz),
+        *(max(contact - rig.max_depth_mm, frame.walls_mm) - 1e-6, height + dz),
     )
     return rig.model_copy(
         update={
@@ -185,11 +184,11 @@ def read_source(config: RigConfig, rig: RigSettings, kind: str) -> dict[str, Any
         raise InputError(f"{config.out}: has no plan, so that it cannot be resumed")
     if source.get("kind") != kind:
         raise InputError(f"{config.out}: holds a recording of kind {source.get('kind')!r}, not {kind!r}")
-    now = _settings_and_pad(config, rig)
-    if source.get("morphology") != now["morphology"]:
+    current = _settings_and_pad(config, rig)
+    if source.get("morphology") != current["morphology"]:
         raise InputError(f"{config.out}: was begun with another pad than the one given")
-    for key in sorted(now["rig"].keys() - _CHANGEABLE):
-        if (stored := _get(source.get("rig"), key)) != (value := now["rig"][key]):
+    for key in sorted(current["rig"].keys() - _CHANGEABLE):
+        if (stored := _get(source.get("rig"), key)) != (value := current["rig"][key]):
             raise InputError(f"[rig] {key}: got {value}, the recording in {config.out} was begun with {stored}")
     return source
 

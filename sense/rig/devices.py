@@ -24,8 +24,7 @@ from padforge.common.validation import Fault, InputError
 from padforge.sense.arrays import Array, Indices
 from padforge.sense.rig import clock
 
-Pose = tuple[float, float, float, float, float, float]
-"""x, y, z in mm and a rotation vector in radians."""
+Pose = tuple[float, float, float, float, float, float]  # x, y, z in mm and a rotation vector in radians
 Cause = Literal["refused", "lost", "stale", "protective_stop", "emergency_stop", "deadline", "force", "data", "disk"]
 Group = Literal["padforge.arms", "padforge.boards"]
 ROOT = Path(padforge.__file__).parents[1]

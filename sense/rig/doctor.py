@@ -16,10 +16,7 @@ Status = Literal["ok", "warn", "fail"]
 
 OBSERVE_S = 2.0  # duration of the observation of each device
 _DEAD_V = 0.02  # a channel closer than this to either end of the range is open, shorted or saturated
-_STUCK_V = 1e-6  # minimum standard deviation: an ADC that reads a fibre shows some noise
-_NOISY_V = 0.02  # maximum standard deviation
 _LATE_S = 0.1  # maximum latency, age or gap
-_RATE_TOLERANCE = 0.01  # relative
 
 
 @dataclass(frozen=True)
@@ -43,7 +40,7 @@ def examine_board(board: Board) -> list[Diagnosis]:
         board.close()
     rate_hz = (len(times_s) - 1) / (times_s[-1] - times_s[0]) if len(times_s) > 1 else 0.0
     nominal_hz = float(identity.get("rate_hz", rate_hz))
-    is_on_rate = abs(rate_hz / nominal_hz - 1) < _RATE_TOLERANCE
+    is_on_rate = abs(rate_hz / nominal_hz - 1) < 0.01
     inputs, supply_v = identity["inputs"], identity.get("supply_v", np.inf)
     return [
         Diagnosis("board", "warn" if "warning" in identity else "ok", _identity_text(identity)),
@@ -124,9 +121,9 @@ def _examine_channel(number: int, board_input: int, volts: Array, supply_v: floa
         return Diagnosis(name, "fail", f"{text}: dead, open or shorted to ground")
     if baseline > supply_v - _DEAD_V:
         return Diagnosis(name, "fail", f"{text}: saturated, or shorted to the supply")
-    if noise < _STUCK_V:
+    if noise < 1e-6:  # an ADC that reads a fibre shows some noise
         return Diagnosis(name, "warn", f"{text}: never changes")
-    if noise > _NOISY_V:
+    if noise > 0.02:
         return Diagnosis(name, "warn", f"{text}: noisy, look at its contacts")
     return Diagnosis(name, "ok", text)
 

@@ -261,23 +261,29 @@ def diagnose(kind: str, config: RigConfig, inputs: Sequence[int]) -> list[Diagno
     """
     ports = [f"{port.device} ({port.description})" for port in host_ports() if port.vid is not None]
     diagnoses = [Diagnosis("ports", "ok", ", ".join(ports) or "no board seen on USB")]
+    if kind == "hand":
+        return diagnoses + examine_board(make_board(config.rig, inputs))
     try:
         diagnoses += examine_board(make_board(config.rig, inputs))
     except RigFault as fault:
-        if kind == "hand":
-            raise
         diagnoses.append(Diagnosis("board", "fail", str(fault)))
-    if kind == "hand":
-        return diagnoses
+    return diagnoses + _diagnose_arm(kind, config, inputs)
+
+
+def _diagnose_arm(kind: str, config: RigConfig, inputs: Sequence[int]) -> list[Diagnosis]:
+    """Diagnose an arm, and whether the pose of the pad on a printer's bed is known."""
     rig, location = config.rig.model_copy(update={"channels": tuple(inputs)}), []
-    try:
-        if kind == "printer":
+    if kind == "printer":
+        try:
             _check_ports(rig)
-            try:
-                rig = locate_on_bed(rig, config.folder)
-            except RigFault as fault:
-                location = [Diagnosis("place", "fail", str(fault))]
-        diagnoses += examine_arm(load_device("padforge.arms", kind)(rig), rig)
+        except RigFault as fault:
+            return [Diagnosis("arm", "fail", str(fault))]
+        try:
+            rig = locate_on_bed(rig, config.folder)
+        except RigFault as fault:
+            location = [Diagnosis("place", "fail", str(fault))]
+    try:
+        arm = load_device("padforge.arms", kind)(rig)
     except RigFault as fault:
-        diagnoses.append(Diagnosis("arm", "fail", str(fault)))
-    return diagnoses + location
+        return [Diagnosis("arm", "fail", str(fault)), *location]
+    return examine_arm(arm, rig) + location

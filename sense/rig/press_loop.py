@@ -39,8 +39,6 @@ from padforge.sense.settings import RigSettings
 
 _READING_DEADLINE_S = 3.0  # longest wait for a reading
 _DISK_DEADLINE_S = 30.0  # longest wait for the disk
-_SETTLE_S = 0.1  # time after which the state of an arm that refused a move shows the reason
-_N_RECENT = 4096  # latest readings whose times are stored, to find the first reading after a command
 
 
 class DiskThread(ThreadPoolExecutor):
@@ -129,7 +127,7 @@ class PressLoop:
         ratio = max(1, round(rig.board_rate_hz / rig.rate_hz))
         self._half_s = rig.readings_per_press / 2 * ratio / rig.board_rate_hz  # half the cycle of a press
         self._averager = Averager(ratio, recorder.fibres)
-        self._recent: deque[float] = deque(maxlen=_N_RECENT)
+        self._recent: deque[float] = deque(maxlen=4096)  # times of the latest readings
         self._disk, self._n_readings = DiskThread(), recorder.n_readings
         self._interrupts = Interrupts()
         self._zero_s = 0.0
@@ -212,7 +210,7 @@ class PressLoop:
         try:
             self._arm.move(pose, speed_mm_s, self._rig.acceleration_mm_s2)
         except RigFault:
-            clock.sleep(_SETTLE_S)  # if the arm was just stopped, the next state shows the reason
+            clock.sleep(0.1)  # if the arm was just stopped, the next state shows the reason
             check_state(self._arm.state(), self._limits, clock.now())
             raise
 

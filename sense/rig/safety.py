@@ -23,7 +23,6 @@ MAX_TILT_DEG = 2.0  # between the expected tool axis and a target's
 MAX_TURN_DEG = 45.0  # about that axis, between the first target and the tool before the first move
 TCP_TOLERANCE_MM = 0.1
 MAX_STATE_AGE_S = 0.5
-STILL_MM_S = 1.0  # maximum speed of an arm at rest
 DEPTH_TOLERANCE_MM = 0.3  # excess of a moving tip over the maximum depth, by noise and overshoot
 POLL_S = 0.004  # between two states
 
@@ -151,7 +150,7 @@ def check_target(pose: Sequence[float], speed_mm_s: float, acceleration_mm_s2: f
 
 
 def check_start_state(state: ArmState, limits: Limits) -> None:
-    """Raise RigFault("refused") if the first move would turn tool and cable too far, or the arm measures no force."""
+    """Raise RigFault("refused") if the first move would turn the tool too far, or a limited force is not measured."""
     if not (turn := turn_deg(state.pose[3:], limits.tool)) <= MAX_TURN_DEG:
         _refuse(f"the tool is held {turn:.0f} degrees away from [rig] tool_rad", f"at most {MAX_TURN_DEG:g}")
     if state.force_n is None and limits.max_force_n is not None:
@@ -211,7 +210,7 @@ def wait_until_still(
         while True:
             state = arm.state()
             check_state(state, limits, clock.now(), until_s)
-            if not state.moving and state.speed_mm_s <= STILL_MM_S:
+            if not state.moving and state.speed_mm_s <= 1.0:
                 return state
             on_wait()
             clock.sleep(POLL_S)

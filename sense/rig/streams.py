@@ -20,7 +20,6 @@ from padforge.sense.settings import RigSettings
 HISTORY = SLOW[-1]  # readings before a press that the history features depend on
 SLACK = 4096  # readings beyond HISTORY, since a press is detected some readings after its start
 PAUSE_S = 0.01  # between two polls of a board, or of the clock of a replay
-MAX_BLOCK = 64  # readings in a block of a replay, so that a fast one can be watched
 RECORDED = "recording"  # name of the training recording in the folder of a model
 
 Block = tuple[Array, Array]  # times (n,) in s, and readings (n, C) in V
@@ -120,7 +119,7 @@ def stream_recording(recording: Recording, speed: float) -> ReadingStream:
         started_s, done = clock.now(), 0
         while done < len(due_s):
             due = int(np.searchsorted(due_s, clock.now() - started_s, side="right"))
-            end = min(due, done + MAX_BLOCK)
+            end = min(due, done + 64)  # short blocks, so that a fast replay can be watched
             yield recording.times_s[done:end], recording.readings[done:end]
             if end == due:
                 clock.sleep(PAUSE_S)

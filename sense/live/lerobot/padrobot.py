@@ -1,6 +1,6 @@
-"""A robot of LeRobot with a pad: another robot whose observations a pad's are added to, or a pad alone.
+"""A robot of LeRobot with a pad: another robot with the observations of a pad added, or a pad alone.
 
-LeRobot looks for the class of a robot by that of its config, without `Config`, in a module of that name in lower case.
+LeRobot finds the class of a robot by the name of its config without `Config`, in a module of that name in lower case.
 """
 
 from dataclasses import dataclass
@@ -19,16 +19,16 @@ from padforge.sense.settings import RigSettings
 @RobotConfig.register_subclass("padforge")
 @dataclass(kw_only=True)
 class PadRobotConfig(RobotConfig):
-    """Options of the pad, which are those of `padforge sense live`, and of the robot beside it."""
+    """Options of the pad, those of `padforge sense live`, and of the other robot."""
 
     model: Path = Path("out/pad")
     rig: str = "simulated"
     spec: Path | None = None
-    robot: dict[str, Any] | None = None  # type and options; a `RobotConfig` would contain options of itself without end
+    robot: dict[str, Any] | None = None  # type and options; a `RobotConfig` would be recursive
 
 
 class PadRobot(Robot):
-    """The robot of `config.robot` with observations `pad.NAME` beside its own; actions are that robot's."""
+    """The robot of `config.robot` with additional observations `pad.NAME`; actions are those of that robot."""
 
     config_class = PadRobotConfig
     name = "padforge"
@@ -39,8 +39,8 @@ class PadRobot(Robot):
         robot = None if config.robot is None else draccus.decode(RobotConfig, config.robot)
         self._robot = None if robot is None else make_robot_from_config(robot)
         self._pad_features = {f"pad.{name}": float for name in self._sensor.names}
-        if self._robot is not None and (both := self._pad_features.keys() & self._robot.observation_features.keys()):
-            raise InputError(f"--robot.robot has an observation {min(both)}, which is the pad's")
+        if self._robot is not None and (common := self._pad_features.keys() & self._robot.observation_features.keys()):
+            raise InputError(f"--robot.robot has an observation {min(common)}, which is the pad's")
 
     @property
     def cameras(self) -> dict[str, Any]:
@@ -63,7 +63,7 @@ class PadRobot(Robot):
         return self._robot is None or self._robot.is_calibrated
 
     def connect(self, calibrate: bool = True) -> None:
-        self._sensor.connect()  # first, so that no arm is powered for a pad that is not there
+        self._sensor.connect()  # first, so that no arm is powered if the pad is missing
         if self._robot is not None:
             try:
                 self._robot.connect(calibrate)

@@ -44,12 +44,7 @@ SETTINGS = ("G21", "G90", "M220 S100", "M211 S1", "M84 S0")
 
 _POLL_S = 0.03  # pause between two requests for the position
 _TOLERANCE_MM = 0.05  # of a position at rest: its last decimal and one motor step
-_MAX_STATES = 100_000  # states buffered for `drain`
-_MOVE_TIMEOUT_S = 0.8
-_STOP_TIMEOUT_S = 0.3
 _START_S = 0.1  # time for which a firmware waits for further moves before it starts the first
-_MAX_DELAY_S = 1.2  # beyond the duration that the axes' limits give
-_MAX_OFFSET_MM = 1.0  # distance from the straight path during a move
 _MAX_IMPLAUSIBLE = 3  # implausible positions in a row; fewer are noise
 
 
@@ -73,7 +68,7 @@ class NozzleThread(threading.Thread):
         self._move: StraightMove | None = None
         self._move_start_s, self._acceleration, self._n_implausible = 0.0, 0.0, 0
         self._commands: queue.Queue[tuple[Callable[[], None], Future[None]]] = queue.Queue()
-        self._states: deque[NozzleState] = deque(maxlen=_MAX_STATES)
+        self._states: deque[NozzleState] = deque(maxlen=100_000)  # for `drain`
         self._ending = threading.Event()
         self.fault: RigFault | None = None  # why the position is unknown, if it is
         self.latest = NozzleState(clock.now(), position, 0.0, False)
@@ -99,14 +94,14 @@ class NozzleThread(threading.Thread):
 
     def move(self, end: Position, speed_mm_s: float, acceleration_mm_s2: float) -> None:
         """Start a straight move; return as soon as the firmware has confirmed its target, or raise RigFault."""
-        self._submit(lambda: self._start_move(end, speed_mm_s, acceleration_mm_s2), _MOVE_TIMEOUT_S)
+        self._submit(lambda: self._start_move(end, speed_mm_s, acceleration_mm_s2), timeout_s=0.8)
 
     def stop(self) -> None:
         """Stop the current move; if the quick stop is not confirmed, halt the printer and raise RigFault("lost")."""
         if self._move is None or self._link.halted:
             return
         try:
-            self._submit(self._quick_stop, _STOP_TIMEOUT_S)
+            self._submit(self._quick_stop, timeout_s=0.3)
         except RigFault:
             self._link.send_unnumbered("M112")
             self._move = None
@@ -180,8 +175,8 @@ class NozzleThread(threading.Thread):
                 self._stop_at(move.end)
                 return
             position = move.position(elapsed_s - _START_S)  # the firmware reports no real-time position
-        late = elapsed_s > move.duration_s + _MAX_DELAY_S
-        implausible = late or move.distance_mm(position) > _MAX_OFFSET_MM
+        is_late = elapsed_s > move.duration_s + 1.2
+        implausible = is_late or move.distance_mm(position) > 1.0  # from the straight path
         self._n_implausible = self._n_implausible + 1 if implausible else 0
         if self._n_implausible >= _MAX_IMPLAUSIBLE:
             self._raise_displaced(f"is at {_format(position)}", move.end)

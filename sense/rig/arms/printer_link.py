@@ -24,8 +24,6 @@ _RESEND = re.compile(r"^(?:Resend:|rs) ?N?(\d+)$")
 _READ_S = 0.01  # longest wait for bytes
 _RESEND_S = 0.08  # time without a line after which the command is sent again
 _SILENCE_S = 0.03  # silence after which all answers to repeated lines have come
-_MAX_HISTORY = 8  # lines that can be sent again
-_MAX_BAD_RESENDS = 4  # requests for lines outside the history; fewer are noise
 
 
 def checksum(text: bytes) -> int:
@@ -92,7 +90,7 @@ class MarlinLink:
         _keep_running(self._stream.serial)
         self._text = b""
         self._number = 0
-        self._history: deque[bytes] = deque(maxlen=_MAX_HISTORY)
+        self._history: deque[bytes] = deque(maxlen=8)  # lines that can be sent again
         self._connected = False
         self.halted = False  # or restarted: the printer takes no moves any more
 
@@ -140,7 +138,7 @@ class MarlinLink:
                     if n_sent > 1:
                         list(self._read_until_silent())
                     return answer
-            if n_bad_resends >= _MAX_BAD_RESENDS:
+            if n_bad_resends >= 4:  # fewer are noise
                 message = f"{self._port}: the printer asks for line {requested}, not {self._number}"
                 raise RigFault("lost", message, HOMING_ADVICE)
         advice = "it may be busy: look at its display"

@@ -21,14 +21,10 @@ from padforge.sense.rig.devices import ArmState, Array, Cause, Pose, RigFault, s
 from padforge.sense.rig.safety import check_finite_move
 from padforge.sense.settings import RigSettings
 
-MAX_STATES = 300_000  # states buffered for `drain`: 10 minutes at 500 Hz
-HEARTBEAT_S = 0.05  # period
 SUPERVISION_S = 2.0  # heartbeats end this long after the program last asked for a state
 CONNECT_S = 4.5  # longest wait for the link
 MOVE_S = 1.0  # longest wait for the arm to accept a move
 STALE_S = 0.5  # maximum age of a state
-CONFIRM_S = 0.25  # longest wait for the worker to confirm a stop; then the dashboard is asked
-DASHBOARD_S = 0.2  # longest wait for the dashboard to confirm a stop
 
 
 class RtdeWorker:
@@ -41,7 +37,7 @@ class RtdeWorker:
         self.stopped = False  # whether the arm's dashboard confirmed a stop after the worker's end
         self._replies: dict[int, dict[str, Any]] = {}
         self._ids = itertools.count(1)
-        self._states: deque[ArmState] = deque(maxlen=MAX_STATES)
+        self._states: deque[ArmState] = deque(maxlen=300_000)  # for `drain`: 10 minutes at 500 Hz
         self._received = threading.Condition()
         self._supervised_s = clock.now()
         self._killed = threading.Event()
@@ -89,7 +85,7 @@ class RtdeWorker:
 
     def stop_program(self) -> bool:
         """Stop the arm through its dashboard once the worker has ended; return whether the stop is confirmed."""
-        self.stopped = self.stopped or stop_program(self._host, DASHBOARD_S)
+        self.stopped = self.stopped or stop_program(self._host, timeout_s=0.2)
         return self.stopped
 
     def _write(self, line: bytes) -> None:
@@ -100,7 +96,7 @@ class RtdeWorker:
             raise self.fault or RigFault("lost", f"the link to the arm {self._host} is down", "connect again") from None
 
     def _send_heartbeats(self) -> None:
-        while not self._killed.wait(HEARTBEAT_S) and not self.fault:
+        while not self._killed.wait(0.05) and not self.fault:
             if clock.now() < self._supervised_s + SUPERVISION_S:
                 with suppress(RigFault):
                     self._write(b"")
@@ -211,7 +207,7 @@ class UR5:
         if self._worker is None or self._worker.stopped:
             return
         try:
-            self._worker.request("stop", timeout_s=CONFIRM_S)
+            self._worker.request("stop", timeout_s=0.25)
         except RigFault:
             if not self._abandon():
                 reason = f"the arm {self._host} did not confirm the stop"

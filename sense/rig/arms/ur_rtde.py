@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from importlib.metadata import version
 from typing import Any
 
-WATCHDOG_HZ = 4.0  # minimum rate of kicks; the arm stops if they come more slowly
 STOP_M_S2 = 5.0  # deceleration
 OPERATION = 0x7F << 24  # bits of ur-rtde's progress register: number of the operation
 UNDER_WAY = 1 << 15  # bit of the same register: the operation is in progress
@@ -26,7 +25,7 @@ class UrRtdeControl:
         self._progress = 0  # latest value of the register
         self._previous_operation = 0  # number of the operation before the current move
         self._control: Any = rtde_control.RTDEControlInterface(host)
-        if not self._control.setWatchdog(WATCHDOG_HZ):
+        if not self._control.setWatchdog(4.0):  # Hz, minimum rate of kicks
             raise RuntimeError("it does not take a watchdog")
         self.identity: dict[str, Any] = {"driver": f"ur-rtde {version('ur-rtde')}"}
 

@@ -17,9 +17,7 @@ SETTLE_S = 0.5  # time of blocks before the first samples are returned, so that 
 BUFFER_S = 60.0  # time of samples that are buffered for a program that does not read
 
 _START_S = 1.5  # longest wait for settled times
-_STALL_S = 1.0  # maximum silence of a board
 _BUCKET_S = 1.0  # of the arrivals in a bucket only the one with the minimum delay counts
-_MAX_BUCKETS = 60
 _MIN_STEP = 0.5  # between two returned times while the fitted line changes, in periods
 _MAX_STEP = 1.5  # the same
 
@@ -103,7 +101,7 @@ class BlockReader(threading.Thread):
                     self._n_buffered += len(block)
                 if self._n_buffered > self._capacity:
                     raise RigFault("data", f"{self._port}: nobody has read the samples for {BUFFER_S:g} s")
-            if silent_s > _STALL_S:
+            if silent_s > 1.0:
                 raise RigFault("stale", f"{self._port}: no sample for {silent_s:.1f} s", "reset the board")
 
 
@@ -178,12 +176,12 @@ class SampleClock:
 
     def __init__(self, period_s: float, max_skew: float) -> None:
         self._period_s, self._max_skew = period_s, max_skew
-        self._origin: tuple[int, float] | None = None
-        self._bucket_min: Point | None = None
-        self._buckets: deque[Point] = deque(maxlen=_MAX_BUCKETS)
-        self._offset = 0.0
-        self._slope = 0.0
-        self._last: tuple[int, float] | None = None
+        self._origin: tuple[int, float] | None = None  # index and arrival of the first block
+        # Points are (nominal time, delay), s; the fitted line is delay = offset + slope * nominal time.
+        self._bucket_min: Point | None = None  # of the current bucket
+        self._buckets: deque[Point] = deque(maxlen=60)  # minima of complete buckets
+        self._offset = self._slope = 0.0
+        self._last: tuple[int, float] | None = None  # index and time returned last
 
     def observe(self, index: int, arrival_s: float) -> None:
         """Add the arrival of a block whose last sample, or clock, has this unwrapped index."""
@@ -192,15 +190,13 @@ class SampleClock:
         start, start_s = self._origin
         nominal_s = (index - start) * self._period_s
         delay_s = arrival_s - start_s - nominal_s
+        minimum = self._bucket_min
+        is_new_bucket = minimum is None or nominal_s // _BUCKET_S > minimum[0] // _BUCKET_S
+        if minimum is not None and is_new_bucket:
+            self._buckets.append(minimum)
+            self._offset, self._slope = _fit_lower_line(list(self._buckets), self._max_skew)
         residual = delay_s - self._slope * nominal_s
-        lowest = self._bucket_min
-        if lowest is None or nominal_s // _BUCKET_S > lowest[0] // _BUCKET_S:
-            if lowest is not None:
-                self._buckets.append(lowest)
-                self._offset, self._slope = _fit_lower_line(list(self._buckets), self._max_skew)
-                residual = delay_s - self._slope * nominal_s
-            self._bucket_min = (nominal_s, delay_s)
-        elif residual < lowest[1] - self._slope * lowest[0]:
+        if minimum is None or is_new_bucket or residual < minimum[1] - self._slope * minimum[0]:
             self._bucket_min = (nominal_s, delay_s)
         self._offset = min(self._offset, residual)
 

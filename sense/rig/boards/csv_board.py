@@ -22,7 +22,6 @@ LISTEN_S = 2.0  # time in which columns and rate are measured
 _START_S = 1.5  # lines of this time are ignored: opening the port resets many boards, which print a greeting
 _RATE_TOLERANCE = 0.05  # relative, of a measured rate
 _MIN_LINES = 10  # within `LISTEN_S`
-_COUNTS_V = 50.0  # higher readings are probably counts of a converter
 _LABEL = re.compile(rb"[A-Za-z_]\w*[:=]")
 _SEPARATOR = re.compile(rb"[,;\t ]+")
 
@@ -81,6 +80,7 @@ class CsvBoard(SerialBoard):
         )
 
     def _start(self, stream: SerialStream) -> dict[str, Any]:
+        # 1. Listen, and ignore the greeting of a board that the opening of its port has reset.
         self._tail = b""
         received = bytearray()
         lines: list[tuple[float, list[float]]] = []
@@ -94,6 +94,7 @@ class CsvBoard(SerialBoard):
             if "lines" in message:
                 advice = f"it must print numbers alone, {_MIN_LINES / LISTEN_S:g} lines a second or more"
             raise RigFault("refused", f"{self._port}: {message}", advice)
+        # 2. Find the columns: the most frequent number of them, of which the first may be the time.
         self._width = Counter(len(numbers) for _, numbers in lines).most_common(1)[0][0]
         table = np.array([numbers for _, numbers in lines if len(numbers) == self._width])
         has_time = self._width > 1 and bool((np.diff(table[:, 0]) > 0).all())
@@ -102,6 +103,7 @@ class CsvBoard(SerialBoard):
             raise RigFault("refused", f"{self._port}: a line has {n_inputs} numbers, allowed is 1 to {MAX_FIBRES}")
         inputs = select_inputs(self._inputs, n_inputs)
         self._columns = [column + has_time for column in inputs]
+        # 3. Measure the rate, and start to read.
         rate_hz = _measure_rate(np.array([arrival_s for arrival_s, _ in lines]))
         if abs(rate_hz / self._rate_hz - 1) > _RATE_TOLERANCE:
             message = f"{self._port}: {rate_hz:.4g} lines come a second, [rig] says {self._rate_hz:g}"
@@ -111,18 +113,16 @@ class CsvBoard(SerialBoard):
         self._reader = BlockReader(self._port, lambda: self._receive_blocks(stream), rate_hz)
         self._reader.start_settled()
         level_v = float(np.median(np.abs(table[:, self._columns]))) * self._count_v
-        counts = (
-            f"; they rest at {level_v:.4g}: if that are counts, [rig] count_v is the volts of one"
-            if level_v > _COUNTS_V
-            else ""
-        )
+        warning = "its lines have no header and no check: what is damaged or lost is not seen"
+        if level_v > 50.0:  # probably counts of a converter
+            warning += f"; they rest at {level_v:.4g}: if that are counts, [rig] count_v is the volts of one"
         return {
             "channels": len(inputs),
             "inputs": list(inputs),
             "rate_hz": round(rate_hz, 3),
             "port": self._port,
             "time": "first column" if has_time else "none",
-            "warning": f"its lines have no header and no check: what is damaged or lost is not seen{counts}",
+            "warning": warning,
         }
 
     def _decode(self, data: bytes) -> list[list[float]]:

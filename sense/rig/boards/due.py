@@ -6,7 +6,6 @@ from padforge.sense.rig.boards.line_board import LineBoard
 from padforge.sense.rig.devices import RigFault, host_ports
 from padforge.sense.settings import RigSettings
 
-_VENDORS = (0x2341, 0x2A03)
 _PRODUCTS = (0x003E, 0x003D)  # native port; programming port, which cannot carry the data
 
 
@@ -30,5 +29,5 @@ def find_due_port(rig: RigSettings) -> str:
 
 def list_due_ports() -> list[str]:
     """Return the ports that look like a Due by their USB identity, native ones first; RigFault without pyserial."""
-    ports = [port for port in host_ports() if port.vid in _VENDORS and port.pid in _PRODUCTS]
+    ports = [port for port in host_ports() if port.vid in (0x2341, 0x2A03) and port.pid in _PRODUCTS]
     return [port.device for port in sorted(ports, key=lambda port: (_PRODUCTS.index(port.pid), port.device))]

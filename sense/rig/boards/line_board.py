@@ -26,17 +26,9 @@ _LIMITS = {  # of header fields; integer limits mean an integer field
     "channels": (1, MAX_FIBRES),
 }
 _ANSWER_S = 3.0  # longest wait for a header: opening the port resets many boards, and their boot loaders wait first
-_RESEND_S = 0.5  # period of the requests for it
-_RATE_TOLERANCE = 1e-3  # relative, between header and `[rig]`
-_MAX_RECEIVED = 1000  # latest bytes from which the content of a wrong stream is described
-_MAX_SHOWN = 60  # characters of a line in a message
-_MIN_TEXT = 0.9  # fraction of printable characters in text at the right speed
 _BAD_S = 0.5  # time of damaged lines only that is a fault; below the time after which a board is stale
 _MIN_BAD_LINES = 5  # damaged lines in that time; fewer are noise
 _MAX_GAP_US = 2_000_000  # between valid lines: a board is stale after 1 s of silence
-_SLOT_GAIN = 0.1  # fraction of a line's deviation from its slot by which the next slots are shifted
-_MAX_MISPLACED = 8  # misplaced lines that are a fault
-_FORGIVEN = 0.1  # misplaced lines that each line in its slot compensates
 
 
 @dataclass(frozen=True)
@@ -153,10 +145,10 @@ def describe_lines(received: bytes) -> tuple[str, str]:
     if not received:
         return "nothing comes from it", "check that it is the board's port, its cable, and that its program runs"
     text = sum(byte in b"\t\r\n" or 32 <= byte < 127 for byte in received)
-    if text < _MIN_TEXT * len(received):
+    if text < 0.9 * len(received):  # text at the right speed has more
         return f"{len(received) - text} of {len(received)} bytes are no text", "is [rig] baud that of the board?"
     lines = [line.strip() for line in received.split(b"\n")[1:-1] if line.strip()] or [received.strip()]
-    excerpt = repr(lines[-1][:_MAX_SHOWN].decode("ascii", "replace"))
+    excerpt = repr(lines[-1][:60].decode("ascii", "replace"))
     what = f"it sends lines such as {excerpt} without the header of docs/howto-boards.md"
     return what, 'add the header to its program, or set [rig] board = "csv", which is weaker'
 
@@ -225,12 +217,12 @@ class LineBoard(SerialBoard):
                 raise RigFault("refused", f"{self._port}: {reason}", advice)
             if now >= resend_s:
                 stream.send(HEADER_REQUEST)
-                resend_s = now + _RESEND_S
+                resend_s = now + 0.5
             data = stream.receive()[1]
-            received = (received + data)[-_MAX_RECEIVED:]
+            received = (received + data)[-1000:]  # for the description of a wrong stream
             self._decoder.decode(data)
         header = self._decoder.header
-        if abs(header.rate_hz / self._rate_hz - 1) > _RATE_TOLERANCE:
+        if abs(header.rate_hz / self._rate_hz - 1) > 1e-3:
             message = f"{self._port}: the board takes {header.rate_hz:g} samples a second, [rig] says {self._rate_hz:g}"
             raise RigFault("refused", message, f"set board_rate_hz = {header.rate_hz:g}")
         return header
@@ -293,14 +285,14 @@ class LineAssembler:
         steps = round((now_us - self._slot_us) / self._period_us)
         if not 0 < elapsed_us <= _MAX_GAP_US or steps < 1:
             self._n_misplaced += 1
-            if self._n_misplaced >= _MAX_MISPLACED:
+            if self._n_misplaced >= 8:
                 message = f"a line came {elapsed_us} us after another by the board's clock, not {self._period_us:g}"
                 is_ms = 0.5 < 1000 * elapsed_us / self._n_misplaced / self._period_us < 2
                 advice = "it was reset, or its rate is not that of its header; connect again"
                 raise RigFault("data", message, "are its times ms? they must be us" if is_ms else advice)
             return None
-        self._n_misplaced = max(self._n_misplaced - _FORGIVEN, 0.0)
+        self._n_misplaced = max(self._n_misplaced - 0.1, 0.0)  # ten lines in their slots compensate a misplaced one
         self._slot_us += steps * self._period_us
-        self._slot_us += _SLOT_GAIN * (now_us - self._slot_us)
+        self._slot_us += 0.1 * (now_us - self._slot_us)  # low-pass: the slots follow the board slowly
         self._last_us = now_us
         return steps - 1
