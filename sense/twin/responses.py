@@ -12,13 +12,13 @@ from scipy.spatial import KDTree
 
 from padforge.sense.arrays import Array, Indices, Mask
 from padforge.sense.localizer.features import compute_features
-from padforge.sense.localizer.moments import DOWN
+from padforge.sense.localizer.moments import PRESS_WINDOWS
 from padforge.sense.localizer.response_model import ResponseModel, remove_history
 from padforge.sense.recording.recording import Recording
 
 DEPTH_TOLERANCE = 0.15  # share of its depth by which another press may differ that counts as equally deep
 FIRST_HELD = 3  # first window of the press that counts as held: the tip has come to rest in the silicone
-HOLD = np.array([(end - first) * (k >= FIRST_HELD) for k, (first, end) in enumerate(DOWN)], float)
+HOLD = np.array([(end - first) * (k >= FIRST_HELD) for k, (first, end) in enumerate(PRESS_WINDOWS)], float)
 HOLD /= HOLD.sum()
 """Weights of the windows of a press in its response; shape (9,)."""
 RIDGE_HISTORY = 300.0  # penalty on weights of the history: less than for places, as the responses themselves are wanted
@@ -81,7 +81,7 @@ def compute_responses(recording: Recording, training: Mask) -> Responses:
     positioned = recording.has_position
     down, up = recording.down_command[positioned], recording.up_command[positioned]
     inputs = compute_features(recording.readings, down, up, until=up)
-    pressed = inputs.windows[:, :, : len(DOWN)]
+    pressed = inputs.windows[:, :, : len(PRESS_WINDOWS)]
     positions_mm = recording.presses_mm[positioned]
     normalized, *_ = normalize(positions_mm)
     model = ResponseModel.fit(
