@@ -323,15 +323,22 @@ def conformal(
     measures: Measures | None = None,
     prior_ratio: float | None = None,
 ) -> Array:
-    """Return the factors by which standard deviations, radii and r90 of measures must grow to hold on these presses.
+    """Return factors with which standard deviations, radii and r90 of measures hold on these presses.
 
-    Radii are split conformal (Lei et al. 2018, Distribution-free predictive inference for regression): a quantile of
-    distance over radius on presses that entered nothing before, one rank higher than the share, so that of few presses
-    they are more cautious. The (3 + T,) factors are of the standard deviation, the radii of 50 and 90 %, and the r90 of
-    T measures (1 where no true value is known); arguments are as in `error_row`.
+    Radii are split conformal (Lei et al. 2018, Distribution-free predictive inference for regression): quantiles of
+    distance over radius on presses that were not used before, one rank higher than the share, which is more cautious
+    after few presses.
 
-    Of few presses a quantile is a lottery. `prior_ratio` is the mean ratio of distance to radius that other pads let
-    expect: a gamma distribution about it counts as PRIOR_PRESSES further presses.
+    Args:
+        predictions: as in `error_row`.
+        positions_mm: as there.
+        measures: as there.
+        prior_ratio: mean ratio of distance to radius on other pads. A gamma distribution about it counts as
+            PRIOR_PRESSES further presses, since quantiles of few presses vary much. None for no prior.
+
+    Returns:
+        Factors (3 + T,) on the standard deviation, the radii of 50 and 90 %, and the r90 of T measures (1 if no true
+        value is known).
     """
     prior = _NO_PRIOR
     if prior_ratio is not None:

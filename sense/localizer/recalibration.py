@@ -202,7 +202,7 @@ def recalibrate(
 
 
 def _extrapolate(error_mm: float, half_mm: float) -> float:
-    """Extrapolate the error to twice as many presses by a power law, from those with all folds but one and with half."""
+    """Extrapolate the error to twice as many presses by a power law, from cross-validation in folds and halves."""
     exponent = float(np.clip(np.log(half_mm / error_mm) / np.log(2 * (1 - 1 / FOLDS)), 0, MAX_EXPONENT))
     return error_mm * (2 / (1 - 1 / FOLDS)) ** -exponent
 
