@@ -30,7 +30,16 @@ from padforge.sense.localizer import features, moments
 from padforge.sense.localizer.bayes import PREFIX, BayesianLocalizer
 from padforge.sense.localizer.features import compute_features, interpolate_gaps
 from padforge.sense.localizer.model import MEASURE_COLUMNS, UNIFORM, LocalizerModel
-from padforge.sense.localizer.moments import FOLLOWING, LEAST_SLIDE, N_DOWN, PHASES, SOON, STAGES, Window, complete_at
+from padforge.sense.localizer.moments import (
+    BAYES_STAGES,
+    EARLY_WINDOWS,
+    N_PRESS_WINDOWS,
+    PHASES,
+    SLIDE_NETWORK,
+    SLIDE_THRESHOLD,
+    Window,
+    complete_at,
+)
 from padforge.sense.localizer.network import MAX_LOG_ERROR, MIN_LOG_ERROR, Weights
 from padforge.sense.localizer.scaler import MAX_INPUT
 from padforge.sense.localizer.torch_network import EnsembleMlp, network_inputs
@@ -98,9 +107,9 @@ class _FeatureModule(nn.Module):
             index = torch.maximum(origin[:, None] + torch.arange(*window), low[:, None])
             return readings[torch.minimum(index, torch.minimum(high, n_readings)[:, None] - 1)].mean(dim=1)
 
-        means = [mean(down_command, each, down_command, held) for each in moments.DOWN]
-        means += [mean(up_command, each, down_command, until) for each in moments.UP]
-        means += [mean(held, each, down_command, held) for each in moments.NOW]
+        means = [mean(down_command, each, down_command, held) for each in moments.PRESS_WINDOWS]
+        means += [mean(up_command, each, down_command, until) for each in moments.RELEASE_WINDOWS]
+        means += [mean(held, each, down_command, held) for each in moments.LATEST_WINDOWS]
         baseline = mean(down_command, moments.REST, previous_end, down_command)
         windows = functional.pad(torch.stack(means, dim=2) - baseline[:, :, None], (0, len(moments.MODULATED)))
         history = _history(readings, down_command) - self.history_mean_v
@@ -111,7 +120,9 @@ class _FeatureModule(nn.Module):
 
 def _complete_windows(down_command: Tensor, up_command: Tensor, until: Tensor) -> Tensor:
     """(Q, K), as `moments.complete_windows`."""
-    down_end, up_end = (torch.tensor([end for _, end in each]) for each in (moments.DOWN, moments.UP))
+    down_end, up_end = (
+        torch.tensor([end for _, end in each]) for each in (moments.PRESS_WINDOWS, moments.RELEASE_WINDOWS)
+    )
     released = (until > up_command)[:, None]
     down = (down_command[:, None] + down_end <= until[:, None]) | released
     return torch.cat([down, released & (up_command[:, None] + up_end <= until[:, None])], dim=1)
@@ -133,9 +144,9 @@ def _history(readings: Tensor, down_command: Tensor) -> Tensor:
         end = torch.maximum(down_command + window[1], first + 1)
         return (sums[end] - sums[first]) / (end - first)[:, None] + readings[:1]
 
-    means = [mean(window) for window in features.PAST]
+    means = [mean(window) for window in features.HISTORY_WINDOWS]
     for length in features.SLOW:
-        offsets = torch.arange(-length, 0, length // features.SLOW_SAMPLES)
+        offsets = torch.arange(-length, 0, length // features.N_MEDIAN_SAMPLES)
         means.append(_median(readings[torch.clamp(down_command[:, None] + offsets, min=0)]))
     return torch.stack(means, dim=2) - mean(moments.REST)[:, :, None]
 
@@ -155,7 +166,7 @@ class _BayesModule(nn.Module):
         position, summary = self._predict(0, scaled, fibre_mask)
         for number in range(1, self.n_stages):
             later = self._predict(number, scaled, fibre_mask)
-            is_later = (n_complete >= STAGES[number])[:, None]
+            is_later = (n_complete >= BAYES_STAGES[number])[:, None]
             position, summary = (torch.where(is_later, *pair) for pair in zip(later, (position, summary), strict=True))
         corrected = self.residual(torch.cat([x, summary], dim=1)[None])
         return corrected + functional.pad(position, (0, 2))
@@ -176,7 +187,7 @@ class _LocalizerModule(nn.Module):
         self.features = _FeatureModule(model)
         self.networks = nn.ModuleDict({name: EnsembleMlp.from_numpy(each) for name, each in model.networks.items()})
         self.bayes = _BayesModule(*model.corrected) if model.bayes else None
-        for name, array in zip(("now_factor", "now_offset"), scaler.to_now(moments.N_TIMED), strict=True):
+        for name, array in zip(("now_factor", "now_offset"), scaler.latest_window_map(moments.N_TIMED), strict=True):
             self.register_buffer(name, torch.from_numpy(array))
         self.scale_mm, self.measures = scaler.scale_mm, scaler.measures
         units = [self.scale_mm] * 3 + [measure.scale for measure in self.measures]
@@ -192,9 +203,9 @@ class _LocalizerModule(nn.Module):
         x = network_inputs(scaled, fibre_mask, complete)
         targets, std = self._predict(scaled, fibre_mask, x, n_complete)
         *followed, moved = self._follow(scaled, fibre_mask, complete)
-        slid = (n_complete >= N_DOWN) & (moved > LEAST_SLIDE)
+        slid = (n_complete >= N_PRESS_WINDOWS) & (moved > SLIDE_THRESHOLD)
         targets, std = (torch.where(slid[:, None], *pair) for pair in zip(followed, (targets, std), strict=True))
-        n_failed, moment = (~fibre_mask).sum(dim=1), torch.where(slid, N_DOWN - 1, n_complete)
+        n_failed, moment = (~fibre_mask).sum(dim=1), torch.where(slid, N_PRESS_WINDOWS - 1, n_complete)
         factors = self.interval_factors[moment, torch.clamp(n_failed, max=self.interval_factors.shape[1] - 1)]
         blind = ~fibre_mask.any(dim=1) | (n_complete == 0)  # which may be anywhere
         radius = torch.linalg.vector_norm(std[:, :2], dim=1)
@@ -224,26 +235,27 @@ class _LocalizerModule(nn.Module):
         if self.bayes is None:
             return combined
         corrected = _combine_members(torch.cat([outputs, self.bayes(scaled, fibre_mask, x, n_complete)]))
-        is_corrected = (n_complete >= STAGES[0])[:, None]
+        is_corrected = (n_complete >= BAYES_STAGES[0])[:, None]
         targets, std = (torch.where(is_corrected, *pair) for pair in zip(corrected, combined, strict=True))
         return targets, std
 
     def _follow(self, scaled: Tensor, fibre_mask: Tensor, complete: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """`Sliding.follow`."""
-        network, n_timed = self.networks[FOLLOWING], moments.N_TIMED
+        network, n_timed = self.networks[SLIDE_NETWORK], moments.N_TIMED
 
         def predict_from(scaled: Tensor, n_complete: int) -> tuple[Tensor, Tensor]:
             x = network_inputs(scaled, fibre_mask, complete & (torch.arange(n_timed) < n_complete))
             return _combine_members(network(x.expand(network.n_members, -1, -1)))
 
-        targets, std = predict_from(scaled, N_DOWN)
+        targets, std = predict_from(scaled, N_PRESS_WINDOWS)
         now = [
-            scaled[:, :, SOON - 1 - k] * self.now_factor[:, k, SOON - 1 - k] + self.now_offset[:, k, SOON - 1 - k]
-            for k in range(len(moments.NOW))
+            scaled[:, :, EARLY_WINDOWS - 1 - k] * self.now_factor[:, k, EARLY_WINDOWS - 1 - k]
+            + self.now_offset[:, k, EARLY_WINDOWS - 1 - k]
+            for k in range(len(moments.LATEST_WINDOWS))
         ]
         modulation = scaled[:, :, n_timed + len(now) :]
         soon, soon_std = predict_from(
-            torch.cat([scaled[:, :, :n_timed], torch.stack(now, dim=2), modulation], dim=2), SOON
+            torch.cat([scaled[:, :, :n_timed], torch.stack(now, dim=2), modulation], dim=2), EARLY_WINDOWS
         )
         distance, expected = (torch.linalg.vector_norm(each[:, :2], dim=1) for each in (targets - soon, soon_std))
         return targets, std, distance / torch.clamp(expected, min=1e-9)
@@ -353,7 +365,7 @@ def _made_up_presses(model: LocalizerModel) -> tuple[Array, Indices, Indices]:
     """Return noise with presses as strong as those of the training, and their commands."""
     rng, scaler = np.random.default_rng(0), model.scaler
     down_command = TRIAL_READINGS // 2 + TRIAL_READINGS * np.arange(N_TRIALS)
-    up_command = down_command + moments.DOWN[-1][1]
+    up_command = down_command + moments.PRESS_WINDOWS[-1][1]
     readings = 1e-3 * rng.standard_normal(((N_TRIALS + 1) * TRIAL_READINGS, model.fibres))
     response = np.abs(scaler.mean_v).max(axis=1) + scaler.scale_v.max(axis=1)
     for first, end in zip(down_command, up_command, strict=True):

@@ -1,1 +1,1 @@
-"""Which fibres are at fault, told from readings alone."""
+"""Detection of faulty fibres from readings alone."""

@@ -1,8 +1,8 @@
-"""Domain shift: how a recording differs from the one that a localizer was calibrated on, so that its radii may fail.
+"""Domain shift between a recording and the calibration of a localizer, after which radii may be too small.
 
-Rests far from all those of the calibration, or responses of another size than to presses at the predicted positions
-then, show that a pad, its wiring or the depth of presses has changed since; true positions need not be known. A fibre
-that fails within a recording is detected by `fault_detector`.
+Baselines outside the range of the calibration, or responses of another size than those of the calibration at the
+predicted positions, show that the pad, its wiring or the depth of presses has changed. True positions need not be
+known. `fault_detector` detects fibres that fail within a recording.
 """
 
 from dataclasses import dataclass, replace
@@ -19,16 +19,14 @@ from padforge.sense.localizer.scaler import ScaledFeatures
 from padforge.sense.recording.frames import framed
 from padforge.sense.recording.recording import Recording
 
-REST_MARGIN = 0.25  # of the range of rests in calibration, by which the median of a recording leaves it at most
-WANDER, COMMON_WANDER = 0.045, 0.03
-"""Standard deviation of the logarithm of a gain that wanders in minutes on an unchanged pad: of a fibre of the
-published pad, and of all six together."""
-LEARNT = 0.8
-"""Standard deviation of the same by what is learnt from one press: the expected responses become surer with the root of
-the presses of the training."""
-STANDARD_DEVIATIONS = 4.0  # of wander, training and chance together, up to which a gain is usual
-MIN_PRESSES, MAX_PRESSES = 100, 1000
-"""From which a gain is estimated, since of a few presses one or two stretch a fibre most; and that are looked at."""
+REST_MARGIN = 0.25  # margin about the range of baselines in calibration, as a share of that range
+# Standard deviations of the logarithm of a gain on an unchanged pad
+FIBRE_DRIFT = 0.045  # within minutes, of a fibre of the published pad
+COMMON_DRIFT = 0.03  # within minutes, of its six fibres together
+TRAINING_STD = 0.8  # by the errors of expected responses, over the root of the number of training presses
+MAX_DEVIATION = 4.0  # largest usual deviation of a gain, in standard deviations
+MIN_PRESSES = 100  # with fewer presses no gain is estimated, since one or two dominate the response of a fibre
+MAX_PRESSES = 1000  # presses that are used at most
 
 
 @dataclass(frozen=True)
@@ -37,8 +35,8 @@ class DomainShift:
 
     kind: str  # "rest" or "gain"
     fibres: tuple[int, ...]  # their indices: one, or all
-    value: float  # median rest, V; or size of the responses over that in calibration
-    usual: tuple[float, float]  # least and greatest that is usual
+    value: float  # median baseline, V; or size of the responses relative to that in calibration
+    usual: tuple[float, float]  # lowest and highest usual value
 
     @property
     def text(self) -> str:
@@ -58,14 +56,14 @@ def detect_shifts(
 ) -> list[DomainShift]:
     """Detect how a recording differs from that of the calibration.
 
-    The size of responses cannot be told from the depth of presses: where the localizer predicts depths, responses are
-    compared with those at these.
+    The size of responses also depends on the depth of presses. If the localizer predicts depths, responses are compared
+    with those expected at these depths.
 
     Args:
         localizer: of the pad.
         health: of the pad.
         recording: of a pad with the fibres of the training, with about as many readings a second or more.
-        fibre_mask: (Q, C), false where a fibre is masked in a press; nothing is said of one that always is.
+        fibre_mask: (Q, C), false where a fibre is masked in a press; fibres masked in all presses are ignored.
 
     Raises:
         InputError: as `LocalizerModel.raw_features`.
@@ -77,7 +75,7 @@ def detect_shifts(
 
 
 def rest_levels(recording: Recording) -> Array:
-    """Return the rests (Q, C) before the presses of a recording, V; NaN where a reading is missing."""
+    """Return the baselines (Q, C) before the presses of a recording, V; NaN where a reading is missing."""
     frames = framed(recording)
     previous_end = np.concatenate([[0], frames.up_command[:-1]])
     return mean_at_rest(frames.readings, frames.down_command, previous_end)
@@ -95,31 +93,31 @@ def _rest_shifts(health: HealthModel, recording: Recording, fibre_mask: Mask) ->
 
 
 def _gain_shifts(localizer: LocalizerModel, training: int, recording: Recording, fibre_mask: Mask) -> list[DomainShift]:
-    """Compare responses with those expected at the predicted positions: all fibres together, or else each of them.
+    """Compare responses with those expected at the predicted positions: of all fibres together, or else of each.
 
-    A single fibre is compared at the positions that the others predict, since it would pull them towards itself.
+    A single fibre is compared at the positions predicted by the others, which it does not bias.
     """
     presses = localizer.scaled_features(recording)
     rows = np.linspace(0, len(presses) - 1, min(len(presses), MAX_PRESSES)).astype(np.int64)
     presses = replace(presses[rows], fibre_mask=presses.fibre_mask[rows] & fibre_mask[rows])
     fibres = tuple(range(localizer.fibres))
-    moment, energy = _compare(localizer, presses)
-    learnt = LEARNT / sqrt(training)
-    together = _gain_shift(fibres, moment.sum(axis=1), energy.sum(axis=1), hypot(COMMON_WANDER, learnt))
-    if together or len(fibres) == 1:
-        return [together] if together else []
+    energy, expected = _compare(localizer, presses)
+    training_std = TRAINING_STD / sqrt(training)
+    common = _gain_shift(fibres, energy.sum(axis=1), expected.sum(axis=1), hypot(COMMON_DRIFT, training_std))
+    if common or len(fibres) == 1:
+        return [common] if common else []
     shifts = []
     for fibre in fibres:
-        moment, energy = _compare(localizer, presses, (fibre,))
-        shifts.append(_gain_shift((fibre,), moment[:, fibre], energy[:, fibre], hypot(WANDER, learnt)))
+        energy, expected = _compare(localizer, presses, (fibre,))
+        shifts.append(_gain_shift((fibre,), energy[:, fibre], expected[:, fibre], hypot(FIBRE_DRIFT, training_std)))
     return [shift for shift in shifts if shift]
 
 
 def _compare(localizer: LocalizerModel, presses: ScaledFeatures, failed: tuple[int, ...] = ()) -> tuple[Array, Array]:
-    """Products of responses and of expected responses with expected ones (Q, C), V^2; 0 where a fibre is masked.
+    """Return the energies (Q, C) of responses and of expected responses, V^2; 0 where a fibre is masked.
 
-    Expected are the responses at the positions and depths that the localizer predicts without the failed fibres; none
-    where no other is valid.
+    Responses are expected at the positions and depths that the localizer predicts without the failed fibres; they are 0
+    if no other fibre is valid.
     """
     scaler, side = localizer.scaler, len(localizer.table)
     localization = localizer.predict_features(presses, failed)
@@ -135,18 +133,18 @@ def _compare(localizer: LocalizerModel, presses: ScaledFeatures, failed: tuple[i
     return (response_v**2).sum(axis=2), (expected_v**2).sum(axis=2)
 
 
-def _gain_shift(fibres: tuple[int, ...], energy: Array, expected: Array, wander: float) -> DomainShift | None:
+def _gain_shift(fibres: tuple[int, ...], energy: Array, expected: Array, log_std: float) -> DomainShift | None:
     """Compare (Q,) energies of responses with expected ones, and return the gain if it is unusual.
 
-    A least-squares gain would be too small by the error of the positions, which blurs the expected responses alone.
+    A least-squares gain would be biased to small values by the errors of the positions.
     """
     if (expected > 0).sum() < MIN_PRESSES:
         return None
     ratio, leverage = energy.sum() / expected.sum(), expected / expected.sum()
     gain = float(np.sqrt(ratio))
-    # Presses scatter in proportion to their responses, and a few stretch a fibre most: the jackknife's standard error.
+    # Jackknife standard error, since the scatter grows with the response and few presses dominate
     residual = (energy / ratio - expected) / (1 - leverage)
     standard_error = float(np.linalg.norm(residual) / (2 * expected.sum()))
-    limit = STANDARD_DEVIATIONS * hypot(wander, standard_error)
+    limit = MAX_DEVIATION * hypot(log_std, standard_error)
     usual = exp(-limit), exp(limit)
     return None if usual[0] <= gain <= usual[1] else DomainShift("gain", fibres, gain, usual)

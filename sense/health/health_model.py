@@ -1,4 +1,4 @@
-"""Model of a healthy pad: how its fibres predict each other; learnt from a recording, kept in JSON and safetensors."""
+"""Model of a healthy pad, whose fibres predict each other: training on a recording, and files."""
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
@@ -32,14 +32,16 @@ from padforge.sense.localizer.model_files import files_of
 FORMAT = "padforge-health/1"
 COMMANDED, DETECTED = "health", "health_live"
 """Names of the files of a model: trained on presses as commanded, and as detected in the readings."""
-FALSE_ALARM_RATE, MAX_FALSE_ALARM_RATE = 1e-5, 0.1
-"""False alarms a press, all fibres and kinds of fault together: the default, and the largest (then every press is)."""
-MAX_FAILED = 2  # largest number of failed fibres for which the heights of chance are learnt
-MIN_PRESSES = 300  # presses that a model is trained on, at least
-MIN_GAIN_PRESSES = 850  # for a reduced gain: with 680, every other simulated pad gave a false alarm, none of 12 now
-WARM_UP = 10  # presses after which the running level of a rest is reliable
-BLOCK = 50  # successive presses of a fold, without which a member is trained: neighbours share what drifts
-SUBSETS = 4  # random sets of failed fibres of a size from which the heights of chance are learnt
+FALSE_ALARM_RATE = 1e-5  # default false alarms per press, of all fibres and kinds of fault together
+MAX_FALSE_ALARM_RATE = 0.1
+MAX_FAILED = 2  # maximum number of failed fibres in the fit of `ExceedanceModel`
+MIN_PRESSES = 300  # minimum presses of a training
+MIN_GAIN_PRESSES = 850
+"""Minimum presses for reports of a reduced gain: with 680, every other simulated pad gave a false alarm, with 850 none
+of 12."""
+WARM_UP = 10  # presses after which the running mean of a baseline is reliable
+BLOCK = 50  # successive presses of a fold; neighbouring presses share their drift
+SUBSETS = 4  # random sets of failed fibres of a size in the fit of `ExceedanceModel`
 
 
 class HealthDocument(Settings):
@@ -57,28 +59,28 @@ class HealthDocument(Settings):
 
 @dataclass(frozen=True)
 class HealthModel:
-    """Model of a healthy pad. Its arrays have the L of the C fibres that were not dead."""
+    """Model of a healthy pad. Its arrays are of the L living fibres, that is those of the C that were not dead."""
 
     pca: TracePCA  # reduces traces to the inputs and targets of the networks
     weights: Weights  # of the networks that predict each fibre from the others
     likelihoods: FaultLikelihoods  # distribution of healthy presses about the predictions
-    exceedance: ExceedanceModel  # how high cumulative sums rise by chance
-    rest_range_v: Array  # lowest and highest rest; shape (2, L), V
+    exceedance: ExceedanceModel  # of the cumulative sums of healthy presses
+    rest_range_v: Array  # lowest and highest baseline; shape (2, L), V
     fibres: int  # number of fibres, C
     dead: tuple[int, ...]  # indices of fibres that were dead in the recording
     rate_hz: float  # readings per second of the recording
-    presses: int  # that the model was trained on
-    false_alarm_rate: float = FALSE_ALARM_RATE  # false alarms a press that are allowed on a healthy pad
+    presses: int  # number of training presses
+    false_alarm_rate: float = FALSE_ALARM_RATE  # false alarms per press on a healthy pad
     provenance: Mapping[str, Any] = field(default_factory=dict)  # origin of the model, JSON
 
     @property
     def living(self) -> Indices:
-        """(L,) indices of the fibres that were not dead."""
+        """Indices (L,) of the fibres that were not dead."""
         return np.setdiff1d(np.arange(self.fibres), self.dead)
 
     @property
     def threshold(self) -> float:
-        """Least `ExceedanceModel.neg_log_p` of a fault: all hypotheses share the false alarms equally."""
+        """Minimum `ExceedanceModel.neg_log_p` of a fault; all hypotheses share the false alarms equally."""
         return float(np.log(len(HYPOTHESES) / self.false_alarm_rate))
 
     def save(self, folder: str | Path, name: str = COMMANDED) -> None:
@@ -140,9 +142,9 @@ def fit_health_model(
 ) -> HealthModel:
     """Train a model on presses of a recording.
 
-    Presses that miss a reading of a living fibre are left out. A single living fibre suffices for faults that its own
-    readings show (stuck, noisy, offset); responses need two or more. A model of fewer than MIN_GAIN_PRESSES never
-    reports a reduced gain.
+    Presses that miss a reading of a living fibre are ignored. A single living fibre suffices for faults that its own
+    readings show (stuck, noisy, offset); faults of responses need two or more. A model of fewer than MIN_GAIN_PRESSES
+    never reports a reduced gain.
     """
     dead = find_dead_fibres(readings)
     living = np.setdiff1d(np.arange(readings.shape[1]), dead)
@@ -154,9 +156,9 @@ def fit_health_model(
         raise InputError(f"{len(traces)} complete presses to learn from, expected {MIN_PRESSES} or more")
 
     pca, inputs, targets = TracePCA.fit_transform(traces)
-    # Each member is trained without its fold, since a network predicts the presses that it was trained on too well.
+    # Each member is trained without its fold, since a network is overconfident on its training presses.
     presses = np.arange(len(traces))
-    # Trained on few presses it also knows the drift of rests near them, so then each fold is one block.
+    # After few presses a network also fits the drift of baselines near them, so that each fold must be one block.
     is_short = len(presses) < MIN_GAIN_PRESSES
     fold = presses * MEMBERS // len(presses) if is_short else presses // BLOCK % MEMBERS
     is_warm = presses >= WARM_UP
@@ -211,6 +213,6 @@ def find_dead_fibres(readings: Array) -> Indices:
     present = np.where(missing, 0.0, readings)
     low, high = np.nanmin(present, axis=0), np.nanmax(present, axis=0)
     at_end = np.maximum((present == low).mean(axis=0), (present == high).mean(axis=0))
-    # Without noise every fibre rests at the end of its range.
+    # Without noise every fibre is at the end of its range while at rest.
     saturated = (at_end > 0.5) & (np.median(at_end) <= 0.5)
     return np.flatnonzero(missing | (high - low < MIN_SCALE_V) | saturated)

@@ -18,33 +18,40 @@ Weights = Mapping[str, Floats]
 """`first.w` (E, C, N, H), `first.mask` (E, C, H), `first.b` (E, H), `hidden.w` (E, H, H), `hidden.b` (E, H), `last.w`
 (E, C, H, 2 T) and `last.b` (E, C, 2 T), for E members, N inputs a fibre, H hidden units and T targets a fibre."""
 
-REST, HELD, RELEASED = 10, 20, 20  # readings of a trace before the probe is sent down, after it, and after the release
+REST = 10  # readings of a trace before the probe is sent down
+HELD = 20  # readings after it was sent down
+RELEASED = 20  # readings after it was sent up
 TRACE = REST + HELD + RELEASED
 COMPONENTS = 6  # principal components of a response: 99.7 % of the variance on the published pad
-INPUTS, TARGETS = 2 * COMPONENTS + 1, COMPONENTS + 1  # response, rest and history; response and rest are predicted
-LEVEL_RATE = 1 / 50  # weight of a press in the running level of the rests, which follows drift, not offsets
-HISTORY_COEF = 0.7  # share of earlier responses that remains after a press: silicone creeps back
+INPUTS = 2 * COMPONENTS + 1  # inputs of a fibre: response, baseline and history
+TARGETS = COMPONENTS + 1  # targets of a fibre: response and baseline
+LEVEL_RATE = 1 / 50  # weight of a press in the running mean of the baseline, which follows drift but not offsets
+HISTORY_COEF = 0.7  # decay of earlier responses per press, as silicone creeps back
 T_DEGREES = 5.0  # of freedom of Student's t, the distribution of the residuals: a few in a thousand are outliers
 MAX_INPUT = 8.0  # largest scaled input: an open fibre must not drive the network where it was never trained
 
-MEMBERS, HIDDEN, BATCH, LEARNING_RATE = 3, 128, 96, 3e-3
-MAX_STEPS = 2500  # of training, one a press: with more, predictions of presses held out get worse
+MEMBERS = 3
+HIDDEN = 128
+BATCH = 96
+LEARNING_RATE = 3e-3
+MAX_STEPS = 2500  # of a training, one per press; with more, predictions of presses held out get worse
 DROPOUT = (0.6, 0.25, 0.15)  # probabilities that training masks 1, 2 and 3 fibres
-INPUT_NOISE, WEIGHT_DECAY = 0.02, 1e-2
+INPUT_NOISE = 0.02  # standard deviation of noise on scaled inputs
+WEIGHT_DECAY = 1e-2
 LOG_STD = (-4.0, 2.0)  # range of the logarithm of a predicted standard deviation
 
 
 def extract_trace(readings: Array, down_command: int, up_command: int, first: int, end: int) -> Array:
-    """Extract the trace (C, TRACE) of a press from readings (R, C), filled beyond those from `first` to before `end`.
+    """Extract the trace (C, TRACE) of a press from the readings (R, C) from `first` to before `end`.
 
-    It has NaN after the release if the press has no reading from there on.
+    Missing readings repeat the nearest one; those after the release are NaN if the press ends before it.
     """
     before = np.arange(down_command - REST, down_command).clip(min(first, down_command - 1))
     held = np.minimum(np.arange(down_command, down_command + HELD), up_command - 1)
     released = np.minimum(np.arange(up_command, up_command + RELEASED), end - 1)
     trace = readings[np.concatenate([before, held, released])].T
     if end <= up_command:
-        # The last reading is of the pressed pad: the fibres would look as if they had not come back.
+        # Repeating the last reading, of the pressed pad, would look like fibres that do not recover.
         trace[:, -RELEASED:] = np.nan
     return trace
 
@@ -54,7 +61,7 @@ def bound_presses(readings: Array, down_command: Indices, up_command: Indices) -
 
     Readings (R, C) are returned too, padded with NaN if they end before RELEASED readings of the last release.
     """
-    # No press follows that cuts the last one short, so its remaining readings are missing, and are not filled.
+    # The last press is not cut short by another one: its remaining readings are missing, and not repeated.
     missing = max(int(up_command[-1]) + RELEASED - len(readings), 0)
     readings = np.pad(readings, ((0, missing), (0, 0)), constant_values=np.nan) if missing else readings
     return readings, np.concatenate([[0], up_command[:-1]]), np.append(down_command[1:], len(readings))
@@ -100,7 +107,7 @@ class TracePCA:
         history = TraceHistory.initial(fibres)
         inputs, targets = map(np.stack, zip(*[pca.project(trace, history) for trace in traces], strict=True))
         input_rms, target_rms = np.sqrt((inputs**2).mean(axis=0)), np.sqrt((targets**2).mean(axis=0))
-        # Small components keep a part of their smallness, and so of their noise.
+        # Small components stay smaller, and their noise with them.
         input_scale = np.sqrt(input_rms * input_rms.max(axis=1, keepdims=True))
         pca = cls(components, *(np.where(scale > MIN_SCALE_V, scale, 1.0) for scale in (input_scale, target_rms)))
         return pca, *pca.scale(inputs, targets)
@@ -134,7 +141,7 @@ def predict_fibres(weights: Weights, inputs: Floats, fibre_mask: Mask) -> tuple[
 
     Returns the mean and the standard deviation of the mixture of the members.
     """
-    # A fibre's term of the first layer is subtracted from the sum: C predictions for little more than one.
+    # The first layer without a fibre is the sum over all minus the term of this fibre, computed once for all C.
     terms = np.einsum("qcn,ecnh->eqch", inputs, weights["first.w"]) + weights["first.mask"][:, None]
     terms = np.where(fibre_mask[:, :, None], terms, np.float32(0))
     h = _silu(terms.sum(axis=2, keepdims=True) - terms + weights["first.b"][:, None, None])
@@ -190,7 +197,7 @@ def train_networks(inputs: Floats, targets: Array, rows: list[Indices], rng: np.
         log_std = log_std.clamp(*LOG_STD)
         square = (y[batch] - mean) ** 2
         nll = (T_DEGREES + 1) / 2 * torch.log1p(square * torch.exp(-2 * log_std) / T_DEGREES) + log_std
-        # The plain square keeps the mean learning where a large standard deviation has made the likelihood flat.
+        # The square error adds a gradient of the mean where a large standard deviation flattens the likelihood.
         loss = ((nll + square / 4) * dropped).sum(dim=(1, 2, 3)) / dropped.sum(dim=(1, 2, 3))
         return loss.sum()
 

@@ -20,8 +20,8 @@ from padforge.sense.health.health_model import HealthModel
 from padforge.sense.health.trace_model import RELEASED
 from padforge.sense.localizer.doubts import OTHER_PAD
 from padforge.sense.localizer.features import (
-    MEDIAN,
     MEDIAN_OFFSET,
+    MEDIAN_WIDTH,
     PressFeatures,
     compute_features,
     compute_history,
@@ -33,7 +33,7 @@ from padforge.sense.localizer.features import (
 from padforge.sense.localizer.localizer import Localizer
 from padforge.sense.localizer.model import MEASURE_COLUMNS, LocalizerModel
 from padforge.sense.localizer.model_files import check_same_pad
-from padforge.sense.localizer.moments import DOWN, MODULATED, REST, UP, complete_windows
+from padforge.sense.localizer.moments import MODULATED, PRESS_WINDOWS, RELEASE_WINDOWS, REST, complete_windows
 from padforge.sense.localizer.scaler import ScaledFeatures
 from padforge.sense.localizer.single_press import MIN_PRESSES, find_misfits, is_other_pad
 from padforge.sense.recording.frames import FrameStream
@@ -42,10 +42,10 @@ from padforge.sense.signals.press_detection import RELEASE_DELAY_S, TOUCH_DELAY_
 
 MAX_TRACK = 64  # latest positions of the current press in the view
 SHARPER = 0.75  # ratio of radii below which a new estimate at the same position replaces the earlier one
-LEAD = MEDIAN_OFFSET + MEDIAN // 2  # readings before `down_command` that features use, without their history
-OPENING = DOWN[-1][1]  # readings after `down_command` that features use
+LEAD = MEDIAN_OFFSET + MEDIAN_WIDTH // 2  # readings before `down_command` that features use, without their history
+OPENING = PRESS_WINDOWS[-1][1]  # readings after `down_command` that features use
 LATEST = 20  # readings before the present or the release that features of a long press use
-RELEASE = max(UP[-1][1], RELEASED)  # readings after `up_command` that complete a press
+RELEASE = max(RELEASE_WINDOWS[-1][1], RELEASED)  # readings after `up_command` that complete a press
 
 
 @dataclass(frozen=True)

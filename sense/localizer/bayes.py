@@ -1,9 +1,9 @@
-"""Bayesian localizer: position of a press by the fitted response of the pad, with any fibres masked.
+"""Bayesian localizer: position of a press from the fitted response of the pad, with any fibres masked.
 
 The features of a fibre are normally distributed about the response expected at a position, with the scatter of the
-presses near it. A posterior on a grid over the pad, whose positions stand for their cells, gives a mean and variances.
-From there a few Gauss-Newton steps lead to the maximum a posteriori position, the grid's posterior being the prior
-(the steps of an iterated Kalman filter: M. S. Grewal and A. P. Andrews, Kalman filtering, 2015).
+presses near it. A posterior on a grid over the pad, each position of which stands for its cell, gives a mean and
+variances. A few Gauss-Newton steps from that mean, with the posterior of the grid as the prior, lead to the maximum a
+posteriori position (the steps of an iterated Kalman filter: M. S. Grewal and A. P. Andrews, Kalman filtering, 2015).
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -14,22 +14,21 @@ import numpy as np
 
 from padforge.common.progress import OnProgress, ignore_progress
 from padforge.sense.arrays import Array, Mask
-from padforge.sense.localizer.moments import NOW, STAGES
+from padforge.sense.localizer.moments import BAYES_STAGES, LATEST_WINDOWS
 from padforge.sense.localizer.response_model import grid_positions, interpolate_grid
 
-COMPONENTS = 6  # discriminant directions of a fibre: those in which positions differ most for their scatter
-LINEARIZED, COARSENING = 2, 3
-"""Cells of the response table along a side of a cell of the linearization, and of the posterior's grid."""
-SCATTER_WIDTH, SCATTER_PRIOR_COUNT = 4.0, 10.0
-"""Width of the averages of the scatter, in distances between presses; presses that the scatter of the pad counts as."""
+COMPONENTS = 6  # linear discriminants of a fibre
+LINEARIZED = 2  # cells of the response table along a side of a cell of the linearization
+COARSENING = 3  # cells of the response table along a side of a cell of the posterior grid
+SCATTER_WIDTH = 4.0  # standard deviation of the averages of the scatter, in distances between presses
+SCATTER_PRIOR_COUNT = 10.0  # weight of the scatter of the whole pad in these averages, in presses
 MIN_VARIANCE = 1e-4  # of scaled features, which are about 1
-PRIOR_WEIGHT = 0.05
-"""Weight of the grid's posterior in the steps after it, which use the same features: little, but enough to hold."""
-GAUSS_NEWTON_STEPS, MAX_STEP = 2, 0.2  # steps, and the longest, in units of the scaled position
-MIN_STD = 1e-2  # smallest standard deviation on the grid, a tenth of a cell
-N_SUMMARY = 9
-"""Numbers of a posterior summary: position, log variances, mean on the grid, its log variances, and correlation."""
-MIN_EXPONENT = -60.0  # smaller exponents count for nothing, and their exponential takes ten times as long
+PRIOR_WEIGHT = 0.05  # of the grid posterior in the Gauss-Newton steps; small, since both use the same features
+GAUSS_NEWTON_STEPS = 2
+MAX_STEP = 0.2  # maximum Gauss-Newton step, in units of the scaled position
+MIN_STD = 1e-2  # minimum standard deviation of the grid posterior, a tenth of a cell
+N_SUMMARY = 9  # entries of a posterior summary, see `BayesianLocalizer.predict`
+MIN_EXPONENT = -60.0  # exponents are clipped to it: smaller ones are negligible, and ten times slower to exponentiate
 PREFIX = "bayes."  # of the names of the arrays in files
 _CHUNK = 2**15
 
@@ -38,62 +37,72 @@ _CHUNK = 2**15
 class BayesianLocalizer:
     """Fitted likelihood of a pad, in arrays of NumPy or of torch.
 
-    All numbers are representable in single precision. NumPy computes in double precision, as the steps are only as
-    accurate as the residuals; for training, single precision suffices.
+    All values are exact in single precision. NumPy computes in double precision, since the Gauss-Newton steps are only
+    as accurate as the residuals; single precision suffices for training.
     """
 
     projection: Any  # (C, F + G, D), scaled features to whitened discriminants
     grid: Any  # (P, 2) positions
-    # (C (D (D + 3) / 2 + 1), P), of products of discriminants, of discriminants and of 1, fibre by fibre
+    # (C (D (D + 3) / 2 + 1), P), coefficients of products of discriminants, discriminants and 1, fibre by fibre
     log_likelihood_coefficients: Any
-    # (S, S, C (3 D + 3)) on a grid over [-1, 1] in x and y: expected discriminants, their weighted Jacobian J' S^-1,
-    # and the Fisher information J' S^-1 J in xx, yy and xy
+    # (S, S, C (3 D + 3)) on a grid over [-1, 1] in x and y, see `_linearize`
     linearization: Any
-    bounds: Any  # (2, 2) least and greatest x and y of presses
-    rotation: Any  # (2, 2), from the positions of the fit to those that are returned
+    bounds: Any  # (2, 2), lowest and highest x and y of presses
+    rotation: Any  # (2, 2), from the positions of the fit to the returned ones
     shift: Any  # (2,), added to the rotated positions
 
     @classmethod
     def fit(
         cls, table: Any, inputs: Any, fibre_mask: Mask, positions: Any, earlier: "BayesianLocalizer | None" = None
     ) -> "BayesianLocalizer":
-        """Fit to scaled presses and the (S, S, C, F + G) table of their response over [-1, 1] in x and y.
+        """Fit the likelihood to scaled presses.
 
-        Discriminants, and the area that is pressed, are those of an `earlier` localizer, if any: how the windows of a
-        fibre scatter together depends on the silicone more than on the pad, and few presses do not tell it.
+        Args:
+            table: scaled response by position, over [-1, 1] in x and y; shape (S, S, C, F + G).
+            inputs: scaled features; shape (Q, C, F + G).
+            fibre_mask: valid fibres; shape (Q, C).
+            positions: scaled; shape (Q, 2).
+            earlier: localizer whose discriminants and pressed area are kept. The correlation of the windows of a fibre
+                depends on the silicone more than on the pad, and cannot be estimated from few presses.
         """
         side, _, fibres, size = table.shape
         table, inputs, positions = (part.astype(np.float64) for part in (table, inputs, positions))
         low, high = positions.min(axis=0), positions.max(axis=0)
         if earlier is not None:
             low, high = np.minimum(low, earlier.bounds[0]), np.maximum(high, earlier.bounds[1])
+
+        # 1. Grids: the table, the linearization and the posterior, from fine to coarse
         grid = grid_positions(side)
         step, coarse = float(grid[1, 0, 0] - grid[0, 0, 0]), grid[::COARSENING, ::COARSENING]
         fine = (slice(None, None, LINEARIZED),) * 2
         cell = float(coarse[1, 0, 0] - coarse[0, 0, 0])
         inside = ((coarse >= low - cell) & (coarse <= high + cell)).all(axis=2)
+
+        # 2. Discriminants, and the covariance of their residuals on the coarse grid
         residual = inputs - interpolate_grid(table.reshape(side, side, -1), positions).reshape(inputs.shape)
-        before = np.zeros((fibres, size, COMPONENTS)) if earlier is None else earlier.projection
-        projection = fit_projection(table, residual, fibre_mask, before)
+        earlier_projection = np.zeros((fibres, size, COMPONENTS)) if earlier is None else earlier.projection
+        projection = fit_projection(table, residual, fibre_mask, earlier_projection)
         residual = np.einsum("qcf,cfd->qcd", residual, projection) * fibre_mask[:, :, None]
         width = max(cell, SCATTER_WIDTH * mean_distance(positions))
         scatter = local_scatter(coarse.reshape(-1, 2), positions, residual, fibre_mask, width)
         scatter = scatter.reshape(*coarse.shape[:2], fibres, -1)
+
+        # 3. Linearization and coefficients of the log likelihood, fibre by fibre
         coefficients, responses, jacobians, informations = [], [], [], []
         for fibre in range(fibres):
             expected = table[:, :, fibre] @ projection[fibre]
             covariance = interpolate_grid(scatter[:, :, fibre], grid.reshape(-1, 2))
             covariance = covariance.reshape(side, side, COMPONENTS, COMPONENTS)
             unused = np.flatnonzero(~projection[fibre].any(axis=0))
-            covariance[:, :, unused, unused] = 1.0  # the same everywhere, or it would tell where presses are dense
+            covariance[:, :, unused, unused] = 1.0  # constant, since it must not depend on the density of presses
             jacobian = np.stack(np.gradient(expected, step, axis=(0, 1)), axis=2)
             weighted = jacobian @ np.linalg.inv(covariance)
             fisher = weighted @ jacobian.swapaxes(2, 3)
             responses.append(expected[fine])
             jacobians.append(weighted[fine].reshape(*responses[-1].shape[:2], -1))
-            diagonal = (np.maximum(fisher[..., k, k], 0) for k in (0, 1))  # rounding may leave less than 0
+            diagonal = (np.maximum(fisher[..., k, k], 0) for k in (0, 1))  # may be negative by rounding
             informations.append(np.stack([*diagonal, fisher[..., 0, 1]], axis=2)[fine])
-            # A position of the grid stands for its cell, over which the response varies by its slope.
+            # Each position of the grid stands for its cell, over which the response varies by its slope.
             slope = jacobian[::COARSENING, ::COARSENING][inside]
             blurred = covariance[::COARSENING, ::COARSENING][inside] + cell**2 / 12 * slope.swapaxes(1, 2) @ slope
             on_grid = expected[::COARSENING, ::COARSENING][inside]
@@ -103,37 +112,55 @@ class BayesianLocalizer:
         return cls(*map(_rounded, (*arrays, np.eye(2), np.zeros(2))))
 
     def predict(self, inputs: Any, fibre_mask: Any, xp: Any = np) -> tuple[Any, Any]:
-        """Return (Q, 2) MAP positions and (Q, N_SUMMARY) posterior summaries, from the fibres in the (Q, C) mask.
+        """Predict positions and posterior summaries.
 
-        Inputs are (Q, C, F + G) scaled features; `xp` is the module of all arrays, numpy or torch.
+        Args:
+            inputs: scaled features; shape (Q, C, F + G).
+            fibre_mask: valid fibres; shape (Q, C).
+            xp: module of all arrays, numpy or torch.
+
+        Returns:
+            Maximum a posteriori positions (Q, 2), scaled; and summaries (Q, N_SUMMARY): position, its log variances,
+            mean of the grid posterior, its log variances, and its correlation.
         """
-        fibres, _, size = self.projection.shape
         mask = xp.asarray(fibre_mask, dtype=inputs.dtype)
         z = xp.matmul(xp.where(fibre_mask[:, :, None], inputs, 0.0).swapaxes(0, 1), self.projection).swapaxes(0, 1)
         grid_mean, grid_var, grid_corr = self._grid_posterior(z, mask, xp)
         prior_precision, position, var = PRIOR_WEIGHT / grid_var, grid_mean, grid_var
         for _ in range(GAUSS_NEWTON_STEPS):
-            local = interpolate_grid(self.linearization, position, xp)
-            residual = mask[:, :, None] * (z - local[:, : fibres * size].reshape(-1, fibres, size))
-            weighted = local[:, fibres * size : 3 * fibres * size].reshape(-1, fibres, 2, size)
-            fisher = (mask[:, :, None] * local[:, 3 * fibres * size :].reshape(-1, fibres, 3)).sum(axis=1)
-            gradient = (weighted * residual[:, :, None, :]).sum(axis=3).sum(axis=1)
+            expected, weighted_jacobian, fisher = self._linearize(position, xp)
+            residual = mask[:, :, None] * (z - expected)
+            gradient = (weighted_jacobian * residual[:, :, None, :]).sum(axis=3).sum(axis=1)
             gradient = gradient + prior_precision * (grid_mean - position)
-            var, step = _solve_2x2(fisher, prior_precision, gradient, xp)
+            var, step = _solve_2x2((mask[:, :, None] * fisher).sum(axis=1), prior_precision, gradient, xp)
             position = xp.clip(position + xp.clip(step, -MAX_STEP, MAX_STEP), self.bounds[0], self.bounds[1])
-        # All of it about 1, as the inputs of a network should be.
-        logs = [1 + 0.25 * xp.log(each) for each in (var, grid_var)]
-        summary = xp.concat([2 * position, logs[0], 2 * grid_mean, logs[1], grid_corr[:, None]], axis=1)
+        # Scaled to about 1, as the inputs of a network should be
+        log_var, log_grid_var = (1 + 0.25 * xp.log(values) for values in (var, grid_var))
+        summary = xp.concat([2 * position, log_var, 2 * grid_mean, log_grid_var, grid_corr[:, None]], axis=1)
         return position @ self.rotation.T + self.shift, summary
+
+    def _linearize(self, position: Any, xp: Any) -> tuple[Any, Any, Any]:
+        """Linearize the response of each fibre at (Q, 2) positions, with J its Jacobian and S its covariance.
+
+        Returns:
+            Expected discriminants (Q, C, D), J' S^-1 (Q, C, 2, D), and J' S^-1 J in xx, yy and xy (Q, C, 3).
+        """
+        fibres, _, size = self.projection.shape
+        local = interpolate_grid(self.linearization, position, xp)
+        return (
+            local[:, : fibres * size].reshape(-1, fibres, size),
+            local[:, fibres * size : 3 * fibres * size].reshape(-1, fibres, 2, size),
+            local[:, 3 * fibres * size :].reshape(-1, fibres, 3),
+        )
 
     def _grid_posterior(self, z: Any, mask: Any, xp: Any) -> tuple[Any, Any, Any]:
         """Mean (Q, 2), variances (Q, 2) and correlation (Q,) of the posterior on the grid."""
-        first, second = (each.tolist() for each in np.triu_indices(z.shape[2]))
+        first, second = (indices.tolist() for indices in np.triu_indices(z.shape[2]))
         monomials = xp.concat([z[:, :, first] * z[:, :, second], z, xp.ones_like(z[:, :, :1])], axis=2)
         coefficients = self.log_likelihood_coefficients
-        # -1 for the presses, whose number may be traced
+        # -1 for the presses, whose number is symbolic in an export
         log_likelihood = (monomials * mask[:, :, None]).reshape(-1, len(coefficients)) @ coefficients
-        log_likelihood -= xp.amax(log_likelihood, axis=1)[:, None]  # in place: fetching memory takes as long as filling
+        log_likelihood -= xp.amax(log_likelihood, axis=1)[:, None]  # in place, since memory bandwidth is the limit
         clipped = xp.clip(log_likelihood, MIN_EXPONENT, 0.0, out=log_likelihood)
         posterior = xp.exp(clipped, out=log_likelihood)
         moments = posterior @ xp.concat([self.grid, self.grid**2, self.grid[:, :1] * self.grid[:, 1:]], axis=1)
@@ -144,22 +171,23 @@ class BayesianLocalizer:
         return mean, var, xp.clip(corr, -1, 1)
 
     def transformed(self, rotation: Array, shift: Array) -> "BayesianLocalizer":
-        """Return one whose positions are rotated (or any linear map, (2, 2)) and shifted, (2,)."""
+        """Return a localizer whose positions are rotated (or mapped linearly), (2, 2), and shifted, (2,)."""
         return replace(self, rotation=_rounded(rotation @ self.rotation), shift=_rounded(rotation @ self.shift + shift))
 
     def map_arrays(self, function: Callable[[Any], Any]) -> "BayesianLocalizer":
-        """Apply a function to every array in single precision, as to convert them to torch."""
+        """Apply a function to every array in single precision, for example to convert it to torch."""
         return BayesianLocalizer(*map(function, self.to_arrays().values()))
 
     def to_arrays(self, number: int = 0) -> dict[str, Any]:
         """Return the arrays of the `number`-th stage by their names in files, in single precision, which is exact."""
         prefix = f"{PREFIX}{number}."
-        return {prefix + each.name: getattr(self, each.name).astype(np.float32) for each in fields(self)}
+        return {prefix + field.name: getattr(self, field.name).astype(np.float32) for field in fields(self)}
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, Any], number: int) -> "BayesianLocalizer":
         """Read what `to_arrays` returned."""
-        return cls(**{each.name: arrays[f"{PREFIX}{number}.{each.name}"].astype(np.float64) for each in fields(cls)})
+        names = [field.name for field in fields(cls)]
+        return cls(**{name: arrays[f"{PREFIX}{number}.{name}"].astype(np.float64) for name in names})
 
 
 def fit_stages(
@@ -171,29 +199,30 @@ def fit_stages(
     on_progress: OnProgress = ignore_progress,
     earlier: Sequence[BayesianLocalizer] = (),
 ) -> tuple[BayesianLocalizer, ...]:
-    """Fit a localizer for each of `STAGES`, or one if `n_timed` = K is 0; arguments as in `BayesianLocalizer.fit`.
+    """Fit a localizer for each of `BAYES_STAGES`, or a single one if `n_timed` = K is 0.
 
-    The first K features are windows in the order in which they are complete; two more say where the finger is now.
+    The first K features are the windows in the order of their completion, followed by the latest ones. Other arguments
+    are as in `BayesianLocalizer.fit`, with an earlier localizer for each stage.
     """
-    stages, numbers = [], STAGES if n_timed else (0,)
+    stages, numbers = [], BAYES_STAGES if n_timed else (0,)
     for n_complete in numbers:
         on_progress(len(stages), len(numbers), "Bayesian localizer")
-        unused = slice(n_complete, n_timed + len(NOW) if n_timed else 0)
+        unused = slice(n_complete, n_timed + len(LATEST_WINDOWS) if n_timed else 0)
         masked = table.copy()
         masked[:, :, :, unused] = 0
-        before = earlier[len(stages)] if earlier else None
-        stages.append(BayesianLocalizer.fit(masked, inputs, fibre_mask, positions, before))
+        earlier_stage = earlier[len(stages)] if earlier else None
+        stages.append(BayesianLocalizer.fit(masked, inputs, fibre_mask, positions, earlier_stage))
     return tuple(stages)
 
 
 def fit_projection(table: Array, residual: Array, fibre_mask: Mask, earlier: Array) -> Array:
-    """Return the whitened discriminants of each fibre (C, F, D): `earlier` ones where there are any, else fitted.
+    """Return the whitened linear discriminants of each fibre (C, F, D), fitted unless the fibre has `earlier` ones.
 
     Args:
         table: response by position, 0 where a feature is not used; shape (S, S, C, F).
         residual: of presses; shape (Q, C, F).
         fibre_mask: whether a fibre is valid in a press; shape (Q, C).
-        earlier: discriminants of the pad before, 0 for a fibre that had none; shape (C, F, D).
+        earlier: discriminants of the earlier pad, 0 for a fibre without; shape (C, F, D).
     """
     projection = earlier.copy()
     for fibre in np.flatnonzero(~earlier.any(axis=(1, 2))):
@@ -204,7 +233,7 @@ def fit_projection(table: Array, residual: Array, fibre_mask: Mask, earlier: Arr
 
 
 def _fit_lda(expected: Array, residual: Array, components: int) -> Array:
-    """Return (F, D) whitened linear discriminants of (S, F) inputs at positions and (Q, F) residuals of presses."""
+    """Return whitened linear discriminants (F, D), from responses at positions (S, F) and residuals (Q, F)."""
     size = residual.shape[1]
     scatter = residual.T @ residual / max(len(residual), 1) + MIN_VARIANCE * np.eye(size)
     whitening = np.linalg.inv(np.linalg.cholesky(scatter)).T
@@ -216,9 +245,12 @@ def _fit_lda(expected: Array, residual: Array, components: int) -> Array:
 
 
 def _solve_2x2(fisher: Any, prior_precision: Any, gradient: Any, xp: Any) -> tuple[Any, Any]:
-    """(Q, 2) variances and steps that solve (J + P) step = gradient; J is (Q, 3) in xx, yy, xy, P a (Q, 2) diagonal."""
+    """Solve (J + P) step = gradient for Q presses; return variances and steps, (Q, 2).
+
+    J is the Fisher information (Q, 3) in xx, yy and xy, P the diagonal prior precision (Q, 2).
+    """
     xx, yy, xy = fisher[:, 0] + prior_precision[:, 0], fisher[:, 1] + prior_precision[:, 1], fisher[:, 2]
-    det = xp.clip(fisher[:, 0] * fisher[:, 1] - xy**2, 0.0, np.inf)  # rounding may leave less than 0
+    det = xp.clip(fisher[:, 0] * fisher[:, 1] - xy**2, 0.0, np.inf)  # may be negative by rounding
     det = det + fisher[:, 0] * prior_precision[:, 1] + fisher[:, 1] * prior_precision[:, 0]
     det = det + prior_precision[:, 0] * prior_precision[:, 1]
     step = xp.stack([yy * gradient[:, 0] - xy * gradient[:, 1], xx * gradient[:, 1] - xy * gradient[:, 0]], axis=1)
@@ -230,15 +262,15 @@ def _rounded(part: Array) -> Array:
 
 
 def mean_distance(positions: Array) -> float:
-    """Return the distance between neighbours of (Q, 2) positions, if they lay on a grid."""
+    """Return the distance between neighbours of (Q, 2) positions, as if they formed a square grid."""
     return float(np.sqrt(np.ptp(positions, axis=0).prod() / len(np.unique(positions, axis=0))))
 
 
 def local_scatter(centres: Array, positions: Array, residual: Array, fibre_mask: Mask, width: float) -> Any:
-    """Return (P, C, D, D) covariances of (Q, C, D) residuals, weighted by the distance of presses from (P, 2) centres.
+    """Return local covariances (P, C, D, D) of residuals, with Gaussian weights by distance.
 
     Args:
-        centres: positions at which they are wanted; shape (P, 2).
+        centres: positions of the covariances; shape (P, 2).
         positions: of the presses; shape (Q, 2).
         residual: whitened; shape (Q, C, D).
         fibre_mask: whether a fibre is valid in a press; shape (Q, C).
@@ -258,10 +290,10 @@ def local_scatter(centres: Array, positions: Array, residual: Array, fibre_mask:
 
 
 def _log_likelihood_coefficients(expected: Array, precision: Array) -> Array:
-    """(D (D + 3) / 2 + 1, P) coefficients of a normal log density about (P, D), of precision (P, D, D)."""
+    """Coefficients (D (D + 3) / 2 + 1, P) of a normal log density with mean (P, D) and precision (P, D, D)."""
     first, second = np.triu_indices(expected.shape[1])
     quadratic = -precision[:, first, second] * np.where(first == second, 0.5, 1.0)
     linear = np.einsum("pij,pj->pi", precision, expected)
     constant = 0.5 * (np.linalg.slogdet(precision)[1] - (linear * expected).sum(axis=1))
     coefficients = np.column_stack([quadratic, linear, constant]).T
-    return coefficients - coefficients.mean(axis=1, keepdims=True)  # what positions share costs digits only
+    return coefficients - coefficients.mean(axis=1, keepdims=True)  # common to all positions, and it would cost digits

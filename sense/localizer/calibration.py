@@ -1,7 +1,7 @@
 """Calibration: train a localizer on a recording, calibrate its uncertainty, and test it on presses held back.
 
-Presses are split three ways: training, calibration of the uncertainty, and test; of method "published", also those
-whose error ends the training.
+Presses are split into training, calibration of the uncertainty, and test; for method "published" also into presses for
+early stopping.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -38,7 +38,7 @@ from padforge.sense.localizer.network import (
     RESIDUAL,
     Networks,
     Weights,
-    answering,
+    active_networks,
     check_weights,
     predict_members,
 )
@@ -49,40 +49,40 @@ from padforge.sense.recording.frames import frame_rate_hz, framed
 from padforge.sense.recording.recording import Recording
 from padforge.sense.settings import LocalizerSettings
 
-FEW_PRESSES = 500  # up to which the plan of a pad says more of its response than basis functions do
-MIN_TRAINING = 3  # presses that a split must leave to learn from: fewer have no scale
+FEW_PRESSES = 500  # up to which the plan of a pad predicts its response better than basis functions
+MIN_TRAINING = 3  # training presses that a split must leave, since fewer have no scale
 CALIBRATION_SHARE = {"ensemble": 0.08, "published": 0.15 / 0.85}
-"""Share of the presses of training that calibrate the uncertainty. Of the published method, 15 % of all, half of which
-end the training."""
+"""Share of the training presses that calibrate the uncertainty; for the published method 15 % of all presses, half of
+them for early stopping."""
 MAX_TIME_BUDGET_S = 1e9
-MIN_DEPTH_RANGE_MM = 0.2  # depths of which nine tenths lie within this are one depth
-PRIOR_COUNT, SCALE_SUBSETS = 2, 6
-"""Presses that a member's own expected error counts as; sets of failed fibres of a size that scales are fitted on."""
+MIN_DEPTH_RANGE_MM = 0.2  # range of the central 90 % of depths, at or below which depth does not vary
+PRIOR_COUNT = 2  # weight of the expected error of a member in the calibration of its scale, in presses
+SCALE_SUBSETS = 6  # maximum sets of failed fibres of a size for the calibration of scales
 TRAINING_KEYS = "members", "hidden", "layers", "epochs"
-HALF_KNOWN, MEAN_RATIO, LOST_SHARE = 165.0, 0.67, 0.15
-"""What localizers of other pads have shown, with the defaults of TRAINING_KEYS and of 255 to 4000 presses of simulated
-pads and of the published recording: presses of training after which those never trained on err twice as much as
-expected, the excess being as 1 / presses; the mean ratio of a distance to the radius that is expected then, and by how
-much it falls with the share of fibres lost. It differs by 5 % between pads, by less between splits."""
-CONTRADICTION = 2.5  # standard errors by which the mean ratio of presses held back may differ from what is known
-INTERVAL_SUBSETS, MOMENT_SUBSETS = 32, 4
-"""Sets of failed fibres of a size that intervals are calibrated on, at most: of one moment, or of each of several."""
+# Prior for the uncertainty: experience with localizers of other pads, simulated and published, with the defaults of
+# TRAINING_KEYS and 255 to 4000 training presses. It differs by 5 % between pads, and by less between splits.
+DOUBLE_ERROR_PRESSES = 165.0  # with n training presses, new presses err 1 + this / n times as much as expected
+MEAN_RATIO = 0.67  # mean ratio of distance to expected radius, with that growth included
+FAILURE_RATIO_DECREASE = 0.15  # decrease of that ratio, relative, per share of failed fibres
+CONTRADICTION = 2.5  # standard errors by which calibration presses may differ from this experience
+INTERVAL_SUBSETS = 32  # maximum sets of failed fibres of a size for the calibration of intervals
+MOMENT_SUBSETS = 4  # the same where there are several moments
 
 
 @dataclass(frozen=True)
 class CalibrationData:
-    """Q presses of known position to train on and to calibrate by."""
+    """Q presses of known position, for training and for the calibration of the uncertainty."""
 
-    features: PressFeatures  # as commanded
-    detected: PressFeatures | None  # as they would be detected in the readings, to augment the others
+    features: PressFeatures  # of presses as commanded
+    detected: PressFeatures | None  # of the same presses as detected in the readings, for augmentation
     positions_mm: Array  # (Q, 2)
-    measures: Mapping[str, Array]  # (Q,) of each of depth and force to be predicted
+    measures: Mapping[str, Array]  # depth and force to be predicted, (Q,) each
     feature_set: FeatureSet
     rate_hz: float
-    sha256: str  # of what they came from
-    # features of presses when so many windows are complete; None if features know no moment
+    sha256: str  # of the source
+    # features by number of complete windows and indices of presses; None for features without moments
     at: Callable[[int, Indices], PressFeatures] | None = None
-    pad: Morphology | None = None  # as planned, if that is to be believed
+    pad: Morphology | None = None  # plan of the pad, as a prior
     contact: Contact = field(default_factory=Contact)
 
 
@@ -97,18 +97,18 @@ def calibrate(
 ) -> tuple[LocalizerModel, Evaluation]:
     """Train a localizer on a part of the presses and test it on the others.
 
-    Test presses enter nothing but the test, which looks at them once. Presses of unknown position are left out.
+    Test presses are used once, in the test alone. Presses of unknown position are ignored.
 
     Args:
         recording: readings and presses of known position.
-        options: how to train; the defaults if None.
-        pad: as planned, with its fibres on the channels in order, whose plan says what up to `FEW_PRESSES` presses do
-            not; None if it is not to be believed.
-        time_budget: seconds to train for, with as many members as that is good for; the result then depends on the
-            pace of the machine. None for the length and the members of `options`.
+        options: of the training; the defaults if None.
+        pad: plan of the pad, with its fibres on the channels in order, which serves as a prior for up to `FEW_PRESSES`
+            presses; None for no prior.
+        time_budget: seconds of training, which decide on the number of members; the result then depends on the speed
+            of the machine. None for the length and the members of `options`.
         by_moment: as in `evaluate`.
-        on_progress: called with (steps done, steps in all, "") in the training, with a time budget in seconds; before
-            and after it with what is being done.
+        on_progress: called with (steps done, total steps, "") in the training, in seconds if there is a time budget;
+            before and after it with the stage of the work.
 
     Returns:
         The localizer, and its evaluation on the test presses.
@@ -158,9 +158,8 @@ def fit_recording(
     readings, commands = frames.readings, (frames.down_command, frames.up_command)
     detected, measures = None, {}
     if options.method == "ensemble":
-        again = align_to_detected(readings, frames.times_s, *commands)
-        detected = compute_features(readings, *again)
-        measures = known_measures(recording, training)
+        detected = compute_features(readings, *align_to_detected(readings, frames.times_s, *commands))
+        measures = trainable_targets(recording, training)
     is_published = options.method == "published"
     features = compute_features(readings, *commands, is_published=is_published)
 
@@ -186,14 +185,17 @@ def fit_model(
 ) -> LocalizerModel:
     """Train a localizer and calibrate its uncertainty.
 
-    A share of the presses calibrates the uncertainty, drawn at random or the last ones, as the split is. The others
-    are trained on as they were commanded and, once more, as they would be detected. The published training ends by
-    presses of its own: were they those of the calibration, its intervals would be too short. InputError is raised for
-    too few presses, and for a training that diverged.
+    A share of the presses, drawn as the split states, calibrates the uncertainty. The others are used in training as
+    commanded and, a second time, as detected. The published training has separate presses for early stopping, without
+    which its intervals would be too short.
+
+    Raises:
+        InputError: too few presses, or a training that diverged.
     """
     # torch is slow to import, and predictions need none
     from padforge.sense.localizer.training import train_members, train_published
 
+    # 1. Response model
     is_ensemble = options.method == "ensemble"
     train, early_stop, calibration = _split_training(training, options, rng)
     features, rows = data.features[train], train
@@ -210,9 +212,11 @@ def fit_model(
         prior = plan_prior(data.pad, data.contact, scaler.origin_mm, scaler.scale_mm)
         table, fit = refit_response(scaler, presses, table, features.windows.shape[2], prior)
         leverage = fit.leverage
-    unfitted = leave_one_out_residuals(presses, table, leverage)
+
+    # 2. Tests for single presses, networks and Bayesian localizers
+    left_out = leave_one_out_residuals(presses, table, leverage)
     zero = scaler.mean_v / scaler.scale_v
-    tests = tuple(SinglePressTest.fit(table, unfitted, zero, n_complete) for n_complete in stages(n_timed))
+    tests = tuple(SinglePressTest.fit(table, left_out, zero, n_complete) for n_complete in stages(n_timed))
     bayes, residual_network, trained_share = (), {}, 1.0
     if is_ensemble:
         trained = train_members(presses, table, options, rng, on_progress, time_budget, leverage)
@@ -235,6 +239,8 @@ def fit_model(
         training_recording_sha256=data.sha256,
         trained_share=trained_share,
     )
+
+    # 3. Uncertainty
     if data.at is None:
         moments = [scaler.transform(data.features[calibration])]
     else:
@@ -243,10 +249,10 @@ def fit_model(
     model = replace(model, single_press=tuple(tests))
     positions_mm = data.positions_mm[calibration]
     measures = {name: values[calibration] for name, values in data.measures.items()}
-    usual = LocalizerSettings()
-    is_usual = all(getattr(options, name) == getattr(usual, name) for name in TRAINING_KEYS)
-    is_known = is_usual and is_ensemble and n_timed and not measures and trained_share >= TRAINED_OUT
-    n_trained = len(train) if is_known else None
+    defaults = LocalizerSettings()
+    is_default = all(getattr(options, name) == getattr(defaults, name) for name in TRAINING_KEYS)
+    has_prior = is_default and is_ensemble and n_timed and not measures and trained_share >= TRAINED_OUT
+    n_trained = len(train) if has_prior else None
     levels = _n_levels(options, model.fibres)
     return calibrate_uncertainty(model, moments, positions_mm, levels, measures, on_progress, n_trained)
 
@@ -260,31 +266,38 @@ def calibrate_uncertainty(
     on_progress: OnProgress = ignore_progress,
     n_trained: int | None = None,
 ) -> LocalizerModel:
-    """Calibrate the weights of the members, and `interval_factors`, on presses never trained on.
+    """Calibrate the weights of the members, and `interval_factors`, on presses that were not used in training.
 
-    `moments` are the presses when 1, 2, ... windows are complete, or once if features know no moment. `n_trained` are
-    the presses of the training, if what other pads have shown after as many says how wide radii are. Other arguments
-    are as in `evaluation.conformal`.
+    Args:
+        model: to calibrate.
+        moments: features of the presses when 1, 2, ... windows are complete, or once for features without moments.
+        positions_mm: of the presses; shape (Q, 2).
+        levels: numbers of failed fibres, from 0.
+        measures: as in `evaluation.conformal`.
+        on_progress: called with the stage of the work.
+        n_trained: number of training presses, if the experience with other pads serves as a prior.
     """
-    typical = False
+    is_typical = False
     if model.method == "ensemble":
-        model, typical = _calibrate_scales(model, moments, positions_mm, levels, on_progress, n_trained)
-    plain, n_sets = replace(model, interval_factors=np.ones_like(model.interval_factors)), INTERVAL_SUBSETS
-    if len(moments) > 1:
-        n_sets = MOMENT_SUBSETS
+        model, is_typical = _calibrate_scales(model, moments, positions_mm, levels, on_progress, n_trained)
+    uncalibrated = replace(model, interval_factors=np.ones_like(model.interval_factors))
+    n_sets = MOMENT_SUBSETS if len(moments) > 1 else INTERVAL_SUBSETS
     factors = []
     for presses in moments:
         on_progress(len(factors), len(moments), "radii")
         predictions = (
-            [plain.predict_features(presses, subset) for subset in failure_subsets(model.fibres, level, n_sets)]
+            [uncalibrated.predict_features(presses, subset) for subset in failure_subsets(model.fibres, level, n_sets)]
             for level in range(levels)
         )
-        ratios = (MEAN_RATIO * (1 - LOST_SHARE * level / model.fibres) if typical else None for level in range(levels))
-        pairs = zip(predictions, ratios, strict=True)
-        factors.append([conformal(each, positions_mm, measures, prior) for each, prior in pairs])
-    factors = factors[:1] * (len(moments) > 1) + factors  # before any window is complete, nothing is predicted
-    counted = len(positions_mm) + PRIOR_PRESSES * typical
-    return replace(model, interval_factors=np.clip(factors, 1e-6, 1e6), radii_presses=counted)
+        row = []
+        for level, of_level in enumerate(predictions):
+            ratio = MEAN_RATIO * (1 - FAILURE_RATIO_DECREASE * level / model.fibres) if is_typical else None
+            row.append(conformal(of_level, positions_mm, measures, ratio))
+        factors.append(row)
+    if len(moments) > 1:
+        factors = [factors[0], *factors]  # a placeholder for 0 complete windows, where nothing is predicted
+    n_presses = len(positions_mm) + PRIOR_PRESSES * is_typical
+    return replace(model, interval_factors=np.clip(factors, 1e-6, 1e6), radii_presses=n_presses)
 
 
 def _n_levels(options: LocalizerSettings, fibres: int) -> int:
@@ -299,37 +312,45 @@ def _calibrate_scales(
     on_progress: OnProgress,
     n_trained: int | None,
 ) -> tuple[LocalizerModel, bool]:
-    """Scale the expected errors of the positions of members to those on presses never trained on.
+    """Scale the expected errors of members to their errors on presses that were not used in training.
 
-    Then the weights of the members are right. The Bayesian localizer is overconfident of few or badly placed presses:
-    those of training are augmented by the same response that it predicts them by. After `n_trained` presses it is known
-    by how much members err more than they expect, and these presses say only which member does so more than another;
-    unless they contradict it. Also returned is whether this knowledge was used.
+    This corrects the weights of the members: the Bayesian localizer is overconfident after few or badly placed presses,
+    since training presses are augmented by the response that it predicts them with. After `n_trained` presses, the mean
+    of the scales is known from other pads, and these presses determine the ratios between members alone, unless they
+    contradict it.
+
+    Returns:
+        The model, and whether the experience with other pads was used.
     """
     targets = (positions_mm - model.scaler.origin_mm) / model.scaler.scale_mm
     subsets = [subset for level in range(levels) for subset in failure_subsets(model.fibres, level, SCALE_SUBSETS)]
-    # members that answer together, and the ratio of error to expected error
+
+    # 1. Ratios of error to expected error, with the names of the networks that answer together
     group_ratios: list[tuple[list[str], Array]] = []
     first = int(len(moments) > 1)
     for n_complete, presses in enumerate(moments, first):
         on_progress(n_complete - first, len(moments), "expected errors")
-        rows = np.flatnonzero(count_complete(presses.complete) == n_complete)  # not those that the next press cuts off
-        names = answering(model.networks, n_complete, presses.complete.shape[1], bool(model.bayes))
+        rows = np.flatnonzero(count_complete(presses.complete) == n_complete)  # the next press may cut off some
+        names = active_networks(model.networks, n_complete, presses.complete.shape[1], bool(model.bayes))
         for failed in subsets if len(rows) else ():
             fibre_mask = presses.fibre_mask[rows] & ~np.isin(np.arange(model.fibres), failed)
             inputs = presses.inputs[rows], fibre_mask, presses.complete[rows]
             outputs = predict_members(model.networks, *inputs, *model.corrected)
-            predicted, log_error = (each[:, :, :2] for each in np.split(outputs, 2, axis=2))
+            predicted, log_error = (half[:, :, :2] for half in np.split(outputs, 2, axis=2))
             expected = np.exp(np.clip(log_error, MIN_LOG_ERROR, MAX_LOG_ERROR)).mean(axis=2)
             group_ratios.append((names, (np.abs(predicted - targets[rows]).mean(axis=2) / expected).mean(axis=1)))
+
+    # 2. Comparison with other pads
     presses, expected_ratio, is_typical = len(positions_mm), 1.0, False
     if n_trained:
-        growth = 1 + HALF_KNOWN / n_trained
+        growth = 1 + DOUBLE_ERROR_PRESSES / n_trained
         excess = np.mean([ratio.mean() for _, ratio in group_ratios]) / growth - 1
         is_typical = bool(abs(excess) < CONTRADICTION * RATIO_SHAPE**-0.5 / np.sqrt(presses))
         if is_typical:
             expected_ratio = growth
             group_ratios = [(names, growth * ratio / ratio.mean()) for names, ratio in group_ratios]
+
+    # 3. Scale of each member, with its expected error as the prior
     ratios: dict[str, list[Array]] = {}
     for names, ratio in group_ratios:
         for name in names:
@@ -345,8 +366,8 @@ def _calibrate_scales(
         if name not in log_scales:
             return weights
         bias = weights["last.b"].copy()
-        of_position = slice(bias.shape[2] // 2, bias.shape[2] // 2 + 2)
-        bias[:, :, of_position] += log_scales[name][:, None, None]
+        log_errors = slice(bias.shape[2] // 2, bias.shape[2] // 2 + 2)
+        bias[:, :, log_errors] += log_scales[name][:, None, None]
         return {**weights, "last.b": bias}
 
     networks = {name: scaled(name, weights) for name, weights in model.networks.items()}
@@ -372,7 +393,7 @@ def check_trained(
 def _split_training(
     training: Indices, options: LocalizerSettings, rng: np.random.Generator
 ) -> tuple[Indices, Indices, Indices]:
-    """Presses to train on, to end a published training by, and to calibrate by."""
+    """Presses for training, for early stopping of a published training, and for calibration."""
     share = CALIBRATION_SHARE[options.method]
     train, held_back = (training[part] for part in split_presses(len(training), options.split, share, rng, 2))
     if options.method == "ensemble" or len(held_back) < 2:
@@ -381,8 +402,8 @@ def _split_training(
     return train, early_stop, calibration
 
 
-def known_measures(recording: Recording, presses: Indices) -> dict[str, Array]:
-    """Depth, if it is known of all `presses` and varies; then force too, if it is known of all."""
+def trainable_targets(recording: Recording, presses: Indices) -> dict[str, Array]:
+    """Return depth if it is known of all `presses` and varies, and with it force if it is known of all."""
     measures = recording.measures
     depth, force = (measures[name][presses] for name in ("depth_mm", "force_n"))
     if np.isnan(depth).any() or depth.min() <= 0 or np.ptp(np.percentile(depth, [5, 95])) <= MIN_DEPTH_RANGE_MM:
@@ -390,19 +411,19 @@ def known_measures(recording: Recording, presses: Indices) -> dict[str, Array]:
     return {"depth_mm": measures["depth_mm"]} if np.isnan(force).any() else measures
 
 
-def unlearnt_lines(recording: Recording, model: LocalizerModel) -> list[str]:
-    """Say in lines why a model has not learnt a depth or force that is known of some presses of a recording."""
-    learnt = {target.name for target in model.scaler.measures}
+def missing_target_lines(recording: Recording, model: LocalizerModel) -> list[str]:
+    """Return lines on why a model does not predict depth or force although a recording holds some of them."""
+    predicted = {target.name for target in model.scaler.measures}
     depth, force = (recording.measures[name][recording.has_position] for name in ("depth_mm", "force_n"))
     presses, n_above = len(depth), int((depth <= 0).sum())
     n_depth, n_force = int((~np.isnan(depth)).sum()), int((~np.isnan(force)).sum())
     if model.method != "ensemble":
         return []
-    if "depth_mm" not in learnt and n_above:
+    if "depth_mm" not in predicted and n_above:
         return [f"depth is not learnt: {n_above} of {presses} presses reached 0 mm or less"]
-    if "depth_mm" not in learnt and 0 < n_depth < presses:
+    if "depth_mm" not in predicted and 0 < n_depth < presses:
         return [f"depth is not learnt: it is known of {n_depth} of {presses} presses, needed is of all"]
-    if "depth_mm" in learnt and "force_n" not in learnt and n_force:
+    if "depth_mm" in predicted and "force_n" not in predicted and n_force:
         return [f"force is not learnt: it is known of {n_force} of {presses} presses, needed is of all"]
     return []
 
@@ -410,7 +431,7 @@ def unlearnt_lines(recording: Recording, model: LocalizerModel) -> list[str]:
 def split_unseen(
     recording: Recording, model: LocalizerModel | None, options: LocalizerSettings
 ) -> tuple[Indices, Indices]:
-    """Return presses of known position to train on, and those to test on, which `model`, if any, has not seen."""
+    """Return presses of known position for training, and those for a test, which a `model` has not been trained on."""
     positioned = np.flatnonzero(recording.has_position)
     if model is not None and (test := held_back_presses(model, recording)) is not None:
         return np.setdiff1d(positioned, test), test
@@ -422,9 +443,17 @@ def split_unseen(
 def split_presses(
     presses: int, split: str, share: float, rng: np.random.Generator, min_training: int = MIN_TRAINING
 ) -> tuple[Indices, Indices]:
-    """Return ascending indices of the presses to train on and of a share held back: drawn at random, or the last.
+    """Split presses into those for training and a share that is held back; return ascending indices of both.
 
-    `split` is "random" or "chronological". InputError is raised if fewer than `min_training` would be left.
+    Args:
+        presses: their number.
+        split: "random", or "chronological" to hold the last presses back.
+        share: of the presses held back.
+        rng: for a random split.
+        min_training: minimum number of training presses.
+
+    Raises:
+        InputError: fewer than `min_training` presses would be left.
     """
     n_held_back = max(round(share * presses), 1 if min_training < MIN_TRAINING else 0)
     if not 1 <= n_held_back <= presses - min_training:

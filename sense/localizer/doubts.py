@@ -1,4 +1,4 @@
-"""Doubts about an evaluation: another pad, and presses that cannot lie where the recording says."""
+"""Reasons to doubt an evaluation: another pad, and presses whose stated positions are improbable."""
 
 from collections.abc import Iterator
 
@@ -9,10 +9,10 @@ from padforge.sense.recording import doubts
 from padforge.sense.recording.recording import Recording
 
 MAX_RADII = 4.0
-"""Radii of 90 % between the predicted and the stated position of a press, at most: on the published recording they are
-up to 2.5, and 5 or more where the sign of one coordinate was lost."""
-MIN_WITHIN_R90 = 0.5  # share of presses within their radii; of a pad that has drifted for hours it is above
-MIN_PRESSES = 20  # from which that share means something
+"""Maximum distance of the predicted from the stated position, in radii of 90 %: on the published recording it is up to
+2.5, and 5 or more if the sign of a coordinate is lost."""
+MIN_WITHIN_R90 = 0.5  # minimum share of presses within their radii; on a pad that drifted for hours it is larger
+MIN_PRESSES = 20  # minimum number of presses for that share
 OTHER_PAD = (
     "these presses are unlike those of the calibration: another pad, or one cast again; radii do not hold; recalibrate"
 )
@@ -21,7 +21,7 @@ OTHER_PAD = (
 def find_doubts(
     recording: Recording, localization: Localization, within_r90: float, n_presses: int, is_other_pad: bool = False
 ) -> list[str]:
-    """Return what makes an evaluation doubtful, each in a line.
+    """Return reasons to doubt an evaluation, one a line.
 
     Args:
         recording: that was evaluated.

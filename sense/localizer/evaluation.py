@@ -13,7 +13,7 @@ from padforge.common.validation import InputError, check_int, check_type
 from padforge.design.objectives.fibre_loss import failure_subsets
 from padforge.sense.arrays import Array, Indices
 from padforge.sense.localizer.doubts import find_doubts
-from padforge.sense.localizer.features import DOWN, compute_features, interpolate_gaps, window_means
+from padforge.sense.localizer.features import PRESS_WINDOWS, compute_features, interpolate_gaps, window_means
 from padforge.sense.localizer.model import Localization, LocalizerModel
 from padforge.sense.localizer.moments import MOMENTS
 from padforge.sense.recording.frames import framed
@@ -24,15 +24,17 @@ if TYPE_CHECKING:
 
 FORMAT = "padforge-calibration/1"
 BUILT_PAD = "simulated, by default with the scatter of a built pad, which itself errs 0.97 / 1.20 / 1.54 / 2.32 mm"
-"""What a simulated error is, beside the errors of the published recording with 0 to 3 of its 6 fibres failed."""
+"""Note on simulated errors, with the errors of the published recording with 0 to 3 of its 6 fibres failed."""
 CELLS = 5  # cells along a side of the map of errors by position
-MOMENT_SETS = 3  # sets of failed fibres of a size that each moment is evaluated with, at most
+MOMENT_SETS = 3  # maximum sets of failed fibres of a size at each moment
 NO_MOMENTS: dict[str, Any] = {"by_moment": [], "focus": {}}
-TRAINED_OUT = 0.5  # share of the steps of a training from which errors are within a twentieth of those of a whole one
-PRIOR_PRESSES, RATIO_SHAPE, N_PRIOR = 100, 2.3, 200
-"""Presses that what other pads have shown counts as in radii; the shape of the gamma distribution that the ratio of
-distance to expected radius had there, whatever the pad, the moment and the fibres lost; and the quantiles of it."""
-UNSURE = 0.043  # share of presses by which that within r90 may differ before it is said
+TRAINED_OUT = 0.5  # share of the steps of a training from which on errors are within 5 % of those of a complete one
+PRIOR_PRESSES = 100  # weight of the experience with other pads in radii, in presses
+RATIO_SHAPE = 2.3
+"""Shape of the gamma distribution of the ratio of distance to expected radius on other pads; it does not depend on the
+pad, the moment or the failed fibres."""
+N_PRIOR = 200  # quantiles that represent this distribution
+UNSURE = 0.043  # uncertainty of the share within r90 above which it is reported
 ACTIVE = 0.02  # share of its range that a fibre must change by to be active in a press (paper, table III)
 Measures = Mapping[str, Array]
 _NO_PRIOR = np.empty(0)
@@ -51,13 +53,13 @@ class Evaluation:
         by_moment: rows of `errors_by_moment`.
         focus: how a press is localized while it is read, see `errors_by_moment`.
         idle_share: of each fibre, see `idle_share`.
-        test: true and predicted positions, depths and forces, with all fibres.
+        test: true and predicted positions, depths and forces, with all fibres valid.
         provenance: of the localizer, and the kind of the recording.
         training_presses: their number, after a calibration.
         settings: of the training, after a calibration.
-        trained_share: of the localizer: share of the usual steps of a training that it had.
-        radii_presses: of the localizer: presses on which its radii rest; 0 if that is not known.
-        doubts: what makes the evaluation doubtful, each in a line.
+        trained_share: share of the usual steps in the training of the localizer.
+        radii_presses: presses on which the radii of the localizer were calibrated; 0 if unknown.
+        doubts: reasons to doubt the evaluation, one a line.
     """
 
     errors: list[dict[str, Any]]
@@ -99,13 +101,13 @@ def evaluate(
 ) -> Evaluation:
     """Evaluate a localizer for every set of failed fibres of some sizes.
 
-    Of the recording of the training, only the presses that were held back count; of any other, all of known position.
+    Of the training recording, only the presses that were held back are used; of any other, all of known position.
 
     Args:
         model: to evaluate.
         recording: of a pad with the fibres of the training, with about as many readings a second or more.
         levels: numbers of failed fibres.
-        by_moment: whether presses are evaluated while they are read, too.
+        by_moment: whether to evaluate presses also while they are read.
         on_progress: called with (steps done, total, what is evaluated).
 
     Raises:
@@ -169,7 +171,7 @@ def evaluate(
 
 
 def held_back_presses(model: LocalizerModel, recording: Recording) -> Indices | None:
-    """Return the test presses of a model in the recording of its training, checked; None for one it has not seen."""
+    """Return the test presses of a model in its training recording, checked; None for any other recording."""
     if recording.digest in model.recalibrated_by:
         raise InputError("recording is one that the localizer was recalibrated by, expected one it has not seen")
     if recording.digest != model.training_recording_sha256:
@@ -191,9 +193,15 @@ def errors_by_loss(
     measures: Measures | None = None,
     on_progress: OnProgress = ignore_progress,
 ) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
-    """Return `errors` and `by_subset` of an evaluation; `predict` predicts presses without the fibres of its indices.
+    """Return `errors` and `by_subset` of an evaluation.
 
-    True positions are (Q, 2), and depths and forces (Q,), NaN where unknown.
+    Args:
+        fibres: their number.
+        levels: numbers of failed fibres.
+        predict: predicts the presses without the fibres of the given indices.
+        positions_mm: true positions; shape (Q, 2).
+        measures: true depths and forces, NaN where unknown; shape (Q,) each.
+        on_progress: called with (sets done, total, "sets of failed fibres").
     """
     rows, by_subset = [], []
     by_level = [failure_subsets(fibres, check_int("n_failed", level, 0, fibres - 1)) for level in levels]
@@ -216,9 +224,10 @@ def errors_by_moment(
 ) -> dict[str, Any]:
     """Return the errors of presses at `MOMENTS`, while they are read, for up to `MOMENT_SETS` sets of failed fibres.
 
-    "by_moment" has rows as those of `error_row`, with "since" touch or lift, "readings" since then, and "time_s".
-    "focus" is how the press of the median error is localized: "press", "pressed_mm", and "moments" with "since",
-    "time_s", "predicted_mm" and "r90_mm". Both are empty of a localizer that knows whole presses only.
+    Returns:
+        "by_moment": rows of `error_row`, with "since" touch or lift, "readings" since then, and "time_s"; and "focus":
+        the press of the median error, with "press", "pressed_mm", and "moments" of "since", "time_s", "predicted_mm"
+        and "r90_mm". Both are empty for a localizer without moments.
     """
     if model.features != "windows":
         return NO_MOMENTS
@@ -265,8 +274,8 @@ def error_row(
 ) -> dict[str, Any]:
     """Summarize the errors of presses predicted with each set of failed fibres of a size.
 
-    Mean, standard deviation and greatest are those of the mean errors of the sets; median, 95th percentile and shares
-    are over all presses. Arguments are as in `errors_by_loss`, with a prediction for each set.
+    Mean, standard deviation and maximum are over the mean errors of the sets; median, 95th percentile and shares are
+    over all presses. Arguments are as in `errors_by_loss`, with a prediction for each set.
     """
     errors = np.stack([distances(each.positions_mm, positions_mm) for each in predictions])
     means = errors.mean(axis=1)
@@ -314,15 +323,22 @@ def conformal(
     measures: Measures | None = None,
     prior_ratio: float | None = None,
 ) -> Array:
-    """Return the factors by which standard deviations, radii and r90 of measures must grow to hold on these presses.
+    """Return factors with which standard deviations, radii and r90 of measures hold on these presses.
 
-    Radii are split conformal (Lei et al. 2018, Distribution-free predictive inference for regression): a quantile of
-    distance over radius on presses that entered nothing before, one rank higher than the share, so that of few presses
-    they are more cautious. The (3 + T,) factors are of the standard deviation, the radii of 50 and 90 %, and the r90 of
-    T measures (1 where no true value is known); arguments are as in `error_row`.
+    Radii are split conformal (Lei et al. 2018, Distribution-free predictive inference for regression): quantiles of
+    distance over radius on presses that were not used before, one rank higher than the share, which is more cautious
+    after few presses.
 
-    Of few presses a quantile is a lottery. `prior_ratio` is the mean ratio of distance to radius that other pads let
-    expect: a gamma distribution about it counts as PRIOR_PRESSES further presses.
+    Args:
+        predictions: as in `error_row`.
+        positions_mm: as there.
+        measures: as there.
+        prior_ratio: mean ratio of distance to radius on other pads. A gamma distribution about it counts as
+            PRIOR_PRESSES further presses, since quantiles of few presses vary much. None for no prior.
+
+    Returns:
+        Factors (3 + T,) on the standard deviation, the radii of 50 and 90 %, and the r90 of T measures (1 if no true
+        value is known).
     """
     prior = _NO_PRIOR
     if prior_ratio is not None:
@@ -342,17 +358,17 @@ def conformal(
 
 
 def _joint_mean(values: Array, presses: int, prior: Array) -> float:
-    """The mean of values of so many presses and of those of the prior, if any."""
+    """Mean of the values of `presses` presses and of those of the prior, if any, weighted by PRIOR_PRESSES."""
     if not len(prior):
         return float(values.mean())
     return float((presses * values.mean() + PRIOR_PRESSES * prior.mean()) / (presses + PRIOR_PRESSES))
 
 
 def _conformal_quantile(share: float, ratios: Array, prior: Array = _NO_PRIOR) -> float:
-    """The least of (sets, Q) ratios that a share of them, and one more, does not exceed; the greatest if they are few.
+    """Conformal quantile of (sets, Q) ratios: the smallest that a share of them, plus one, does not exceed, if any.
 
-    The sets of one press are not independent: they count for as many as presses differ in how often they keep within.
-    Values of the prior count as PRIOR_PRESSES together.
+    The sets of failed fibres of one press are not independent; the effective sample size is that of a binomial
+    distribution with the observed variance between presses. Values of the prior weigh PRIOR_PRESSES in total.
     """
     within = (ratios <= np.quantile(ratios, share)).mean(axis=0)
     presses, variance = len(within), float(within.var())
@@ -361,13 +377,13 @@ def _conformal_quantile(share: float, ratios: Array, prior: Array = _NO_PRIOR) -
     weights = np.repeat([effective / ratios.size, PRIOR_PRESSES / max(len(prior), 1)], [ratios.size, len(prior)])
     order = np.argsort(values)
     below = np.cumsum(weights[order])
-    one_more = 0 if len(prior) else 1  # the prior is no less sure at its ends
-    rank = np.searchsorted(below, share * (below[-1] + one_more) - 1e-9)
+    extra = 0 if len(prior) else 1  # the finite-sample correction of split conformal intervals
+    rank = np.searchsorted(below, share * (below[-1] + extra) - 1e-9)
     return float(values[order[min(rank, len(order) - 1)]])
 
 
 def errors_by_position(predicted_mm: Array, pressed_mm: Array) -> list[dict[str, Any]]:
-    """Return presses, mean and greatest error in each cell that was pressed; "x_mm" and "y_mm" are its centre."""
+    """Return number of presses, mean and maximum error in each pressed cell, with its centre "x_mm", "y_mm"."""
     low, high = pressed_mm.min(axis=0), pressed_mm.max(axis=0)
     side = np.where(high > low, (high - low) / CELLS, 1.0)
     cells = np.minimum(((pressed_mm - low) / side).astype(int), CELLS - 1)
@@ -385,7 +401,7 @@ def idle_share(recording: Recording) -> Array:
     """Return the (C,) share of presses in which a fibre changes by less than `ACTIVE` of its range over all presses."""
     frames = framed(recording)
     readings, commands = interpolate_gaps(frames.readings), (frames.down_command, frames.up_command)
-    changes = window_means(readings, *commands, frames.up_command)[:, :, len(DOWN) - 1]
+    changes = window_means(readings, *commands, frames.up_command)[:, :, len(PRESS_WINDOWS) - 1]
     return (np.abs(changes) <= ACTIVE * np.ptp(changes, axis=0)).mean(axis=0)
 
 
@@ -421,13 +437,13 @@ def reserve_lines(document: Mapping[str, Any]) -> list[str]:
 
 
 def untrained_lines(document: Mapping[str, Any]) -> list[str]:
-    """Say in a line that a localizer of a calibration document is not trained out, if so."""
+    """Return a line if the training of the localizer of a calibration document was too short, else none."""
     share = document.get("trained_share", 1.0)
     return [f"not trained out: {share:.0%} of the usual steps; errors fall with more time"] * (share < TRAINED_OUT)
 
 
 def sureness_lines(document: Mapping[str, Any]) -> list[str]:
-    """Say in a line how sure the radii of a calibration document are, if they rest on few presses."""
+    """Return a line on the uncertainty of the radii of a calibration document if few presses calibrated them."""
     presses = document.get("radii_presses", 0)
     slack = 2 * math.sqrt(0.9 * 0.1 / presses) if presses else 0.0
     line = f"radii rest on few presses: of many others {0.9 - slack:.0%} to {min(0.9 + slack, 1):.0%} may lie in r90"

@@ -1,8 +1,8 @@
 """Features of presses: means of each fibre's readings over windows about a press, and its history before it.
 
-Windows lie as `moments` has them; where one would reach into a neighbouring press, the nearest reading that does not is
-repeated. A feature is made of one fibre's readings alone, so that a failed fibre can be masked and affects no other.
-Short gaps (NaN) are interpolated, and a fibre that lacks too much of a press is masked in it.
+The windows are those of `moments`. Where a window would reach into a neighbouring press, the nearest reading of its own
+press is repeated. Each feature depends on one fibre alone, so that a failed fibre can be masked and affects no other.
+Short gaps (NaN) are interpolated; a fibre with too few readings in a press is masked in it.
 """
 
 from dataclasses import dataclass
@@ -11,21 +11,31 @@ from typing import Literal
 import numpy as np
 
 from padforge.sense.arrays import Array, Indices, Mask
-from padforge.sense.localizer.moments import DOWN, MODULATED, N_TIMED, NOW, REST, UP, Window, complete_windows
+from padforge.sense.localizer.moments import (
+    LATEST_WINDOWS,
+    MODULATED,
+    N_TIMED,
+    PRESS_WINDOWS,
+    RELEASE_WINDOWS,
+    REST,
+    Window,
+    complete_windows,
+)
 
 FeatureSet = Literal["windows", "published", "array"]
-"""What is computed of a press: windows, the published running medians, or arrays that a caller computed."""
-PAST: tuple[Window, ...] = (
+"""Features of a press: windows, the published running medians, or arrays that a caller computed."""
+HISTORY_WINDOWS: tuple[Window, ...] = (
     *((-2, 0), (-5, -2), (-10, -5), (-15, -10), (-18, -15), (-20, -18), (-30, -20), (-40, -30)),
     *((-50, -40), (-60, -50), (-80, -60), (-100, -80), (-120, -100), (-160, -120)),
 )
-"""Windows of the history: silicone creeps for seconds to minutes after a press."""
-SLOW = (800, 4000)  # lengths, in readings before the press, of slow medians: a minute and five at 13 Hz
-SLOW_SAMPLES = 200  # readings that a slow median is taken of
-N_FEATURES, N_HISTORY = N_TIMED + len(NOW) + len(MODULATED), len(PAST) + len(SLOW)
-MEDIAN = 15  # width of the published running median, readings
+"""Windows before a press, since silicone creeps for seconds to minutes after an earlier one."""
+SLOW = (800, 4000)  # lengths of the slow medians before a press, readings: one and five minutes at 13 Hz
+N_MEDIAN_SAMPLES = 200  # readings in a slow median
+N_FEATURES = N_TIMED + len(LATEST_WINDOWS) + len(MODULATED)
+N_HISTORY = len(HISTORY_WINDOWS) + len(SLOW)
+MEDIAN_WIDTH = 15  # of the published running median, readings
 MEDIAN_OFFSET = 10  # readings from a command to the middle of the published median
-MIN_PRESENT = 0.75  # share of a press's readings that a fibre must have given to be valid in it
+MIN_PRESENT = 0.75  # minimum share of valid readings of a fibre in a press
 
 
 @dataclass(frozen=True)
@@ -33,9 +43,9 @@ class PressFeatures:
     """Features of Q presses in volts."""
 
     windows: Array  # (Q, C, F)
-    history: Array  # (Q, C, J), relative to the rest before the press
-    fibre_mask: Mask  # (Q, C), whether the fibre gave enough readings
-    complete: Mask  # (Q, K), which windows of `DOWN` and `UP` are complete; K = 0 if the features know no moment
+    history: Array  # (Q, C, J), relative to the baseline
+    fibre_mask: Mask  # (Q, C), whether the fibre has enough readings
+    complete: Mask  # (Q, K), complete windows of the press and the release; K = 0 for features without moments
 
     def __getitem__(self, rows: Indices | slice) -> "PressFeatures":
         return PressFeatures(self.windows[rows], self.history[rows], self.fibre_mask[rows], self.complete[rows])
@@ -56,30 +66,36 @@ def compute_features(
     is_published: bool = False,
     history: Array | None = None,
 ) -> PressFeatures:
-    """Compute the features of every press from (R, C) readings, V, NaN where missing.
+    """Compute the features of every press.
 
-    Commands are the (Q,) first readings after the probe was sent down, and after it was sent up. A press is looked at
-    up to before the reading `until` (Q,), to its end and to the next press if it is None. `is_published` asks for the
-    published running medians, which know no such moment. `history` is that of the presses, if it was computed before:
-    it takes longest.
+    Args:
+        readings: NaN where missing; shape (R, C), V.
+        down_command: first readings after the probe was sent down; shape (Q,).
+        up_command: first readings after it was sent up; shape (Q,).
+        until: first readings that are not used; shape (Q,). None for all readings up to the next press.
+        is_published: whether to compute the published running medians, which do not depend on `until`.
+        history: of the presses, if computed before, since it takes longest; shape (Q, C, J).
     """
     filled = interpolate_gaps(readings)
     _, next_begin = _neighbours(down_command, up_command, len(readings))
     until = next_begin if until is None else np.clip(until, down_command + 1, next_begin)
     fibre_mask = valid_fibres(readings, down_command, up_command, until)
     if is_published:
-        medians = _running_medians(filled, down_command, up_command)
-        empty = np.empty((*fibre_mask.shape, 0)), np.empty((len(medians), 0), bool)
-        return PressFeatures(medians, empty[0], fibre_mask, empty[1])
+        return features_without_moments(_running_medians(filled, down_command, up_command), fibre_mask)
     windows = window_means(filled, down_command, up_command, until)
     complete = complete_windows(down_command, up_command, until)
     history = compute_history(filled, down_command) if history is None else history
     return PressFeatures(windows, history, fibre_mask, complete)
 
 
+def features_without_moments(windows: Array, fibre_mask: Mask) -> PressFeatures:
+    """Return features (Q, C, F) that have no history and do not depend on a moment."""
+    return PressFeatures(windows, np.empty((*fibre_mask.shape, 0)), fibre_mask, np.empty((len(windows), 0), bool))
+
+
 def valid_fibres(readings: Array, down_command: Indices, up_command: Indices, until: Indices) -> Mask:
-    """Return (Q, C) which fibres gave enough readings of the presses, from the rest before them to `until` (Q,)."""
-    first, ends = np.maximum(down_command + REST[0], 0), np.minimum(until, up_command + UP[-1][1])
+    """Return (Q, C) which fibres have enough readings in a press, from the rest before it to `until` (Q,)."""
+    first, ends = np.maximum(down_command + REST[0], 0), np.minimum(until, up_command + RELEASE_WINDOWS[-1][1])
     counts = np.vstack([np.zeros((1, readings.shape[1])), np.cumsum(~np.isnan(readings), axis=0)])
     return counts[ends] - counts[first] >= MIN_PRESENT * (ends - first)[:, None]
 
@@ -98,34 +114,35 @@ def interpolate_gaps(readings: Array) -> Array:
 
 
 def window_means(readings: Array, down_command: Indices, up_command: Indices, until: Indices) -> Array:
-    """Return (Q, C, F) means over the windows `DOWN`, `UP` and `NOW` of a press, V, less the mean at rest before it."""
+    """Return (Q, C, F) means over the windows of press, release and latest readings, V, less the baseline."""
     previous_end, _ = _neighbours(down_command, up_command, len(readings))
     baseline = mean_at_rest(readings, down_command, previous_end)
     return windows_from_rest(readings, baseline, down_command, up_command, until)
 
 
 def mean_at_rest(readings: Array, down_command: Indices, previous_end: Indices) -> Array:
-    """Return (Q, C) means before the presses, V, back to the ends (Q,) of the presses before them at most."""
+    """Return the baselines (Q, C), V: means before the presses, after the ends (Q,) of the previous ones."""
     return _gather(readings, down_command, REST, previous_end, down_command).mean(axis=1)
 
 
 def windows_from_rest(
     readings: Array, baseline: Array, down_command: Indices, up_command: Indices, until: Indices
 ) -> Array:
-    """Return the windows of `window_means`, measured from the known rest (Q, C)."""
-    held = np.minimum(up_command, until)
-    places = [(down_command, window, held) for window in DOWN] + [(up_command, window, until) for window in UP]
-    places += [(held, window, held) for window in NOW]
-    means = [_gather(readings, origin, window, down_command, high).mean(axis=1) for origin, window, high in places]
+    """Return the windows of `window_means`, relative to a known baseline (Q, C)."""
+    hold_end = np.minimum(up_command, until)
+    spans = [(down_command, window, hold_end) for window in PRESS_WINDOWS]
+    spans += [(up_command, window, until) for window in RELEASE_WINDOWS]
+    spans += [(hold_end, window, hold_end) for window in LATEST_WINDOWS]
+    means = [_gather(readings, origin, window, down_command, high).mean(axis=1) for origin, window, high in spans]
     return np.stack(means, axis=2) - baseline[:, :, None]
 
 
 def compute_history(readings: Array, down_command: Indices) -> Array:
-    """Return (Q, C, J) readings before the presses, V, relative to the rest just before: windows, then slow medians.
+    """Return the history (Q, C, J) before the presses, V, relative to the baseline: windows, then slow medians.
 
-    Everything that was recorded counts, whether or not a press is known there.
+    It includes all readings, whether or not a press is known there.
     """
-    level = readings[0]  # subtracted, so that long sums keep their digits
+    level = readings[0]  # subtracted so that long sums keep their digits
     sums = np.vstack([np.zeros((1, readings.shape[1])), np.cumsum(readings - level, axis=0)])
 
     def mean(window: Window) -> Array:
@@ -134,22 +151,22 @@ def compute_history(readings: Array, down_command: Indices) -> Array:
         return (sums[end] - sums[first]) / (end - first)[:, None] + level
 
     slow = [_slow_median(readings, down_command, length) for length in SLOW]
-    return np.stack([*map(mean, PAST), *slow], axis=2) - mean(REST)[:, :, None]
+    return np.stack([*map(mean, HISTORY_WINDOWS), *slow], axis=2) - mean(REST)[:, :, None]
 
 
 def _slow_median(readings: Array, down_command: Indices, length: int) -> Array:
-    offsets = np.arange(-length, 0, length // SLOW_SAMPLES)
+    offsets = np.arange(-length, 0, length // N_MEDIAN_SAMPLES)
     out = np.empty((len(down_command), readings.shape[1]))
-    for first in range(0, len(down_command), 1024):  # in parts, since a press takes kilobytes
+    for first in range(0, len(down_command), 1024):  # in chunks, since a press takes kilobytes
         index = np.maximum(down_command[first : first + 1024, None] + offsets, 0)
         out[first : first + 1024] = np.median(readings[index], axis=1)
     return out
 
 
 def _running_medians(readings: Array, down_command: Indices, up_command: Indices) -> Array:
-    """(Q, C, 3) published features, V: the running median before, in and after the press."""
+    """(Q, C, 3) published features, V: the running medians before, in and after the press."""
     previous_end, next_begin = _neighbours(down_command, up_command, len(readings))
-    window = (-(MEDIAN // 2), MEDIAN // 2 + 1)
+    window = (-(MEDIAN_WIDTH // 2), MEDIAN_WIDTH // 2 + 1)
     ranges = (
         (down_command - MEDIAN_OFFSET, previous_end, down_command),
         (down_command + MEDIAN_OFFSET, down_command, up_command),

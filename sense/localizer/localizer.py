@@ -14,7 +14,7 @@ from padforge.common.validation import InputError, check_float
 from padforge.sense.arrays import MAX_MM, MAX_VOLTS, Array, Indices, check_magnitude, check_numbers
 from padforge.sense.localizer.calibration import MAX_TIME_BUDGET_S, CalibrationData, calibrate, fit_model, fit_recording
 from padforge.sense.localizer.evaluation import Evaluation, distances, evaluate
-from padforge.sense.localizer.features import PressFeatures
+from padforge.sense.localizer.features import PressFeatures, features_without_moments
 from padforge.sense.localizer.model import Localization, LocalizerModel
 from padforge.sense.recording.recording import PressSelection, Recording
 from padforge.sense.settings import LocalizerSettings
@@ -228,8 +228,7 @@ def _array_features(X: ArrayLike) -> PressFeatures:
         raise InputError(f"X has shape {windows.shape}, expected (Q, C, F)")
     check_magnitude("X", windows.reshape(len(windows), -1), MAX_VOLTS, "V", missing=True)
     present = np.isfinite(windows).all(axis=2)
-    empty = np.empty((*present.shape, 0)), np.empty((len(present), 0), bool)
-    return PressFeatures(np.where(present[:, :, None], windows, 0.0), empty[0], present, empty[1])
+    return features_without_moments(np.where(present[:, :, None], windows, 0.0), present)
 
 
 def _array_positions(y: ArrayLike | None) -> Array:

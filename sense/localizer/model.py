@@ -1,6 +1,6 @@
-"""The trained localizer: what it is made of, its predictions with any fibres failed, and its files. Needs no torch.
+"""The trained localizer: its parts, its predictions with any fibres failed, and its files. It does not need torch.
 
-Where it was trained on presses of several depths, it predicts depth too, and force where that was known.
+A localizer trained on presses of several depths also predicts depth, and force if that was known.
 """
 
 import json
@@ -22,13 +22,13 @@ from padforge.sense.localizer.bayes import BayesianLocalizer
 from padforge.sense.localizer.features import FeatureSet, PressFeatures, compute_features
 from padforge.sense.localizer.model_files import check_same_pad, files_of
 from padforge.sense.localizer.moments import (
-    FOLLOWING,
-    MAY_SLIDE,
-    N_DOWN,
+    BAYES_STAGES,
+    N_PRESS_WINDOWS,
     N_TIMED,
     PHASES,
+    POSSIBLE_SLIDE_THRESHOLD,
     RESIDUAL,
-    STAGES,
+    SLIDE_NETWORK,
     complete_at,
     count_complete,
 )
@@ -71,8 +71,8 @@ class Localization:
         r50_mm: (Q,) radius that holds the true position in 50 % of cases.
         r90_mm: (Q,) radius that holds it in 90 % of cases.
         measures: depth and force by the names of `Recording.measures`, where they are predicted.
-        unlike: (Q,) whether no single press explains the responses, as of two fingers; such a press may be anywhere,
-            and its radii say so. None if that was not judged.
+        unlike: (Q,) whether no single press explains the responses, for example those to two fingers; the radii of such
+            a press are those of an unknown position. None if not tested.
     """
 
     positions_mm: Array
@@ -85,7 +85,7 @@ class Localization:
 
 def write_localization(localization: Localization, path: str | Path) -> None:
     """Write predictions as CSV of `COLUMNS` and `MEASURE_COLUMNS`, one line a press, atomically."""
-    estimates = [column for each in localization.measures.values() for column in (each.values, each.r90)]
+    estimates = [column for measure in localization.measures.values() for column in (measure.values, measure.r90)]
     columns = [localization.positions_mm, localization.std_mm, localization.r50_mm, localization.r90_mm, *estimates]
     names = (*COLUMNS, *(name for measure in localization.measures for name in MEASURE_COLUMNS[measure]))
     texts = [[f"{value:.4f}" for value in row] for row in np.column_stack(columns).tolist()]
@@ -98,40 +98,38 @@ def write_localization(localization: Localization, path: str | Path) -> None:
 
 
 def concatenate(parts: Sequence[Localization]) -> Localization:
-    """Concatenate the predictions of localizers that predict the same measures; at least one part, none judged."""
+    """Concatenate one or more predictions of the same measures, without `unlike`."""
 
-    def joined(estimates: Sequence[Any], *names: str) -> Iterator[Array]:
-        return (np.concatenate([getattr(each, name) for each in estimates]) for name in names)
+    def stack(estimates: Sequence[Any], *names: str) -> Iterator[Array]:
+        return (np.concatenate([getattr(estimate, name) for estimate in estimates]) for name in names)
 
     measures = {
-        name: MeasureEstimate(*joined([part.measures[name] for part in parts], "values", "r90"))
+        name: MeasureEstimate(*stack([part.measures[name] for part in parts], "values", "r90"))
         for name in parts[0].measures
     }
-    return Localization(*joined(parts, "positions_mm", "std_mm", "r50_mm", "r90_mm"), measures)
+    return Localization(*stack(parts, "positions_mm", "std_mm", "r50_mm", "r90_mm"), measures)
 
 
 @dataclass(frozen=True, kw_only=True)
 class LocalizerDocument:
-    """What `localizer.json` holds, by these names; the only list of its fields."""
+    """Content of `localizer.json`, by these names."""
 
     __pydantic_config__: ClassVar[ConfigDict] = DOCUMENT_CONFIG
     method: Method
     features: FeatureSet
-    rate_hz: Annotated[
-        float, Field(ge=MIN_RATE_HZ, le=MAX_RATE_HZ)
-    ]  # readings a second of the recording of the training
+    rate_hz: Annotated[float, Field(ge=MIN_RATE_HZ, le=MAX_RATE_HZ)]  # of the training recording
     scaler: FeatureScaler
     # (K + 1, L, 3 + T) by numbers of complete windows and of failed fibres: factors from the expected error to the
-    # standard deviation, to the radii of 50 and 90 %, and to the r90 of T measures, from presses never trained on
+    # standard deviation, the radii of 50 and 90 %, and the r90 of T measures, calibrated on presses held back
     interval_factors: Annotated[Array, *array_field(1e-9, 1e6)]
     training_recording_sha256: Digest
-    split: Split = "random"  # how the test presses of the training were held back
+    split: Split = "random"  # of training and test presses
     test: tuple[Annotated[int, Field(ge=0)], ...] = ()
-    recalibrated_by: tuple[Digest, ...] = ()  # recordings all of whose presses it has seen
-    fibre_names: tuple[str, ...] = ()  # of the recording of the training, if that was imported
-    pad_sha256: Digest | Literal[""] = ""  # of its `pad_digest`
+    recalibrated_by: tuple[Digest, ...] = ()  # recordings of recalibrations
+    fibre_names: tuple[str, ...] = ()  # of the training recording, if it was imported
+    pad_sha256: Digest | Literal[""] = ""  # `pad_digest` of the training recording
     trained_share: Annotated[float, Field(gt=0, le=1)] = 1.0  # of the usual steps of a training
-    radii_presses: Annotated[int, Field(ge=0)] = 0  # on which the factors rest
+    radii_presses: Annotated[int, Field(ge=0)] = 0  # presses on which the factors were calibrated
     errors: Sequence[Mapping[str, int | float]] = ()  # rows of `evaluation.error_row` on the test presses
     provenance: Mapping[str, JsonValue] = field(default_factory=dict)
 
@@ -145,10 +143,10 @@ class LocalizerModel(LocalizerDocument):
 
     Attributes:
         networks: of the members, see `network.Networks`.
-        table: (S, S, C, F + G) scaled response by position, by which a recalibration augments presses.
-        bayes: the Bayesian localizers, see `bayes.fit_stages`; none where depths vary, and of method "published".
+        table: (S, S, C, F + G) scaled response by position, which a recalibration augments presses with.
+        bayes: Bayesian localizers, see `bayes.fit_stages`; none where depths vary, or for method "published".
         residual_network: weights of the network that corrects them.
-        single_press: tests whether one press explains the responses, one for each of `single_press.stages`.
+        single_press: tests for single presses, one for each of `single_press.stages`.
     """
 
     networks: Networks
@@ -159,12 +157,12 @@ class LocalizerModel(LocalizerDocument):
 
     @property
     def fibres(self) -> int:
-        """C, the number of fibres it was trained on."""
+        """Number of fibres, C."""
         return len(self.scaler.mean_v)
 
     @property
     def max_failures(self) -> int:
-        """Failed fibres that it was trained for, at most."""
+        """Maximum number of failed fibres that it was trained for."""
         return self.interval_factors.shape[1] - 1
 
     @property
@@ -174,14 +172,14 @@ class LocalizerModel(LocalizerDocument):
 
     @property
     def sliding(self) -> Sliding | None:
-        """How a finger that slides is followed; None where none is."""
-        return Sliding(*self.scaler.to_now(N_TIMED)) if FOLLOWING in self.networks else None
+        """Tracking of sliding fingers; None if the localizer does not track them."""
+        return Sliding(*self.scaler.latest_window_map(N_TIMED)) if SLIDE_NETWORK in self.networks else None
 
     def check_recording(self, recording: Recording) -> None:
         """Raise InputError unless a recording is of the pad of the training, with its fibres, their names and its rate.
 
         Args:
-            recording: to be localized. Names and plans that one of both does not know tell nothing.
+            recording: to be localized. Names and plans are compared if both have them.
         """
         check_same_pad(self, "the localizer", recording.fibres, recording.rate_hz)
         if self.pad_sha256 and recording.pad_digest not in ("", self.pad_sha256):
@@ -189,10 +187,10 @@ class LocalizerModel(LocalizerDocument):
                 f"recording is of a pad with the plan {recording.pad_digest[:12]}, "
                 f"the localizer was learnt from {self.pad_sha256[:12]}"
             )
-        for fibre, (name, learnt) in enumerate(zip(recording.fibre_names, self.fibre_names, strict=False), 1):
-            if name != learnt and (name in self.fibre_names or learnt in recording.fibre_names):
+        for fibre, (name, trained) in enumerate(zip(recording.fibre_names, self.fibre_names, strict=False), 1):
+            if name != trained and (name in self.fibre_names or trained in recording.fibre_names):
                 raise InputError(
-                    f"fibre {fibre} is {short_repr(name)}, the localizer learnt it as {short_repr(learnt)}; "
+                    f"fibre {fibre} is {short_repr(name)}, the localizer learnt it as {short_repr(trained)}; "
                     f"import the fibres in the order {join_names(self.fibre_names)}"
                 )
 
@@ -201,7 +199,7 @@ class LocalizerModel(LocalizerDocument):
 
         Args:
             recording: of a pad with the fibres of the training, with about as many readings a second or more.
-            until: (Q,) first frames (see `framed`) that are not looked at; None for all up to the next press.
+            until: (Q,) first frames (see `framed`) that are not used; None for all frames up to the next press.
 
         Raises:
             InputError: another pad, a localizer that was fitted to arrays, or `until` is no reading for each press.
@@ -256,7 +254,7 @@ class LocalizerModel(LocalizerDocument):
     def is_other_pad(self, presses: ScaledFeatures) -> bool:
         """Return whether presses are of another pad than that of the calibration, or of one cast again by its plan.
 
-        Fewer than 25 are not judged; a pad that drifts, or has two failed fibres, is no other.
+        The result is false for fewer than 25 presses, and for a pad that drifts or has two failed fibres.
 
         Args:
             presses: scaled features.
@@ -264,7 +262,7 @@ class LocalizerModel(LocalizerDocument):
         return is_other_pad(self.single_press, find_misfits(self.single_press, presses))
 
     def calibrate_tests(self, recording: Recording, presses: Indices) -> tuple[SinglePressTest, ...]:
-        """Return `single_press` with what is usual of some presses of a recording, which were never trained on.
+        """Return `single_press`, calibrated on some presses of a recording that were not used in training.
 
         Args:
             recording: as `raw_features`, and raises as it does.
@@ -277,7 +275,7 @@ class LocalizerModel(LocalizerDocument):
         return tuple(tests)
 
     def localize(self, presses: ScaledFeatures, failed: ArrayLike = ()) -> Localization:
-        """Predict the positions of Q presses, and judge whether each of them is a single press.
+        """Predict the positions of Q presses, and test whether each of them is a single press.
 
         Args:
             presses: scaled features.
@@ -290,9 +288,11 @@ class LocalizerModel(LocalizerDocument):
         presses = replace(presses, fibre_mask=np.logical_and(presses.fibre_mask, self._working(failed)))
         unlike = find_unlike(self.single_press, presses)
         rows = np.flatnonzero(unlike)
-        if self.sliding is not None and len(rows):  # the response to a finger that slides is that to many presses
+        if self.sliding is not None and len(rows):  # a sliding finger responds like several presses
             inputs = presses.inputs[rows], presses.fibre_mask[rows], presses.complete[rows]
-            unlike[rows] = self.sliding.follow(self.networks[FOLLOWING], *inputs).moved <= MAY_SLIDE
+            unlike[rows] = (
+                self.sliding.follow(self.networks[SLIDE_NETWORK], *inputs).distance <= POSSIBLE_SLIDE_THRESHOLD
+            )
         std_mm, r50_mm, r90_mm = np.array(UNIFORM) * self.scaler.scale_mm
         measures = {
             target.name: replace(estimate, r90=np.where(unlike, target.scale, estimate.r90))
@@ -308,14 +308,16 @@ class LocalizerModel(LocalizerDocument):
         )
 
     def predict_features(self, presses: ScaledFeatures, failed: ArrayLike = ()) -> Localization:
-        """Predict the positions of Q single presses; one without a valid fibre may be anywhere, and its radii say so.
+        """Predict the positions of Q single presses.
+
+        A press without a valid fibre has the middle of the pressed area, and the radii of an unknown position.
 
         Args:
             presses: scaled features.
             failed: indices of fibres to mask in every press.
 
         Raises:
-            InputError: `failed` are no such fibres, or all; or some, and the method is "published".
+            InputError: `failed` are no indices of fibres, or all of them, or any for method "published".
         """
         fibre_mask: Mask = np.logical_and(presses.fibre_mask, self._working(failed))
         chunk = max(1, _CHUNK // self.fibres)
@@ -328,7 +330,7 @@ class LocalizerModel(LocalizerDocument):
         empties = empty, empty, np.empty(0, bool)
         targets, std, slid = (np.concatenate(part) for part in zip(empties, *parts, strict=True))
         n_complete, level = count_complete(presses.complete), np.minimum((~fibre_mask).sum(axis=1), self.max_failures)
-        factors = self.interval_factors[np.where(slid, N_DOWN - 1, n_complete), level]
+        factors = self.interval_factors[np.where(slid, N_PRESS_WINDOWS - 1, n_complete), level]
         to_std, to_r50, to_r90 = factors[:, :3].T * self.scaler.scale_mm
         radius = np.hypot(*std[:, :2].T)
         is_complete = n_complete > 0 if presses.complete.shape[1] else np.ones(len(presses), bool)
@@ -363,10 +365,10 @@ class LocalizerModel(LocalizerDocument):
         return working
 
     def save(self, folder: str | Path) -> None:
-        """Write `localizer.json` and `localizer.safetensors`, both or none; `load` reads the same to the last bit.
+        """Write `localizer.json` and `localizer.safetensors` atomically; `load` restores every bit.
 
         Args:
-            folder: where to; its localizer is replaced.
+            folder: destination; its localizer is replaced.
 
         Raises:
             InputError: the folder cannot be written.
@@ -408,7 +410,7 @@ class LocalizerModel(LocalizerDocument):
             phase, _, part = name.partition(".")
             networks[phase][part] = arrays.pop(name)
         residual_network = networks.pop(RESIDUAL)
-        n_stages = (len(STAGES) if n_timed else 1) if residual_network else 0
+        n_stages = (len(BAYES_STAGES) if n_timed else 1) if residual_network else 0
         bayes = tuple(BayesianLocalizer.from_arrays(arrays, number) for number in range(n_stages))
         tests = tuple(SinglePressTest.from_arrays(arrays, number) for number in range(len(stages(n_timed))))
         parts: dict[str, Any] = {"networks": networks, "table": table, "bayes": bayes, "single_press": tests}

@@ -1,24 +1,25 @@
-"""Moments of a press: the windows of its readings, which of them are complete, and who answers then.
+"""Timeline of a press: windows of its readings, which of them are complete, and which networks answer then.
 
-Windows are counted in frames (see `recording.frames`) from a command of the probe; here of a press of 20, up to its
+Windows are counted in frames (see `recording.frames`) from a command of the probe. For a press of 20 frames, up to its
 release::
 
     frame    -10     0       4       8       12      16      20      24      28      32      36      40
     command          down_command                            up_command
     REST     |       |
-    DOWN               |0|1|2|3|4| 5 |   6   |   7   |   8   |
-    UP                                                       |0|1|2|3| 4 |  5  |    6    |     7     |
-    NOW                                                  |1|0|
+    PRESS_WINDOWS      |0|1|2|3|4| 5 |   6   |   7   |   8   |
+    RELEASE_WINDOWS                                          |0|1|2|3| 4 |  5  |    6    |     7     |
+    LATEST_WINDOWS                                       |1|0|
 
-They are complete one after the other, so that their number K = 0 .. N_TIMED says how far a press is. Each phase of it
-has a network of its own (`PHASES`), as one for all of them learns each of them less well::
+They are complete one after the other, so that the number of complete windows, K = 0 .. N_TIMED, says how far a press
+is. Each phase of a press has its own network (`PHASES`), since one network for all phases learns each of them less
+well::
 
-    complete     what is known        network                       and
-    0                                                               the press may be anywhere
-    1 .. 8       the touch            "touched"
-    9            it rests             "settled"                     "touched", where the finger has slid since SOON
-    10 .. 17     the release          "released"                    from 12 on the Bayesian localizer of the last of
-                                                                    `STAGES`, corrected by the network "residual"
+    complete     phase            network       in addition
+    0            -                -             the press may be anywhere
+    1 .. 8       touch            "touched"
+    9            rest             "settled"     "touched", if the finger has slid since `EARLY_WINDOWS`
+    10 .. 17     release          "released"    from 12 on the Bayesian localizer of the last of `BAYES_STAGES` that is
+                                                complete, corrected by the network "residual"
 """
 
 from bisect import bisect_right
@@ -32,26 +33,30 @@ from padforge.sense.arrays import Indices, Mask
 
 Window = tuple[int, int]
 
-REST: Window = (-10, 0)  # frames before the probe is sent down; the other windows are measured from their mean
-DOWN: tuple[Window, ...] = ((1, 2), (2, 3), (3, 4), (4, 5), (5, 6), (6, 8), (8, 12), (12, 16), (16, 20))
+REST: Window = (-10, 0)
+"""Frames at rest before the probe is sent down; their mean is the baseline of the other windows."""
+PRESS_WINDOWS: tuple[Window, ...] = ((1, 2), (2, 3), (3, 4), (4, 5), (5, 6), (6, 8), (8, 12), (12, 16), (16, 20))
 """Windows after the probe was sent down: fine while it sinks in, broad while it rests in the silicone."""
-UP: tuple[Window, ...] = ((0, 1), (1, 2), (2, 3), (3, 4), (4, 6), (6, 9), (9, 14), (14, 20))
+RELEASE_WINDOWS: tuple[Window, ...] = ((0, 1), (1, 2), (2, 3), (3, 4), (4, 6), (6, 9), (9, 14), (14, 20))
 """Windows after the probe was sent up: the release depends on the position as much as the press does."""
-NOW: tuple[Window, ...] = ((-1, 0), (-2, -1))
-"""Windows before the moment, or before the release if that is earlier: where the finger is now if it moves."""
-N_DOWN, N_TIMED = len(DOWN), len(DOWN) + len(UP)  # K, windows of a press in the order in which they are complete
-MODULATED = slice(2, 5), slice(5, 9), slice(12, 17)  # windows whose sensitivity is modulated together
+LATEST_WINDOWS: tuple[Window, ...] = ((-1, 0), (-2, -1))
+"""Windows before the latest reading, or before the release if that is earlier: they locate a finger that moves."""
+N_PRESS_WINDOWS = len(PRESS_WINDOWS)
+N_TIMED = len(PRESS_WINDOWS) + len(RELEASE_WINDOWS)
+"""Largest K: the windows of a press that are complete one after the other."""
+MODULATED = slice(2, 5), slice(5, 9), slice(12, 17)
+"""Groups of windows; the sensitivity of a group is modulated as one (see `response_model`)."""
 
 
 @dataclass(frozen=True)
 class Moment:
-    """A time in a press: so many readings after the first that shows it, or after the probe was sent up."""
+    """Time in a press, in readings after the first that shows the touch, or after the probe was sent up."""
 
     since: Literal["touch", "lift"]
     readings: int
 
     def until(self, touched: Indices, up_command: Indices) -> Indices:
-        """Return the first readings (Q,) of presses that are not looked at; `touched` (Q,) are those that show them."""
+        """Return the first readings (Q,) after the moment; `touched` (Q,) are the first that show the touch."""
         return np.minimum(touched + self.readings, up_command) if self.since == "touch" else up_command + self.readings
 
 
@@ -64,12 +69,12 @@ MOMENTS = (
 
 @dataclass(frozen=True)
 class Phase:
-    """Numbers of complete windows, from `first` on, that a network is trained for, and how."""
+    """Numbers of complete windows, from `first` on, that a network is trained for."""
 
     first: int
-    shares: tuple[float, ...]  # of the training that looks at each of these numbers
-    length: float = 1.0  # of the training
-    sliding: float = 0.0  # share of presses in it that slide
+    shares: tuple[float, ...]  # share of the training at each of these numbers
+    length: float = 1.0  # relative length of the training
+    sliding: float = 0.0  # share of presses that slide in the training
 
     def __contains__(self, n_complete: object) -> bool:
         return isinstance(n_complete, int) and self.first <= n_complete < self.first + len(self.shares)
@@ -78,44 +83,52 @@ class Phase:
 PHASES: Mapping[int, Mapping[str, Phase]] = {
     N_TIMED: {
         "touched": Phase(1, (0.05, 0.12, 0.26, 0.15, 0.11, 0.09, 0.08, 0.07, 0.07), 1.4, sliding=0.3),
-        "settled": Phase(N_DOWN, (1.0,), 1.3),
-        "released": Phase(N_DOWN + 1, (*(0.5 / (len(UP) - 1),) * (len(UP) - 1), 0.5), 1.7),
+        "settled": Phase(N_PRESS_WINDOWS, (1.0,), 1.3),
+        "released": Phase(
+            N_PRESS_WINDOWS + 1,
+            (*(0.5 / (len(RELEASE_WINDOWS) - 1),) * (len(RELEASE_WINDOWS) - 1), 0.5),
+            1.7,
+        ),
     },
-    N_DOWN: {"held": Phase(1, (*(0.5 / (N_DOWN - 1),) * (N_DOWN - 1), 0.5), sliding=0.2)},
+    N_PRESS_WINDOWS: {"held": Phase(1, (*(0.5 / (N_PRESS_WINDOWS - 1),) * (N_PRESS_WINDOWS - 1), 0.5), sliding=0.2)},
     0: {"press": Phase(0, (1.0,))},
 }
-"""Networks by K, the number of windows that are complete one after the other: all of them, those of the touch alone, or
-none, if features know no moment. The last one that is trained for a moment answers."""
-FOLLOWING, RESIDUAL = "touched", "residual"
-"""The network that follows a finger which slides, as others know fingers at rest alone; and the one that corrects the
-Bayesian localizers."""
-SOON, LEAST_SLIDE = 5, 3.0
-"""Complete windows soon after the touch: a finger that is farther from where it was then than so many standard
-deviations is believed to have slid. Of presses at rest, hardly one is."""
-MAY_SLIDE = 1.75
-"""The same from which on it may have slid, and is not taken for two fingers: 5 % of pairs of fingers look like that."""
-STAGES = (12, 13, 14, 15, 17)
-"""Numbers of complete windows of a press from which on a Bayesian localizer of its own answers, the first one after the
-release has shown: before, it errs a third more than a network."""
-CORRECTED = Phase(N_DOWN + 3, (0.15, 0.1, 0.15, 0.1, 0.05, 0.45))
-"""When the Bayesian localizer answers, with the network that corrects it."""
+"""Phases by the name of their network, for each number of timed windows: all, those of the touch alone, or none if the
+features do not depend on the moment. Where phases overlap, the last one answers."""
+SLIDE_NETWORK = "touched"
+"""Network that follows a sliding finger; the others know fingers at rest alone."""
+RESIDUAL = "residual"
+"""Network that corrects the Bayesian localizers."""
+EARLY_WINDOWS = 5
+"""Complete windows soon after the touch, when a finger has not slid far."""
+SLIDE_THRESHOLD = 3.0
+"""Distance from the position at `EARLY_WINDOWS`, in its standard deviations, above which a press counts as sliding;
+rarely exceeded at rest."""
+POSSIBLE_SLIDE_THRESHOLD = 1.75
+"""The same, above which a press may be sliding and is not taken for two fingers; 5 % of pairs of fingers exceed it."""
+BAYES_STAGES = (12, 13, 14, 15, 17)
+"""Complete windows from which on a Bayesian localizer of its own answers. Before the release has shown, at 12, it errs
+by a third more than a network."""
+RESIDUAL_PHASE = Phase(N_PRESS_WINDOWS + 3, (0.15, 0.1, 0.15, 0.1, 0.05, 0.45))
+"""Phase of the network that corrects the Bayesian localizers."""
 
 
 def complete_windows(down_command: Indices, up_command: Indices, until: Indices) -> Mask:
-    """Return (Q, K) which windows of `DOWN` and `UP` are complete before the readings `until` (Q,).
+    """Return (Q, K) which windows of `PRESS_WINDOWS` and `RELEASE_WINDOWS` are complete before readings `until` (Q,).
 
-    A press that is shorter than `DOWN` has all of it once it has ended: its last reading is repeated.
+    After the release all `PRESS_WINDOWS` are complete, also those of a shorter press, whose last reading is repeated.
     """
     released = (until > up_command)[:, None]
-    down = (down_command[:, None] + [end for _, end in DOWN] <= until[:, None]) | released
-    return np.hstack([down, released & (up_command[:, None] + [end for _, end in UP] <= until[:, None])])
+    press_ends, release_ends = ([end for _, end in windows] for windows in (PRESS_WINDOWS, RELEASE_WINDOWS))
+    pressed = (down_command[:, None] + press_ends <= until[:, None]) | released
+    return np.hstack([pressed, released & (up_command[:, None] + release_ends <= until[:, None])])
 
 
 def complete_at(n_complete: int, down_command: Indices, up_command: Indices) -> Indices:
-    """Return the first readings (Q,) at which so many windows of presses, 1 or more, are complete."""
-    if n_complete <= N_DOWN:
-        return down_command + DOWN[n_complete - 1][1]
-    return up_command + UP[n_complete - N_DOWN - 1][1]
+    """Return the first readings (Q,) at which `n_complete` windows of a press, 1 or more, are complete."""
+    if n_complete <= N_PRESS_WINDOWS:
+        return down_command + PRESS_WINDOWS[n_complete - 1][1]
+    return up_command + RELEASE_WINDOWS[n_complete - N_PRESS_WINDOWS - 1][1]
 
 
 def count_complete(complete: Mask) -> Indices:
@@ -123,14 +136,14 @@ def count_complete(complete: Mask) -> Indices:
     return complete.sum(axis=1)
 
 
-def stage_of(n_complete: int, n_timed: int) -> int | None:
-    """Return which of the Bayesian localizers answers when so many of K windows are complete, if any."""
+def bayes_stage(n_complete: int, n_timed: int) -> int | None:
+    """Return the index of the Bayesian localizer that answers when `n_complete` windows of K are complete, if any."""
     if not n_timed:
         return 0
-    return bisect_right(STAGES, n_complete) - 1 if n_complete >= STAGES[0] else None
+    return bisect_right(BAYES_STAGES, n_complete) - 1 if n_complete >= BAYES_STAGES[0] else None
 
 
-def answering(networks: Container[str], n_complete: int, n_timed: int, has_bayes: bool) -> list[str]:
-    """Return the names of the networks that answer when so many of K windows are complete, in their order."""
+def active_networks(networks: Container[str], n_complete: int, n_timed: int, has_bayes: bool) -> list[str]:
+    """Return the names of the networks that answer when `n_complete` windows of K are complete, `RESIDUAL` last."""
     names = [name for name, phase in PHASES[n_timed].items() if n_complete in phase and name in networks][-1:]
-    return [*names, RESIDUAL] if has_bayes and stage_of(n_complete, n_timed) is not None else names
+    return [*names, RESIDUAL] if has_bayes and bayes_stage(n_complete, n_timed) is not None else names

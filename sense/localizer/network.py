@@ -1,8 +1,9 @@
 """Networks of the localizer in NumPy, for inference; `torch_network` is the same ensemble in torch, for training.
 
-Method "ensemble": a heteroscedastic ensemble of residual MLPs whose inputs are masked features and the mask, so that
-one network serves every set of failed fibres. Residual layers are h + relu(layer_norm(h)) W + b; the outputs are scaled
-position (and depth, force) and the logarithms of their expected absolute errors. Method "published": one tanh layer.
+Method "ensemble" is a heteroscedastic ensemble of residual MLPs. Their inputs are masked features and the masks, so
+that one network serves every set of failed fibres. Residual layers are h + relu(layer_norm(h)) W + b. Outputs are the
+scaled position (and depth, force) and the logarithms of their expected absolute errors. Method "published" is a network
+of one tanh layer.
 """
 
 from collections.abc import Mapping, Sequence
@@ -17,15 +18,15 @@ from padforge.sense.arrays import Floats, Mask
 from padforge.sense.localizer.bayes import BayesianLocalizer
 from padforge.sense.localizer.model_files import check_arrays
 from padforge.sense.localizer.moments import (
-    FOLLOWING,
-    LEAST_SLIDE,
-    N_DOWN,
-    NOW,
+    EARLY_WINDOWS,
+    LATEST_WINDOWS,
+    N_PRESS_WINDOWS,
     RESIDUAL,
-    SOON,
-    answering,
+    SLIDE_NETWORK,
+    SLIDE_THRESHOLD,
+    active_networks,
+    bayes_stage,
     count_complete,
-    stage_of,
 )
 
 Weights = Mapping[str, Floats]
@@ -34,11 +35,12 @@ Weights = Mapping[str, Floats]
 network, E = 1, no `hidden`, and 2 in place of 2 N."""
 
 N_OUTPUTS = 4
-"""x, y and their log errors, in scaled units; with T measures, 2 T more: values follow y, and their logs the logs."""
+"""Outputs without measures: scaled x, y, and their log errors. With T measures, T values follow y, and T log errors
+those of x and y."""
 EPSILON = 1e-5  # added to the variance in layer normalization
-MIN_LOG_ERROR, MAX_LOG_ERROR = -9.0, 2.0
-"""Range of log errors: from a ten-thousandth of the pad to the whole pad and more."""
-MAX_WEIGHT = 1e4  # largest weight of a network, far above any that training ends with; no sum overflows below it
+MIN_LOG_ERROR = -9.0  # a ten-thousandth of the pad
+MAX_LOG_ERROR = 2.0  # more than the pad
+MAX_WEIGHT = 1e4  # far above the weights of any training; sums of smaller ones do not overflow
 
 
 def check_weights(weights: Weights, n_inputs: int, method: str, n_measures: int = 0) -> None:
@@ -64,7 +66,7 @@ def network_inputs(features: Floats, fibre_mask: Mask, complete: Mask) -> Floats
     """Return (Q, C F + C + K) inputs of a network from (Q, C, F) features and the (Q, C) and (Q, K) masks."""
     untimed = np.ones((len(complete), features.shape[2] - complete.shape[1]), bool)
     mask = fibre_mask[:, :, None] & np.hstack([complete, untimed])[:, None]
-    # What is masked is replaced, not multiplied, by 0: not even NaN gets through.
+    # Masked features are replaced, not multiplied, by 0, since they may be NaN.
     masked = np.where(mask, features, np.float32(0)).reshape(len(features), np.prod(features.shape[1:]))
     return np.concatenate([masked, fibre_mask.astype(np.float32), complete.astype(np.float32)], axis=1)
 
@@ -92,18 +94,23 @@ def predict_members(
     bayes: Sequence[BayesianLocalizer] = (),
     residual_network: Weights = MappingProxyType({}),
 ) -> Floats:
-    """Return the (E, Q, 2 N) outputs of all members that answer for Q presses with as many complete windows.
+    """Return the outputs (E, Q, 2 N) of the members that answer for presses with equally many complete windows.
 
-    Features are (Q, C, F + G), scaled, with (Q, C) and (Q, K) masks. The last member is the Bayesian localizer of the
-    phase, if any, corrected by its residual network.
+    Args:
+        networks: by phase.
+        features: scaled; shape (Q, C, F + G).
+        fibre_mask: valid fibres; shape (Q, C).
+        complete: complete windows, the same number in each press; shape (Q, K).
+        bayes: Bayesian localizers by stage. With them, the one of the stage is the last member.
+        residual_network: corrects the Bayesian localizer.
     """
     n_complete, n_timed = int(complete[:1].sum()), complete.shape[1]
     is_published = "hidden.w" not in next(iter(networks.values()))
     x = features.reshape(len(features), -1) if is_published else network_inputs(features, fibre_mask, complete)
-    names = answering(networks, n_complete, n_timed, bool(bayes))
+    names = active_networks(networks, n_complete, n_timed, bool(bayes))
     outputs = [forward(networks[name], x) for name in names if name != RESIDUAL]
     if RESIDUAL in names:
-        localizer = bayes[stage_of(n_complete, n_timed) or 0]
+        localizer = bayes[bayes_stage(n_complete, n_timed) or 0]
         position, summary = localizer.predict(features.astype(np.float64), fibre_mask)
         outputs.append(forward(residual_network, np.concatenate([x, summary.astype(np.float32)], axis=1)))
         outputs[-1][:, :, :2] += position
@@ -119,12 +126,20 @@ def predict(
     residual_network: Weights = MappingProxyType({}),
     sliding: "Sliding | None" = None,
 ) -> tuple[Floats, Floats, Mask]:
-    """Predict presses at any moments; those of a finger that has slid by the network that follows it.
+    """Predict presses at any moments, those of sliding fingers by `SLIDE_NETWORK`.
 
-    Arguments are as in `predict_members`.
+    Args:
+        networks: by phase.
+        features: as in `predict_members`.
+        fibre_mask: as there.
+        complete: complete windows, whose number may differ between presses; shape (Q, K).
+        bayes: as there.
+        residual_network: as there.
+        sliding: how sliding fingers are tracked; None if they are not.
 
     Returns:
-        (Q, N) scaled targets and their standard deviations, 0 before the first moment, and (Q,) whether it has slid.
+        Scaled targets (Q, N) and their standard deviations, 0 where no window is complete; and whether a finger has
+        slid (Q,).
     """
     n_complete = count_complete(complete)
     first = next(iter(networks.values()))
@@ -136,55 +151,64 @@ def predict(
             inputs = features[rows], fibre_mask[rows], complete[rows]
             targets[rows], std[rows] = combine_members(predict_members(networks, *inputs, bayes, residual_network))
     slid = np.zeros(len(complete), bool)
-    rows = np.flatnonzero(n_complete >= N_DOWN)
+    rows = np.flatnonzero(n_complete >= N_PRESS_WINDOWS)
     if sliding is not None and len(rows):
-        following = sliding.follow(networks[FOLLOWING], features[rows], fibre_mask[rows], complete[rows])
-        slid[rows] = following.moved > LEAST_SLIDE
-        targets[slid], std[slid] = (part[slid[rows]] for part in following[:2])
+        tracked = sliding.follow(networks[SLIDE_NETWORK], features[rows], fibre_mask[rows], complete[rows])
+        slid[rows] = tracked.distance > SLIDE_THRESHOLD
+        targets[slid], std[slid] = tracked.targets[slid[rows]], tracked.std[slid[rows]]
     return targets, std, slid
 
 
-class Followed(NamedTuple):
-    """Where a finger was last, by the network that follows it."""
+class TrackedFinger(NamedTuple):
+    """Latest position of a finger by `SLIDE_NETWORK`, and how far it has slid."""
 
     targets: Floats  # (Q, N), scaled
     std: Floats  # (Q, N)
-    moved: Floats  # (Q,) distance from where it was soon after the touch, in standard deviations then
+    distance: Floats  # (Q,) from the position at `EARLY_WINDOWS`, in standard deviations of that one
 
 
 @dataclass(frozen=True)
 class Sliding:
-    """How a finger that slides is followed."""
+    """Tracking of sliding fingers."""
 
-    # (C, len(NOW), len(DOWN)), see `FeatureScaler.to_now`
+    # (C, len(LATEST_WINDOWS), len(PRESS_WINDOWS)), see `FeatureScaler.latest_window_map`
     now_factor: Floats
     now_offset: Floats
 
-    def follow(self, weights: Weights, features: Floats, fibre_mask: Mask, complete: Mask) -> Followed:
-        """Follow the finger of presses (Q, C, F + G) that are read to their end."""
+    def follow(self, weights: Weights, features: Floats, fibre_mask: Mask, complete: Mask) -> TrackedFinger:
+        """Track the finger of presses whose touch is complete.
+
+        Args:
+            weights: of `SLIDE_NETWORK`.
+            features: scaled; shape (Q, C, F + G).
+            fibre_mask: valid fibres; shape (Q, C).
+            complete: complete windows; shape (Q, K).
+        """
         n_timed = complete.shape[1]
 
         def predict_from(features: Floats, n_complete: int) -> tuple[Floats, Floats]:
             inputs = network_inputs(features, fibre_mask, complete & (np.arange(n_timed) < n_complete))
             return combine_members(forward(weights, inputs))
 
-        targets, std = predict_from(features, N_DOWN)
-        soon = features.copy()
-        for k in range(len(NOW)):
-            window = SOON - 1 - k
-            now = features[:, :, window] * self.now_factor[:, k, window] + self.now_offset[:, k, window]
-            soon[:, :, n_timed + k] = now
-        before, before_std = predict_from(soon, SOON)
-        moved = np.hypot(*(targets - before)[:, :2].T) / np.maximum(np.hypot(*before_std[:, :2].T), np.float32(1e-9))
-        return Followed(targets, std, moved)
+        targets, std = predict_from(features, N_PRESS_WINDOWS)
+        # At `EARLY_WINDOWS`, the latest windows were the last of these, which are single readings.
+        early = features.copy()
+        for k in range(len(LATEST_WINDOWS)):
+            window = EARLY_WINDOWS - 1 - k
+            latest = features[:, :, window] * self.now_factor[:, k, window] + self.now_offset[:, k, window]
+            early[:, :, n_timed + k] = latest
+        early_targets, early_std = predict_from(early, EARLY_WINDOWS)
+        distance = np.hypot(*(targets - early_targets)[:, :2].T)
+        distance = distance / np.maximum(np.hypot(*early_std[:, :2].T), np.float32(1e-9))
+        return TrackedFinger(targets, std, distance)
 
 
 def combine_members(outputs: Floats) -> tuple[Floats, Floats]:
-    """Combine (E, Q, 2 N) outputs by inverse variances: (Q, N) targets and their standard deviations, scaled.
+    """Combine (E, Q, 2 N) outputs by inverse variances; return (Q, N) targets and standard deviations, scaled.
 
-    The error of a member is taken as Laplace distributed, of variance 2 b^2 for the mean absolute error b. Members are
-    weighted press by press, alike in x and y; their disagreement adds to the variance (Lakshminarayanan et al. 2017,
-    Simple and scalable predictive uncertainty estimation using deep ensembles).
+    The error of a member is taken as Laplace distributed, with the variance 2 b^2 for the mean absolute error b.
+    Members are weighted press by press, equally in x and y. Their disagreement adds to the variance (Lakshminarayanan
+    et al. 2017, Simple and scalable predictive uncertainty estimation using deep ensembles).
     """
     targets, log_errors = np.split(outputs, 2, axis=2)
     variance = 2 * np.exp(2 * np.clip(log_errors, MIN_LOG_ERROR, MAX_LOG_ERROR))
@@ -197,17 +221,17 @@ def combine_members(outputs: Floats) -> tuple[Floats, Floats]:
 
 def stack_members(members: list[Weights]) -> Weights:
     """Stack the weights of networks of one size into an ensemble."""
-    return {name: np.concatenate([each[name] for each in members], axis=_axis(name)) for name in members[0]}
+    return {name: np.concatenate([member[name] for member in members], axis=_axis(name)) for name in members[0]}
 
 
 def unstack_members(weights: Weights) -> list[Weights]:
     """Return the weights of each member of an ensemble, as ensembles of one."""
     members = range(len(weights["last.b"]))
-    return [{name: np.take(part, [each], axis=_axis(name)) for name, part in weights.items()} for each in members]
+    return [{name: np.take(array, [k], axis=_axis(name)) for name, array in weights.items()} for k in members]
 
 
 def _axis(name: str) -> int:
-    """Axis of the members in a part of `Weights`."""
+    """Axis of the members in an array of `Weights`."""
     return 1 if name.startswith("hidden") else 0
 
 

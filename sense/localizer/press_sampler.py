@@ -1,8 +1,8 @@
-"""What a training draws: presses at random moments, moved to other positions, held still or sliding.
+"""Augmented presses for training: at random moments, moved to other positions, at rest or sliding.
 
-A press moved elsewhere responds as the table of the response says there, with its own residual. The response to a
-finger that slides is the superposition of those to where it was, each as old as that is: so strokes are learnt from
-presses.
+A press that is moved has the response of the table at its new position, plus its own residual. A sliding finger has the
+superposition of the responses to its earlier positions, each delayed by its age (see `_trace_slide`), so that strokes
+are learnt from presses.
 """
 
 import math
@@ -15,47 +15,49 @@ import torch
 from padforge.common.compilation import kernel
 from padforge.sense.arrays import Array, Floats, Indices, Mask
 from padforge.sense.localizer.bayes import N_SUMMARY, BayesianLocalizer
-from padforge.sense.localizer.moments import DOWN, N_DOWN, NOW, Phase, stage_of
+from padforge.sense.localizer.moments import LATEST_WINDOWS, N_PRESS_WINDOWS, PRESS_WINDOWS, Phase, bayes_stage
 from padforge.sense.localizer.response_model import interpolate_grid
 from padforge.sense.localizer.scaler import TrainingPresses
 
 FULL_SHARE = 0.25
-"""Share of training presses that keep all fibres; others lose 1 .. `max_failures`, each number as often."""
-NOW_NOISE = 0.05  # of single readings, beside that of means
-SPEEDS_MM_S = 2.0, 60.0  # range of their speeds, logarithmically uniform
-LONGER = 40  # readings beyond `DOWN` for which a finger slides
-RESIDUAL_MM = 10.0  # distance over which what a press leaves unexplained becomes another
-SUDDEN = 4  # window of `DOWN` up to which a response follows the finger; what changes later follows as much later
-N_NOW = len(NOW)
-_ENDS = np.array([0, *(end for _, end in DOWN), DOWN[-1][1] + 1])  # of windows of `DOWN`, and one before and after
-_MIDDLES = np.array([(first + end - 1) / 2 for first, end in DOWN])
-_WINDOW_OF = np.array([max(sum(first <= n for first, _ in DOWN) - 1, 0) for n in range(DOWN[-1][1])])  # a reading
+"""Share of training presses with all fibres; the others have 1 .. `max_failures` masked, each number equally often."""
+LATEST_NOISE = 0.05  # additional noise of `LATEST_WINDOWS`, which are single readings
+SPEEDS_MM_S = 2.0, 60.0  # range of speeds of sliding fingers, logarithmically uniform
+MAX_SLIDE_READINGS = 40  # maximum readings beyond `PRESS_WINDOWS` for which a finger slides
+RESIDUAL_LENGTH_MM = 10.0  # correlation length of residuals along a slide
+LAST_INSTANT_WINDOW = 4  # last of `PRESS_WINDOWS` that responds without delay
+N_LATEST = len(LATEST_WINDOWS)
+_HOLD = PRESS_WINDOWS[-1][1]
+_ENDS = np.array([0, *(end for _, end in PRESS_WINDOWS), _HOLD + 1])  # of `PRESS_WINDOWS`, with one before and after
+_MIDDLES = np.array([(first + end - 1) / 2 for first, end in PRESS_WINDOWS])
+_WINDOW_OF = np.array([max(sum(first <= n for first, _ in PRESS_WINDOWS) - 1, 0) for n in range(_HOLD)])
+"""Window of each reading after the probe was sent down."""
 
 
 class _Source(NamedTuple):
-    """What presses are drawn from."""
+    """Presses and response table that are sampled from."""
 
     table: Floats  # scaled response by position, over [-1, 1] in x and y; shape (S, S, C, F)
-    residual: Floats  # what the table leaves unexplained of each press; shape (Q, C, F)
-    complete: Mask  # windows that are complete; shape (Q, K)
+    residual: Floats  # features minus the response table, of each press; shape (Q, C, F)
+    complete: Mask  # complete windows; shape (Q, K)
     now_factor: Floats  # see `TrainingPresses`
     now_offset: Floats
     depth_gain: float  # growth of the response with the scaled depth
-    now_noise: float
+    latest_noise: float
 
 
 class _Moments(NamedTuple):
-    """When the presses of a batch are looked at, and how those slide that do, the first S of them."""
+    """Moments at which the presses of a batch are read, of which the first S slide."""
 
     counts: Indices  # complete windows; shape (B,)
-    last: Indices  # the latest reading of the press; shape (B,)
-    end: Array  # the latest reading of one that slides, which may do so for longer; shape (S,)
-    velocity: Array  # scaled distance from one reading to the next; shape (S, 2)
-    reach: float  # scaled distance over which a residual becomes another
+    last: Indices  # latest reading of the press; shape (B,)
+    end: Array  # latest reading of a slide, which may be longer than `PRESS_WINDOWS`; shape (S,)
+    velocity: Array  # scaled distance per reading; shape (S, 2)
+    correlation_length: float  # of residuals, scaled
 
 
 class PressSampler:
-    """Presses at random moments of a phase, whose features follow the response model to other targets."""
+    """Sampler of presses at random moments of a phase, with features for augmented targets."""
 
     def __init__(
         self,
@@ -73,21 +75,37 @@ class PressSampler:
         if self.targets.shape[1] > 2:
             expected *= 1 + self.depth_gain * self.targets[:, 2:3]
         residual = (presses.inputs - expected.reshape(presses.inputs.shape)).astype(np.float32)
-        now = presses.now_factor, presses.now_offset, float(self.depth_gain), NOW_NOISE
-        self._source = _Source(np.ascontiguousarray(table), residual, presses.complete, *now)
+        self._source = _Source(
+            np.ascontiguousarray(table),
+            residual,
+            presses.complete,
+            presses.now_factor,
+            presses.now_offset,
+            float(self.depth_gain),
+            LATEST_NOISE,
+        )
         self._n_timed = presses.complete.shape[1]
         self._bayes = tuple(stage.map_arrays(torch.from_numpy) for stage in bayes)
         self.n_inputs = fibres * (n_features + 1) + self._n_timed + (N_SUMMARY if bayes else 0)
-        self._phase, self._cumulated = phase, np.cumsum(phase.shares)
+        self._phase, self._cumulative_shares = phase, np.cumsum(phase.shares)
         self._speed, self._per_mm = presses.speed, presses.per_mm
 
-    def draw(self, batch: int) -> Indices:
-        """Draw (B,) rows of presses."""
+    def sample_rows(self, batch: int) -> Indices:
+        """Sample the rows (B,) of a batch of presses."""
         return self.rng.integers(len(self.targets), size=batch)
 
     def inputs(self, rows: Indices, targets: Floats, noise: float) -> tuple[Floats, Floats]:
-        """Network inputs (B, D), and positions to correct, (B, 2) or 0, of presses moved to (B, 2 + T) targets."""
-        moments = self._draw_moments(len(rows))
+        """Compute the network inputs of presses that are moved to other targets.
+
+        Args:
+            rows: of the presses; shape (B,).
+            targets: scaled; shape (B, 2 + T).
+            noise: standard deviation of noise on the scaled features.
+
+        Returns:
+            Inputs (B, D), and the positions (B, 2) by the Bayesian localizer, or 0 without one.
+        """
+        moments = self._sample_moments(len(rows))
         fibres, n_features = self._source.residual.shape[1:]
         fibre_mask = sample_fibre_dropout(len(rows), fibres, self._max_failures, self.rng)
         fibre_mask &= self._fibre_mask[rows]
@@ -95,32 +113,33 @@ class PressSampler:
         _compute_inputs(self._source, rows, targets, fibre_mask, moments, noise, self.rng, x)
         if not self._bayes:
             return x, np.zeros(1, np.float32)
-        bayes = self._bayes[stage_of(int(moments.counts[0]), self._n_timed) or 0]
+        bayes = self._bayes[bayes_stage(int(moments.counts[0]), self._n_timed) or 0]
         features = torch.from_numpy(x)[:, : fibres * n_features].view(-1, fibres, n_features)
         with torch.no_grad():
             position, summary = bayes.predict(features, torch.from_numpy(fibre_mask), torch)
         x[:, -N_SUMMARY:] = summary.numpy()
         return x, position.numpy()
 
-    def _draw_moments(self, batch: int) -> _Moments:
-        """Draw moments of the phase, a batch of one where a Bayesian localizer answers, of which each stage has one."""
-        n_drawn, rng = 1 if self._bayes else batch, self.rng
-        drawn = np.searchsorted(self._cumulated, rng.random(n_drawn) * self._cumulated[-1], side="right")
-        counts = np.full(batch, self._phase.first + drawn)
-        begin, end = (_ENDS[np.minimum(counts + k, N_DOWN + 1)] for k in (0, 1))
+    def _sample_moments(self, batch: int) -> _Moments:
+        """Sample moments of the phase; a single one with Bayesian localizers, since each serves one stage."""
+        n_moments, rng, shares = 1 if self._bayes else batch, self.rng, self._cumulative_shares
+        offsets = np.searchsorted(shares, rng.random(n_moments) * shares[-1], side="right")
+        counts = np.full(batch, self._phase.first + offsets)
+        begin, end = (_ENDS[np.minimum(counts + k, N_PRESS_WINDOWS + 1)] for k in (0, 1))
         last = begin + (rng.random(batch) * (end - begin)).astype(np.int64) - 1
         n_sliding = round(self._phase.sliding * batch) if self._speed and self._n_timed else 0
         low, high = np.log(SPEEDS_MM_S)
         speed = self._speed * np.exp(rng.uniform(low, high, n_sliding))
-        angle, longer = rng.uniform(0, 2 * math.pi, n_sliding), LONGER * rng.random(n_sliding) ** 2
+        angle = rng.uniform(0, 2 * math.pi, n_sliding)
+        extra_readings = MAX_SLIDE_READINGS * rng.random(n_sliding) ** 2
         velocity = speed[:, None] * np.column_stack([np.cos(angle), np.sin(angle)])
-        sliding = last[:n_sliding]
-        end = sliding + np.where(sliding >= _ENDS[N_DOWN] - 1, longer, 0.0)
-        return _Moments(counts, last, end, velocity, RESIDUAL_MM * self._per_mm)
+        end = last[:n_sliding]
+        end = end + np.where(end >= _ENDS[N_PRESS_WINDOWS] - 1, extra_readings, 0.0)
+        return _Moments(counts, last, end, velocity, RESIDUAL_LENGTH_MM * self._per_mm)
 
 
 def sample_fibre_dropout(batch: int, fibres: int, max_failures: int, rng: np.random.Generator) -> Mask:
-    """Sample (B, C) masks in which all fibres are kept, or 1 .. `max_failures` are masked, each set equally likely."""
+    """Sample (B, C) fibre masks: all fibres valid, or 1 .. `max_failures` masked, each set of a size equally likely."""
     count = rng.integers(1, max(max_failures, 1) + 1, (batch, 1))
     full = rng.random((batch, 1)) < (FULL_SHARE if max_failures else 1.0)
     rank = rng.random((batch, fibres)).argsort(axis=1)
@@ -131,43 +150,58 @@ def sample_fibre_dropout(batch: int, fibres: int, max_failures: int, rng: np.ran
 def _compute_inputs(
     source: Any, rows: Any, targets: Any, fibre_mask: Any, moments: Any, noise: float, rng: Any, x: Any
 ) -> None:
-    """Write the inputs of a network for presses (B,) of the source, moved to targets (B, 2 + T), into x, which is 0.
+    """Write the inputs of a network for presses of the source into x.
 
-    What is masked, and windows yet to come, stay 0.
+    Args:
+        source: a `_Source`.
+        rows: of the presses; shape (B,).
+        targets: to which presses are moved; shape (B, 2 + T).
+        fibre_mask: valid fibres; shape (B, C).
+        moments: `_Moments` of the presses.
+        noise: standard deviation of noise on the features.
+        rng: random number generator.
+        x: 0; shape (B, D). Masked features, and windows that are not complete, stay 0.
     """
     side, (fibres, size), n_timed = len(source.table), source.residual.shape[1:], source.complete.shape[1]
-    residual, features, of_now = np.empty(size), np.empty(size), np.empty(N_NOW)
-    complete, windows = np.ones(size, np.bool_), np.empty(N_NOW, np.int64)
+    residual, features, latest = np.empty(size), np.empty(size), np.empty(N_LATEST)
+    complete, latest_windows = np.ones(size, np.bool_), np.empty(N_LATEST, np.int64)
     for b, row in enumerate(rows):
+        # 1. Windows that are complete, and those that hold the latest readings
         gain = 1 + source.depth_gain * targets[b, 2] if targets.shape[1] > 2 else 1.0
         i, j, u, v = _locate(targets[b, 0], targets[b, 1], side)
         for k in range(n_timed):
             complete[k] = source.complete[row, k] and k < moments.counts[b]
             x[b, fibres * (size + 1) + k] = complete[k]
-        for k in range(N_NOW):
-            windows[k] = _WINDOW_OF[min(max(moments.last[b] - k, 0), len(_WINDOW_OF) - 1)]
+        for k in range(N_LATEST):
+            latest_windows[k] = _WINDOW_OF[min(max(moments.last[b] - k, 0), len(_WINDOW_OF) - 1)]
         is_sliding = b < len(moments.end)
-        is_now_mapped = n_timed > 0 and (is_sliding or moments.counts[b] <= N_DOWN)
+        has_latest = n_timed > 0 and (is_sliding or moments.counts[b] <= N_PRESS_WINDOWS)
         if is_sliding:
-            path = _trace(targets[b], moments.velocity[b], moments.end[b], windows, moments.reach, side)
-            other = rows[b - 1] if b else rows[len(moments.end) - 1]
+            path = _trace_slide(
+                targets[b], moments.velocity[b], moments.end[b], latest_windows, moments.correlation_length, side
+            )
+            other_row = rows[b - 1] if b else rows[len(moments.end) - 1]
         for c in range(fibres):
             if not fibre_mask[b, c]:
                 continue
             x[b, fibres * size + c] = 1
+            # 2. Response of a finger at rest
             for f in range(size):
-                if f < N_DOWN or complete[f]:
+                if f < N_PRESS_WINDOWS or complete[f]:
                     residual[f] = source.residual[row, c, f] + noise * rng.standard_normal()
                     features[f] = gain * _respond(source.table, i, j, u, v, c, f) + residual[f]
+            # 3. Windows that the slide changes, and the latest readings
             if is_sliding:
-                _slide(source, path, c, gain, residual, source.residual[other, c], noise, rng, features, of_now)
-            elif is_now_mapped:
-                for k in range(N_NOW):
-                    of_now[k] = features[windows[k]]
-            if is_now_mapped:
-                for k in range(N_NOW):
-                    mapped = of_now[k] * source.now_factor[c, k, windows[k]] + source.now_offset[c, k, windows[k]]
-                    features[n_timed + k] = mapped + source.now_noise * rng.standard_normal()
+                other_residual = source.residual[other_row, c]
+                _write_slide(source, path, c, gain, residual, other_residual, noise, rng, features, latest)
+            elif has_latest:
+                for k in range(N_LATEST):
+                    latest[k] = features[latest_windows[k]]
+            if has_latest:
+                for k in range(N_LATEST):
+                    window = latest_windows[k]
+                    scaled = latest[k] * source.now_factor[c, k, window] + source.now_offset[c, k, window]
+                    features[n_timed + k] = scaled + source.latest_noise * rng.standard_normal()
             for f in range(size):
                 if complete[f]:
                     x[b, c * size + f] = features[f]
@@ -175,7 +209,7 @@ def _compute_inputs(
 
 @kernel(inline="always")
 def _locate(x: float, y: float, side: int) -> tuple[int, int, float, float]:
-    """Return the cell of the table in which a position lies, or the nearest one, and how far in it along both axes."""
+    """Return the cell (i, j) of the table that is nearest to a position, and the position (u, v) in it, 0 to 1."""
     u = min(max((x + 1) * ((side - 1) / 2), 0.0), side - 1 - 1e-3)
     v = min(max((y + 1) * ((side - 1) / 2), 0.0), side - 1 - 1e-3)
     return int(u), int(v), u - int(u), v - int(v)
@@ -183,56 +217,82 @@ def _locate(x: float, y: float, side: int) -> tuple[int, int, float, float]:
 
 @kernel
 def _respond(table: Any, i: int, j: int, u: float, v: float, c: int, f: int) -> float:
-    """Interpolate a window of a fibre in the table."""
+    """Interpolate window f of fibre c bilinearly in cell (i, j) of the table."""
     near = (1 - v) * table[i, j, c, f] + v * table[i, j + 1, c, f]
     return (1 - u) * near + u * ((1 - v) * table[i + 1, j, c, f] + v * table[i + 1, j + 1, c, f])
 
 
 @kernel(inline="always")
-def _trace(target: Any, velocity: Any, end: float, now: Any, reach: float, side: int) -> tuple[Any, Any, Any, Any]:
-    """Trace a finger that slides to its target back to its touch, for the windows of `DOWN` and those of now.
+def _trace_slide(
+    target: Any, velocity: Any, end: float, latest_windows: Any, correlation_length: float, side: int
+) -> tuple[Any, Any, Any, Any]:
+    """Trace a finger from its target back to its touch, for `PRESS_WINDOWS` and then `LATEST_WINDOWS`.
+
+    With R_m(x) the response of window m to a press at x, L = `LAST_INSTANT_WINDOW`, x(t) the position of the finger and
+    t_m the middle of window m, the response of window k at time t is the superposition of delayed increments
+
+        R_min(k, L)(x(t)) + sum over n = 1 .. k - L of [R_(L + n) - R_(L + n - 1)](x(t - (t_(L + n) - t_L))).
+
+    Args:
+        target: position of the finger at the end; shape (2,).
+        velocity: scaled distance per reading; shape (2,).
+        end: time of the latest reading.
+        latest_windows: windows that hold the latest readings.
+        correlation_length: of residuals, scaled.
+        side: of the table.
 
     Returns:
-        Windows (J,), and the correlation (J,) of their residuals with the press's. Cells (L, J, 2) of the table and the
-        places (L, J, 2) in them, to which a window up to SUDDEN responds, and later ones one after the other.
+        Windows k (J,), the correlation (J,) of their residuals with that of the press at rest, and for each increment
+        n the cells (N, J, 2) of the table and the positions (N, J, 2) in them.
     """
-    count, later = N_DOWN + len(now), N_DOWN - SUDDEN
-    windows, correlation = np.empty(count, np.int64), np.empty(count)
-    cells, places = np.empty((later, count, 2), np.int64), np.empty((later, count, 2))
-    for k in range(count):
-        windows[k] = k if k < N_DOWN else now[k - N_DOWN]
-        time = _MIDDLES[k] if k < N_DOWN else end - (k - N_DOWN)
-        for n in range(later):
-            # Windows of `DOWN` before it have not seen the change; those of now may have.
-            behind = time - (_MIDDLES[SUDDEN + n] - _MIDDLES[SUDDEN])
-            since = max(end - max(behind, _MIDDLES[1]), 0.0)
-            x = min(max(target[0] - since * velocity[0], -1.0), 1.0)
-            y = min(max(target[1] - since * velocity[1], -1.0), 1.0)
-            i, j, u, v = _locate(x, y, side)
-            cells[n, k, 0], cells[n, k, 1], places[n, k, 0], places[n, k, 1] = i, j, u, v
+    n_windows, n_increments = N_PRESS_WINDOWS + len(latest_windows), N_PRESS_WINDOWS - LAST_INSTANT_WINDOW
+    windows, correlation = np.empty(n_windows, np.int64), np.empty(n_windows)
+    cells, fractions = np.empty((n_increments, n_windows, 2), np.int64), np.empty((n_increments, n_windows, 2))
+    for k in range(n_windows):
+        windows[k] = k if k < N_PRESS_WINDOWS else latest_windows[k - N_PRESS_WINDOWS]
+        time = _MIDDLES[k] if k < N_PRESS_WINDOWS else end - (k - N_PRESS_WINDOWS)
+        for n in range(n_increments):
+            delayed = time - (_MIDDLES[LAST_INSTANT_WINDOW + n] - _MIDDLES[LAST_INSTANT_WINDOW])
+            age = max(end - max(delayed, _MIDDLES[1]), 0.0)  # the finger does not slide before it has sunk in
+            x = min(max(target[0] - age * velocity[0], -1.0), 1.0)
+            y = min(max(target[1] - age * velocity[1], -1.0), 1.0)
+            cells[n, k, 0], cells[n, k, 1], fractions[n, k, 0], fractions[n, k, 1] = _locate(x, y, side)
             if n == 0:
-                correlation[k] = math.exp(-0.5 * (since * math.hypot(velocity[0], velocity[1]) / reach) ** 2)
-    return windows, correlation, cells, places
+                distance = age * math.hypot(velocity[0], velocity[1])
+                correlation[k] = math.exp(-0.5 * (distance / correlation_length) ** 2)
+    return windows, correlation, cells, fractions
 
 
 @kernel
-def _slide(
-    source: Any, path: Any, c: int, gain: float, residual: Any, other: Any, noise: float, rng: Any, down: Any, now: Any
+def _write_slide(
+    source: Any,
+    path: Any,
+    c: int,
+    gain: float,
+    residual: Any,
+    other_residual: Any,
+    noise: float,
+    rng: Any,
+    pressed: Any,
+    latest: Any,
 ) -> None:
-    """Write the windows of a fibre under a finger that slides, over those of one at rest."""
-    windows, correlation, cells, places = path
+    """Write the windows of fibre c under a sliding finger, see `_trace_slide`, into `pressed` and `latest`.
+
+    Along the slide, the residual of the press becomes `other_residual`, that of another press.
+    """
+    windows, correlation, cells, fractions = path
     for k in range(len(windows)):
         window, response = windows[k], 0.0
-        for n in range(1 + max(min(window, k) - SUDDEN, 0)):
-            i, j, u, v = cells[n, k, 0], cells[n, k, 1], places[n, k, 0], places[n, k, 1]
+        for n in range(1 + max(min(window, k) - LAST_INSTANT_WINDOW, 0)):
+            i, j, u, v = cells[n, k, 0], cells[n, k, 1], fractions[n, k, 0], fractions[n, k, 1]
             if n == 0:
-                response = _respond(source.table, i, j, u, v, c, min(window, SUDDEN))
+                response = _respond(source.table, i, j, u, v, c, min(window, LAST_INSTANT_WINDOW))
             else:
-                response += _respond(source.table, i, j, u, v, c, SUDDEN + n)
-                response -= _respond(source.table, i, j, u, v, c, SUDDEN + n - 1)
-        far = math.sqrt(1 - correlation[k] ** 2) * (other[window] + noise * rng.standard_normal())
-        slid = gain * response + correlation[k] * residual[window] + far
-        if k < N_DOWN:
-            down[k] = slid
+                response += _respond(source.table, i, j, u, v, c, LAST_INSTANT_WINDOW + n)
+                response -= _respond(source.table, i, j, u, v, c, LAST_INSTANT_WINDOW + n - 1)
+        uncorrelated = math.sqrt(1 - correlation[k] ** 2) * (other_residual[window] + noise * rng.standard_normal())
+        sliding = gain * response + correlation[k] * residual[window] + uncorrelated
+        if k < N_PRESS_WINDOWS:
+            pressed[k] = sliding
         else:
-            now[k - N_DOWN] = slid
+            latest[k - N_PRESS_WINDOWS] = sliding

@@ -1,14 +1,14 @@
-"""Recalibration: a localizer follows its pad, or another one of the same plan, by a few new presses.
+"""Recalibration: adapt a localizer to its pad, or to another one of the same plan, with a few new presses.
 
 Three models are compared by cross-validation over these presses:
 
 1. The localizer as it is.
-2. Corrected: a gain for every fibre, and the position, angle and scale of the pad, which fold into the scaling of the
-   features and the last layer of the networks.
-3. Refitted: the response of each fibre anew, with the maps so far, corrected if that is more probable, and the plan of
-   the pad as its prior, so that a fibre that is the same keeps its map and one that is not gets another; the Bayesian
-   localizers by it, and the networks trained further on it. This is for a pad that drifted as for one cast again, or of
-   which a fibre was replaced.
+2. Corrected: a gain for every fibre, and the position, angle and scale of the pad, which are folded into the scaling of
+   the features and the last layer of the networks.
+3. Refitted: the response of each fibre is fitted again. Its prior is the plan of the pad and the present maps,
+   corrected if that is more probable, so that an unchanged fibre keeps its map and a new one gets another. The Bayesian
+   localizers are fitted to this response, and the networks are fine-tuned on it. This serves a pad that has drifted,
+   that was cast again, or that has a new fibre.
 """
 
 from collections.abc import Callable, Sequence
@@ -29,7 +29,7 @@ from padforge.sense.localizer.bayes import fit_stages
 from padforge.sense.localizer.evaluation import Measures, conformal, distances, error_row
 from padforge.sense.localizer.features import PressFeatures
 from padforge.sense.localizer.model import Localization, LocalizerModel, concatenate
-from padforge.sense.localizer.network import Weights, answering
+from padforge.sense.localizer.network import Weights, active_networks
 from padforge.sense.localizer.response_model import grid_positions
 from padforge.sense.localizer.response_priors import map_prior, plan_prior, planned_pad, stated_contact
 from padforge.sense.localizer.response_process import ResponseFit, ResponsePrior
@@ -39,38 +39,36 @@ from padforge.sense.recording.frames import frame_rate_hz
 from padforge.sense.recording.recording import Recording
 
 FORMAT = "padforge-recalibration/1"
-GAIN_STD, ROTATION_STD, SHIFT_STD = 0.2, 0.05, 0.1
-"""Prior standard deviations: of the logarithm of a gain, of the angle (radians) and the logarithm of the scale, and of
-the shift (scaled position)."""
-R90_STD = 1.645  # standard deviations in the half-width that holds 90 % of a normal distribution
-DIFFERENCE = 0.02
-"""Step of numerical derivatives, in prior standard deviations: shorter ones drown in the rounding of the network."""
-MIN_PRESSES = 10  # new presses needed: fewer can neither change much nor show that it was for the better
-MAX_PRESSES = 500  # that are looked at: a fit takes the cube of them, and of more a calibration errs no more
+GAIN_STD = 0.2  # prior standard deviation of the logarithm of a gain
+ROTATION_STD = 0.05  # prior standard deviation of the angle (radians) and of the logarithm of the scale
+SHIFT_STD = 0.1  # prior standard deviation of the shift (scaled position)
+R90_STD = 1.645  # half-width of the central 90 % of a normal distribution, in standard deviations
+DIFF_STEP = 0.02  # step of finite differences, in prior standard deviations; smaller ones are lost in rounding
+MIN_PRESSES = 10  # new presses needed; fewer can neither change much nor show an improvement
+MAX_PRESSES = 500  # new presses used at most; the time of a fit grows with their cube, and more gain nothing
 FOLDS = 5
-CORRECT_FROM, REFIT_FROM = 2.0, 0.0
-"""Gains, in standard errors, from which a correction, which is coarse, and refitting, which gains the more the more
-presses there are, are kept."""
-MAX_EXPONENT = 0.5  # of the power of the presses with which errors fall: that of a mean
-SUBSETS = 16  # sets of failed fibres of a size that are looked at, at most
+MIN_CORRECTION_GAIN = 2.0  # minimum gain of a correction, which is coarse, in standard errors
+MIN_REFIT_GAIN = 0.0  # minimum gain of refitting, which gains more with more presses, in standard errors
+MAX_EXPONENT = 0.5  # maximum exponent of the power law of errors by number of presses, that of a mean
+SUBSETS = 16  # maximum sets of failed fibres of a size
 Predictions = Sequence[Sequence[Localization]]  # by number and by set of failed fibres
 Change = Callable[[LocalizerModel, PressFeatures, Array, Measures], LocalizerModel]
-"""By features, positions and measures of new presses."""
+"""Change of a model, by features, positions and measures of new presses."""
 
 
 @dataclass(frozen=True)
 class Recalibration:
-    """What a recalibration changed and gained.
+    """Result of a recalibration.
 
     Attributes:
         presses: number of new presses.
-        change: that was kept, "corrected" or "refitted"; None if none was.
-        candidates: "change" (None as it was), "mean_mm" and "standard_error_mm" of all that were compared: errors of
-            presses left out, and standard errors of their gains; averaged over numbers of failed fibres.
-        new_fibres: indices of the fibres that do not respond as they did, if refitted.
-        twice_as_many_mm: error that twice as many presses let expect, if refitted; else None.
+        change: "corrected", "refitted", or None if neither was kept.
+        candidates: "change" (None for the old localizer), "mean_mm" and "standard_error_mm" of all models compared:
+            errors of presses left out, and standard errors of their gains; averaged over numbers of failed fibres.
+        new_fibres: indices of the fibres that respond differently from before, if refitted.
+        twice_as_many_mm: error expected with twice as many presses, if refitted; else None.
         before: rows of `evaluation.error_row` on the new presses, by the old localizer.
-        after: the same by the new one, each press left out of what predicts it.
+        after: the same by the new localizer, cross-validated.
         gain_mm: decrease of the error, averaged over numbers of failed fibres.
         standard_error_mm: of the gain.
         widened: factors on the intervals.
@@ -104,18 +102,19 @@ def recalibrate(
 ) -> tuple[LocalizerModel, Recalibration]:
     """Adapt a localizer to a pad that has drifted, was cast again, or has a new fibre.
 
-    Radii only ever grow: they are widened where presses left out lie outside more often than they should. The `errors`
-    of the model stay those of its calibration.
+    Radii never shrink; they are widened if presses left out lie outside too often. The `errors` of the model remain
+    those of its calibration.
 
     Args:
-        model: the localizer so far.
-        recording: of the pad as it is now, with some 20 to 500 presses of known position; of more, so many are drawn.
-        pad: as planned, with its fibres on the channels in order; None for that of the recording, if it holds one.
+        model: the old localizer.
+        recording: of the pad as it is now, with some 20 to 500 presses of known position; of more presses, 500 are
+            sampled.
+        pad: plan of the pad, with its fibres on the channels in order; None for that of the recording, if it holds one.
         seed: of the folds and of the training.
-        on_progress: called with (steps done, steps in all, "").
+        on_progress: called with (steps done, total steps, "").
 
     Returns:
-        The localizer from now on, which predicts as the old one if nothing was gained, and what changed.
+        The new localizer, which predicts as the old one if nothing was gained, and the result.
 
     Raises:
         InputError: too few presses of known position, a recording that does not suit the localizer, or a pad of another
@@ -146,7 +145,7 @@ def recalibrate(
     predictions = validation.predict(validation.change(folds, fit_correction))
     candidates.append(validation.candidate("corrected", before, predictions))
     gain, standard_error = validation.gain(before, predictions)
-    if gain > CORRECT_FROM * standard_error:
+    if gain > MIN_CORRECTION_GAIN * standard_error:
         changed, after, change = fit_correction(model, *presses), predictions, "corrected"
     step()
 
@@ -166,7 +165,7 @@ def recalibrate(
         predictions = validation.predict(validation.change(folds, refit_last))
         candidates.append(validation.candidate("refitted", before, predictions))
         gain, standard_error = validation.gain(after, predictions)
-        if gain > REFIT_FROM * standard_error:
+        if gain > MIN_REFIT_GAIN * standard_error:
             half = halves.predict(halves.change([model] * 2, refit_last))
             twice_as_many_mm = _extrapolate(validation.mean_error(predictions), halves.mean_error(half))
             changed, is_new = refit(model, *presses)
@@ -203,7 +202,7 @@ def recalibrate(
 
 
 def _extrapolate(error_mm: float, half_mm: float) -> float:
-    """Error by twice as many presses, from those by presses less a fold and by half of them: a power law."""
+    """Extrapolate the error to twice as many presses by a power law, from cross-validation in folds and halves."""
     exponent = float(np.clip(np.log(half_mm / error_mm) / np.log(2 * (1 - 1 / FOLDS)), 0, MAX_EXPONENT))
     return error_mm * (2 / (1 - 1 / FOLDS)) ** -exponent
 
@@ -213,7 +212,7 @@ class _Refit:
     """Fit of the response, the Bayesian localizers and the networks of a localizer to new presses.
 
     Attributes:
-        prior: by the plan of the pad; None if that is not known.
+        prior: from the plan of the pad; None without a plan.
         seed: of the training.
     """
 
@@ -231,18 +230,21 @@ class _Refit:
     ) -> tuple[LocalizerModel, Mask]:
         """Return the refitted localizer, and which fibres (C,) are new.
 
-        `only_last` retrains the networks alone that answer when a press has been read to its end.
+        With `only_last`, only the networks that answer at the end of a press are retrained.
         """
         from padforge.sense.localizer.training import retrain  # torch takes long to import
 
+        # 1. Response, with the present maps or the corrected ones as the prior, by evidence
         starts = [old, fit_correction(old, features, positions_mm, measures)]
         fits = [self._fit_response(start, features, positions_mm, measures) for start in starts]
         number = int(np.argmax([fit.log_evidence for *_, fit in fits]))
         start, (presses, table, response) = starts[number], fits[number]
         presses, n_timed = leave_one_out_residuals(presses, table, response.leverage), features.complete.shape[1]
+
+        # 2. Bayesian localizers, networks and tests
         fitted = presses.inputs, presses.fibre_mask, presses.targets[:, :2]
         bayes = fit_stages(table, *fitted, n_timed, earlier=start.bayes) if start.bayes else ()
-        last = answering(start.networks, n_timed, n_timed, bool(bayes))
+        last = active_networks(start.networks, n_timed, n_timed, bool(bayes))
         networks = {name: weights for name, weights in start.networks.items() if not only_last or name in last}
         rng = np.random.default_rng([self.seed, len(features)])
         retrained = retrain(networks, start.residual_network, presses, table, start.max_failures, rng, bayes)
@@ -261,7 +263,7 @@ class _Refit:
         """Scaled presses, the response table (S, S, C, F + G), and its fit, whose evidence is of windows in volts."""
         scaler, n_windows = old.scaler, features.windows.shape[2]
         predicted = old.predict_features(scaler.transform(features)).measures
-        # Where the depth of a press is unknown, its prediction is kept.
+        # Unknown depths and forces are replaced by their predictions.
         completed = {
             name: np.where(np.isnan(values), predicted[name].values, values) for name, values in measures.items()
         }
@@ -277,24 +279,24 @@ def fit_correction(
     model: LocalizerModel, features: PressFeatures, positions_mm: Array, measures: Measures = MappingProxyType({})
 ) -> LocalizerModel:
     """Correct gains of fibres, rotation, scale and shift by robust least squares with a normal prior."""
-    from scipy.optimize import least_squares  # slow to import, and needed here only
+    from scipy.optimize import least_squares  # slow to import
 
     expected = model.predict_features(model.scaler.transform(features))
 
     def residuals(parameters: Array) -> Array:
-        # Parameters are counted from 1, since the steps of the solver are relative to them.
+        # Parameters are offset by 1, since the steps of the solver are relative to their values.
         corrected = _corrected(model, parameters - 1)
         prediction = corrected.predict_features(corrected.scaler.transform(features))
         errors = [((prediction.positions_mm - positions_mm) / expected.std_mm).ravel()]
         errors += [
-            (each.values - measures[name]) / (expected.measures[name].r90 / R90_STD)
-            for name, each in prediction.measures.items()
+            (estimate.values - measures[name]) / (expected.measures[name].r90 / R90_STD)
+            for name, estimate in prediction.measures.items()
             if name in measures
         ]
         return np.nan_to_num(np.concatenate([*errors, parameters - 1]))
 
     start = np.ones(model.fibres + 4)
-    solution = least_squares(residuals, start, loss="soft_l1", diff_step=DIFFERENCE, xtol=1e-2, ftol=1e-3)
+    solution = least_squares(residuals, start, loss="soft_l1", diff_step=DIFF_STEP, xtol=1e-2, ftol=1e-3)
     _, rotation, shift = _transform(solution.x - 1)
     return replace(_corrected(model, solution.x - 1), table=_transformed_table(model.table, rotation, shift))
 
@@ -327,7 +329,7 @@ def _transformed_weights(weights: Weights, rotation: Array, shift: Array) -> Wei
 
 
 def _transformed_table(table: Floats, rotation: Array, shift: Array) -> Floats:
-    """The response table by transformed positions; beyond the edge, what is at the edge."""
+    """Resample the response table at transformed positions, clipped to its edge."""
     from scipy.interpolate import RegularGridInterpolator
 
     axis = np.linspace(-1, 1, len(table))
@@ -336,10 +338,12 @@ def _transformed_table(table: Floats, rotation: Array, shift: Array) -> Floats:
 
 
 class CrossValidation:
-    """Cross-validation of changes on new presses: each fold is left out in turn, for each subset of failed fibres.
+    """Cross-validation of changes on new presses, for subsets of failed fibres.
 
-    `presses` are features, positions (Q, 2), mm, and measures; `subsets` are listed by the number of failed fibres,
-    from 0.
+    Args:
+        presses: features, positions (Q, 2), mm, and measures.
+        n_folds: number of folds, each of which is left out in turn.
+        subsets: subsets of failed fibres, by their size from 0.
     """
 
     def __init__(
@@ -352,7 +356,7 @@ class CrossValidation:
         self._folds, self._subsets = np.array_split(np.arange(len(presses[1])), n_folds), subsets
 
     def change(self, models: Sequence[LocalizerModel], change: Change) -> list[LocalizerModel]:
-        """Change the models, one a fold, each by the presses that its fold leaves."""
+        """Change each model, one per fold, by the presses outside its fold."""
         features, positions_mm, measures = self.presses
         changed = []
         for model, fold in zip(models, self._folds, strict=True):
@@ -362,7 +366,7 @@ class CrossValidation:
         return changed
 
     def predict(self, models: Sequence[LocalizerModel]) -> Predictions:
-        """Predict each press by the model of the fold that leaves it out, without each set of failed fibres."""
+        """Predict the presses of each fold by its model, without each set of failed fibres."""
         features = self.presses[0]
         parts = [(each, each.scaler.transform(features[fold])) for each, fold in zip(models, self._folds, strict=True)]
         return [
@@ -371,7 +375,7 @@ class CrossValidation:
         ]
 
     def mean_error(self, predictions: Predictions) -> float:
-        """Return the mean error, mm, numbers of failed fibres weighing alike."""
+        """Return the mean error, mm, averaged over numbers of failed fibres."""
         positions_mm = self.presses[1]
         return float(
             np.mean([np.mean([distances(each.positions_mm, positions_mm) for each in level]) for level in predictions])
@@ -383,7 +387,7 @@ class CrossValidation:
         return {"change": change, "mean_mm": self.mean_error(predictions), "standard_error_mm": standard_error}
 
     def gain(self, before: Predictions, after: Predictions) -> tuple[float, float]:
-        """Return the mean decrease of errors, mm, numbers of failed fibres weighing alike, and its standard error."""
+        """Return the mean decrease of errors, mm, averaged over numbers of failed fibres, and its standard error."""
 
         def errors(prediction: Localization) -> Array:
             return distances(prediction.positions_mm, self.presses[1])
@@ -405,7 +409,7 @@ class CrossValidation:
 
 
 def recalibration_lines(result: Recalibration) -> list[str]:
-    """Format a recalibration: what each change gives, a table of the one that was kept, and a conclusion."""
+    """Format a recalibration: the error of each candidate, a table of the one that was kept, and a conclusion."""
     names = {None: "as it was", "corrected": "corrected by gains and pose", "refitted": "response fitted again"}
     lines = [f"{result.presses} new presses, each predicted by what was changed without it; error in mm"]
     for each in result.candidates:

@@ -1,9 +1,10 @@
-"""Response model of a pad: what each fibre answers to a press at a position, and what still shows of its history.
+"""Response model of a pad: response of each fibre to a press at a position, and the effect of its history.
 
-The windows of a fibre are a sum of Gaussian radial basis functions of the position (in proportion to the depth, if
-depths vary) plus a linear function of its history, fitted together by ridge regression. Silicone creeps, so the history
-is subtracted before the windows are used. It also modulates the sensitivity: a fibre that was stretched a moment ago
-answers by a fifth more. The modulation, a linear function of the history for each phase, is an input of the networks.
+The windows of a fibre are a sum of Gaussian radial basis functions of the position (proportional to the depth, if
+depths vary) plus a linear function of its history, fitted jointly by ridge regression. Silicone creeps, so the effect
+of the history is subtracted before the windows are used. The history also modulates the sensitivity: a fibre that was
+stretched a moment ago responds more strongly by a fifth. This modulation, a linear function of the history for each
+phase, is an input of the networks.
 """
 
 from collections.abc import Sequence
@@ -16,9 +17,11 @@ from padforge.sense.arrays import MIN_SCALE_V, Array, Mask
 
 RBF_SIDE = 21  # basis functions along a side of the pad
 RBF_STD = 2.0  # their standard deviation, in distances between neighbours: wide enough that sums of them are smooth
-RIDGE_POSITION, RIDGE_HISTORY, RIDGE_MODULATION = 1.0, 3000.0, 300.0
-"""Penalties on squared weights, of basis functions, of standardized history, and of its modulations. Features of the
-history are collinear: with a small penalty weights cancel each other, and presses err by up to a tenth more."""
+RIDGE_POSITION = 1.0  # penalty on squared weights of basis functions
+RIDGE_HISTORY = 3000.0
+"""Penalty on squared weights of standardized history. These features are collinear: with a small penalty weights cancel
+each other, and errors of presses grow by up to a tenth."""
+RIDGE_MODULATION = 300.0  # penalty on squared weights of modulations by standardized history
 GRID_CELLS = 60  # cells along a side of the grid on which the response is tabulated
 _CHUNK = 16_384
 
@@ -31,7 +34,7 @@ class ResponseModel:
     # (C, J, F + G), V/V, effect of a volt of history on the windows; and, with a minus sign, on the relative
     # sensitivity in each of G phases, 1/V
     history_coef: Array
-    history_mean_v: Array  # (C, J), history that the table is for
+    history_mean_v: Array  # (C, J), history at which the table holds
 
     @classmethod
     def fit(
@@ -46,9 +49,14 @@ class ResponseModel:
     ) -> "ResponseModel":
         """Fit the response, fibre by fibre, to the presses in which the fibre is valid.
 
-        Positions (Q, 2) are within [-1, 1], windows (Q, C, F) and history (Q, C, J) in V. `relative_depth` (Q,) is that
-        of each press over that of the table; windows of a phase have their sensitivity modulated together.
-        `ridge_history` is the penalty on weights of the history.
+        Args:
+            positions: within [-1, 1]; shape (Q, 2).
+            windows: shape (Q, C, F), V.
+            history: shape (Q, C, J), V.
+            fibre_mask: valid fibres; shape (Q, C).
+            relative_depth: depth of each press over that of the table; shape (Q,). None for 1.
+            phases: G slices of windows; the sensitivity of each is modulated as one.
+            ridge_history: penalty on squared weights of the history.
         """
         fibres, pasts = history.shape[1:]
         size, n_rbf = windows.shape[2], RBF_SIDE**2
@@ -101,7 +109,7 @@ def remove_history(windows: Array, history: Array, history_coef: Array, history_
 
 
 def interpolate_grid(table: Any, positions: Any, xp: Any = np) -> Any:
-    """Interpolate a (S, S, D) table over [-1, 1] bilinearly at (B, 2) positions: (B, D); beyond the edge, as at it.
+    """Interpolate a (S, S, D) table over [-1, 1] bilinearly at (B, 2) positions, clipped to its edge; return (B, D).
 
     `xp` is the module of the arrays, numpy or torch.
     """
@@ -116,7 +124,7 @@ def interpolate_grid(table: Any, positions: Any, xp: Any = np) -> Any:
 
 
 def leverages(positions: Array, relative_depth: Array | None = None) -> Array:
-    """Return the (Q,) leverages of presses in the fit, 0 to 1; presses at one position count together."""
+    """Return the (Q,) leverages of presses in the fit, 0 to 1, summed over the presses at one position."""
     empty = np.empty((len(positions), 0))
     gram = _normal_equations(positions, empty, empty, relative_depth)[0] + RIDGE_POSITION * np.eye(RBF_SIDE**2)
     single = np.empty(len(positions))
@@ -127,7 +135,7 @@ def leverages(positions: Array, relative_depth: Array | None = None) -> Array:
 
 
 def _scaled_rbf(positions: Array, relative_depth: Array | None) -> Any:
-    """Yield slices of presses and their basis functions times the depth, in chunks: they take kilobytes a press."""
+    """Yield slices of presses and their basis functions times the depth, in chunks, since a press takes kilobytes."""
     for first in range(0, len(positions), _CHUNK):
         rows = slice(first, first + _CHUNK)
         rbf = rbf_features(positions[rows])
@@ -146,10 +154,10 @@ def _normal_equations(
 
 
 def _sensitivity_modulation(expected: Array, residual: Array, past: Array) -> Array:
-    """(J,) share by which a standard deviation of history strengthens (Q,) responses, fitted to (Q,) residuals."""
+    """Relative change (J,) of (Q,) responses per standard deviation of history, fitted to (Q,) residuals."""
     scale = expected.std()
     if not past.shape[1] or scale <= MIN_SCALE_V:
         return np.zeros(past.shape[1])
-    design_matrix = np.hstack([expected[:, None] / scale * past, past])  # an additive effect is no modulation
+    design_matrix = np.hstack([expected[:, None] / scale * past, past])  # with an additive effect beside it
     gram = design_matrix.T @ design_matrix + RIDGE_MODULATION * np.eye(design_matrix.shape[1])
     return np.linalg.solve(gram, design_matrix.T @ residual)[: past.shape[1]] / scale

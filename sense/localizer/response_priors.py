@@ -1,7 +1,8 @@
-"""Priors of the response of a pad: what its plan says, or the maps of an earlier pad.
+"""Priors of the response of a pad, from its plan or from the maps of an earlier pad.
 
-The signal of a fibre is linear in the sensitivity along it, and nearly so in how far its path lies beside the plan.
-Both are smooth along it, so that some ten numbers, which a press at each tenth of it can tell, make its whole map.
+The signal of a fibre is linear in the sensitivity along it, and nearly linear in the lateral offset of its path from
+the plan. Both are smooth along the fibre, so that some ten numbers, which as many presses along it determine, define
+its whole map.
 """
 
 import numpy as np
@@ -17,14 +18,15 @@ from padforge.sense.recording.recording import Recording
 N_NODES = 9  # points along a fibre between which its sensitivity and its lateral offset are linear
 CORRELATION_LENGTH = 0.2  # of both, as a share of the fibre
 OFFSET_MM = 2.0  # prior standard deviation of the lateral offset, over that of the logarithm of the sensitivity
-WIDTHS = 1.0, 0.7  # of a press, and of its onset and what remains of it, over that of the contact; see `[rig]`
-BLOBS, BLOB_STD = 6, 0.4  # basis functions along a side by which the maps of an earlier pad are scaled; scaled position
+WIDTHS = 1.0, 0.7  # width of a press, and of its onset and residue, relative to that of the contact; see `[rig]`
+RBF_SIDE = 6  # basis functions along a side that scale the maps of an earlier pad
+RBF_STD = 0.4  # their standard deviation, scaled position
 
 
 def planned_pad(recording: Recording, pad: Morphology | None = None) -> Morphology | None:
     """Return the plan of the pad of a recording: `pad`, or the one that the recording holds, if any.
 
-    A recording of a twin holds a plan that lay otherwise under the arm, which tells nothing of its positions.
+    The plan in a recording of a twin is ignored, since its position under the arm was another.
 
     Raises:
         InputError: `pad` has another number of fibres than the recording.
@@ -34,8 +36,8 @@ def planned_pad(recording: Recording, pad: Morphology | None = None) -> Morpholo
     plan = recording.source.get("morphology")
     if pad is not None or plan is None or "twin" in recording.source:
         return pad
-    held = Morphology.from_dict(plan)
-    return held if len(held.knots) == recording.fibres else None
+    recorded = Morphology.from_dict(plan)
+    return recorded if len(recorded.knots) == recording.fibres else None
 
 
 def stated_contact(recording: Recording) -> Contact:
@@ -44,11 +46,11 @@ def stated_contact(recording: Recording) -> Contact:
 
 
 def plan_prior(pad: Morphology, contact: Contact, origin_mm: Array, scale_mm: float) -> ResponsePrior:
-    """Return the prior of a pad by its plan: fibres of uneven sensitivity that lie beside their planned paths.
+    """Return the prior of a pad from its plan: fibres with varying sensitivity and lateral offset.
 
     Args:
-        pad: the plan, which lies under the arm as it was drawn.
-        contact: by which the pad is pressed.
+        pad: the plan, in the frame of the arm.
+        contact: of the presses.
         origin_mm: position that is 0 when scaled, mm from the middle of the pad; shape (2,).
         scale_mm: distance that is 1 when scaled, mm.
     """
@@ -78,15 +80,15 @@ def plan_prior(pad: Morphology, contact: Contact, origin_mm: Array, scale_mm: fl
 
 
 def map_prior(maps: Array) -> ResponsePrior:
-    """Return the prior of a pad by the (S, S, C, F) responses of an earlier one, each fibre scaled smoothly.
+    """Return the prior of a pad from the responses of an earlier one, each fibre scaled smoothly.
 
     Args:
-        maps: not centred.
+        maps: responses, not centred; shape (S, S, C, F).
     """
     envelope = np.sqrt((maps**2 / np.maximum((maps**2).max(axis=(0, 1)), 1e-12)).mean(axis=3))
-    centres = np.linspace(-1, 1, BLOBS)
-    weights = np.exp(-0.5 * ((np.linspace(-1, 1, len(maps))[:, None] - centres) / BLOB_STD) ** 2)
-    blobs = np.einsum("xi,yj->xyij", weights, weights).reshape(*maps.shape[:2], -1)
-    deviations = envelope[..., None] * blobs[:, :, None]
+    centres = np.linspace(-1, 1, RBF_SIDE)
+    weights = np.exp(-0.5 * ((np.linspace(-1, 1, len(maps))[:, None] - centres) / RBF_STD) ** 2)
+    rbf = np.einsum("xi,yj->xyij", weights, weights).reshape(*maps.shape[:2], -1)
+    deviations = envelope[..., None] * rbf[:, :, None]
     scale = np.linalg.norm(deviations, axis=3).max(axis=(0, 1))
     return ResponsePrior(deviations / np.maximum(scale, 1e-12)[:, None], maps)

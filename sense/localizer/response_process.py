@@ -1,9 +1,9 @@
-"""Response of a pad by few presses: a normal process about what is known of it before.
+"""Response of a pad from few presses: a Gaussian process about prior knowledge.
 
 Some sixty presses do not determine the hundreds of basis functions of `ResponseModel`. The response of a fibre is
-instead one of an earlier pad, or none, plus deviations that the fibre can make, see `response_priors`, and a smooth
-remainder. How large they are, and whether the fibre is that of the earlier pad, is chosen by the evidence, the marginal
-likelihood (C. E. Rasmussen, C. K. I. Williams, Gaussian processes for machine learning, 2006).
+modelled as that of an earlier pad, or zero, plus the deviations of `response_priors` and a smooth remainder. Their
+variances, and whether the fibre is that of the earlier pad, maximize the evidence, that is the marginal likelihood
+(C. E. Rasmussen, C. K. I. Williams, Gaussian processes for machine learning, 2006).
 """
 
 from collections.abc import Sequence
@@ -16,28 +16,28 @@ import numpy as np
 from padforge.sense.arrays import MIN_SCALE_V, Array, Mask
 from padforge.sense.localizer.response_model import GRID_CELLS, grid_positions, interpolate_grid
 
-SNR_NEW, SNR_OLD = (10.0, 30.0, 100.0), (0.1, 1.0, 10.0)
-"""Variances of the deviations that are tried, relative to that of a press about its response: from none, and from an
-earlier pad. A fibre that differs from the earlier one as much as another fibre would is another one."""
-KERNELS, REMAINDER_STD = ((1.0, 0.003), (1.0, 0.03), (1.0, 0.3), (0.0, 1.0)), 0.35
-"""Shares of them that the maps of a prior and a smooth remainder have, and the distance over which this changes, in
-scaled positions. The last one believes nothing of the maps."""
-LOG_ODDS, MIN_OLD_SHARE = 0.05, 0.5
-"""Difference of log evidence, for each press and window, that speaks for a fibre of the earlier pad, and below minus it
-for another: windows are correlated, so that chance makes some. It speaks for more than a share of the fibres of the
-same pad, also of one that has drifted; then the others are those of before unless it speaks against them."""
-SCATTER_SHARE, ROUNDS = 0.8, 2
-"""Share of the variance of a press, in a pad as built, that grows with the square of its response; and how often the
-process is fitted, the first time as if there were none."""
+SNR_NEW = 10.0, 30.0, 100.0
+"""Candidate variances of the deviations of a new fibre, relative to the variance of a press about its response."""
+SNR_OLD = 0.1, 1.0, 10.0  # the same of a fibre of the earlier pad, which deviates less
+KERNELS = (1.0, 0.003), (1.0, 0.03), (1.0, 0.3), (0.0, 1.0)
+"""Candidate shares of the variance in the maps of the prior and in the smooth remainder; the last ignores the maps."""
+REMAINDER_STD = 0.35  # correlation length of the smooth remainder, scaled position
+LOG_ODDS = 0.05
+"""Difference of log evidence per press and window above which a fibre is that of the earlier pad, and below minus which
+it is new. Windows are correlated, so that smaller differences arise by chance."""
+MIN_OLD_SHARE = 0.5
+"""Share of fibres of the earlier pad above which the pad is the same; undecided fibres are then old ones, too."""
+SCATTER_SHARE = 0.8  # of the variance of a press, on a printed pad: this part grows with the square of the response
+ROUNDS = 2  # fits of the process; the first one ignores that growth
 
 
 @dataclass(frozen=True)
 class ResponsePrior:
-    """What is known of the response of a pad before it is pressed.
+    """Prior of the response of a pad.
 
     Attributes:
-        deviations: maps on a grid over [-1, 1] in x and y, whose sum with independent standard normal weights each
-            window deviates by, up to its amplitude; shape (S, S, C, J).
+        deviations: maps on a grid over [-1, 1] in x and y; each window deviates from the mean by a sum of them with
+            independent standard normal weights, times an amplitude; shape (S, S, C, J).
         mean: responses of an earlier pad, V or scaled as the windows; shape (S, S, C, F); None if there was none.
     """
 
@@ -51,9 +51,9 @@ class ResponseFit:
 
     Attributes:
         table: windows on the grid of the prior; shape (S, S, C, F).
-        leverage: of presses, 0 to 1, those at one position together; shape (Q, C).
-        is_new: fibres that are not those of an earlier pad; shape (C,).
-        log_evidence: of the windows, as scaled.
+        leverage: of presses, 0 to 1, summed over the presses at one position; shape (Q, C).
+        is_new: fibres that are not those of the earlier pad; shape (C,).
+        log_evidence: of the scaled windows.
     """
 
     table: Array
@@ -65,20 +65,22 @@ class ResponseFit:
 def fit_response(
     positions: Array, windows: Array, fibre_mask: Mask, prior: ResponsePrior, relative_depth: Array | None = None
 ) -> ResponseFit:
-    """Fit the response, fibre by fibre, to the presses in which the fibre is valid; it takes the cube of their number.
+    """Fit the response, fibre by fibre, to the presses in which the fibre is valid, in a time of O(Q^3).
 
-    A fibre that is valid in none stays as it was, or 0.
+    A fibre that is valid in no press keeps the mean of the prior, or 0.
 
     Args:
         positions: within [-1, 1]; shape (Q, 2).
         windows: without history, and not centred: 0 is no response; shape (Q, C, F).
         fibre_mask: whether a fibre is valid in a press; shape (Q, C).
-        prior: what is known before.
-        relative_depth: of each press over that of the table; shape (Q,). 1 if None.
+        prior: of the response.
+        relative_depth: depth of each press over that of the table; shape (Q,). None for 1.
     """
     depth = np.ones(len(positions)) if relative_depth is None else relative_depth
     fibres = np.flatnonzero(fibre_mask.any(axis=0))
     table = np.zeros((GRID_CELLS + 1, GRID_CELLS + 1, *windows.shape[1:])) if prior.mean is None else prior.mean.copy()
+
+    # 1. Each fibre as a new one, and as that of the earlier pad
     processes, odds = [], np.zeros(len(fibres))
     for number, fibre in enumerate(fibres):
         valid = fibre_mask[:, fibre]
@@ -87,6 +89,8 @@ def fit_response(
         old = new if prior.mean is None else _fit_process(*presses, maps, prior.mean[:, :, fibre], SNR_OLD)
         processes.append((new, old))
         odds[number] = (old.log_evidence - new.log_evidence) / presses[1].size
+
+    # 2. Choice between the two
     is_same_pad = (odds > LOG_ODDS).mean() > MIN_OLD_SHARE
     is_old = is_same_pad & (odds > -LOG_ODDS)
     leverage, is_new = np.zeros(fibre_mask.shape), np.zeros(fibre_mask.shape[1], bool)
@@ -100,14 +104,14 @@ def fit_response(
 
 
 class _Process(NamedTuple):
-    """A fitted normal process of the windows of a fibre."""
+    """Fitted Gaussian process of the windows of a fibre. Variances are relative to that of a press."""
 
     log_evidence: float
-    of_maps: float  # variance of the deviations by the maps, relative to that of a press
-    of_smooth: float  # and of the smooth remainder
+    maps_variance: float  # of the deviations by the maps
+    smooth_variance: float  # of the smooth remainder
     weights: Array  # (Q, F), inverse covariance times residual
     precision: Array  # (Q,), diagonal of the inverse covariance
-    noise: Array  # (Q,), relative variance of the presses
+    noise: Array  # (Q,), variance of each press
     positions: Array  # (Q, 2)
     depth: Array  # (Q,), relative
     maps: Array  # (S, S, J)
@@ -117,14 +121,14 @@ class _Process(NamedTuple):
         """Compute the posterior mean of the response; shape (S, S, F)."""
         grid, maps = grid_positions(GRID_CELLS + 1).reshape(-1, 2), self.maps
         weighted = self.depth[:, None] * self.weights
-        deviation = self.of_smooth * _smooth_covariance(grid, self.positions) @ weighted
+        deviation = self.smooth_variance * _smooth_covariance(grid, self.positions) @ weighted
         at_presses = interpolate_grid(maps, self.positions)
-        deviation += self.of_maps * maps.reshape(len(grid), -1) @ (at_presses.T @ weighted)
+        deviation += self.maps_variance * maps.reshape(len(grid), -1) @ (at_presses.T @ weighted)
         deviation = deviation.reshape(*maps.shape[:2], -1)
         return deviation if self.mean is None else self.mean + deviation
 
     def leverages(self) -> Array:
-        """Compute the leverages (Q,)."""
+        """Compute the leverages (Q,), summed over the presses at one position."""
         _, position = np.unique(self.positions, axis=0, return_inverse=True)
         return np.bincount(position.ravel(), 1 - self.noise * self.precision)[position.ravel()]
 
@@ -134,32 +138,30 @@ def _fit_process(
 ) -> _Process:
     """Fit a process to windows (Q, F) of one fibre by maximum evidence; the scale of each window is profiled out."""
     at_presses = depth[:, None] * interpolate_grid(maps, positions)
-    of_maps, of_smooth = (
-        at_presses @ at_presses.T,
-        np.outer(depth, depth) * _smooth_covariance(positions, positions),
-    )
+    maps_covariance = at_presses @ at_presses.T
+    smooth_covariance = np.outer(depth, depth) * _smooth_covariance(positions, positions)
     residual = windows if mean is None else windows - depth[:, None] * interpolate_grid(mean, positions)
-    # Presses at one position, as commanded and as detected, are one press.
+    # A press as commanded and as detected has one position twice: half the weight each.
     _, position, count = np.unique(positions, axis=0, return_inverse=True, return_counts=True)
-    presses = count[position.ravel()].astype(np.float64)
-    best, noise = None, presses
+    multiplicity = count[position.ravel()].astype(np.float64)
+    best, noise = None, multiplicity
     for _ in range(ROUNDS):
         if best is not None:
-            # what is expected of each press by the others, relative to the usual
+            # Leave-one-out prediction of each press, and its square relative to the mean
             squares = (windows - best.weights / best.precision[:, None]) ** 2
             square = (squares / np.maximum(squares.mean(axis=0), MIN_SCALE_V**2)).mean(axis=1)
-            noise, best = presses * (1 - SCATTER_SHARE + SCATTER_SHARE * square), None
+            noise, best = multiplicity * (1 - SCATTER_SHARE + SCATTER_SHARE * square), None
         for snr, (share_maps, share_smooth) in product(snrs, KERNELS):
-            covariance = snr * (share_maps * of_maps + share_smooth * of_smooth) + np.diag(noise)
+            covariance = snr * (share_maps * maps_covariance + share_smooth * smooth_covariance) + np.diag(noise)
             precision = np.linalg.inv(covariance)
             weights = precision @ residual
             variance = np.maximum((residual * weights).mean(axis=0), MIN_SCALE_V**2)
             log_det = np.linalg.slogdet(covariance)[1]
             log_evidence = -0.5 * float(len(windows) * np.log(variance).sum() + windows.shape[1] * log_det)
             if best is None or log_evidence > best.log_evidence:
-                shares = snr * share_maps, snr * share_smooth
+                variances = snr * share_maps, snr * share_smooth
                 prior = positions, depth, maps, mean
-                best = _Process(log_evidence, *shares, weights, np.diag(precision), noise, *prior)
+                best = _Process(log_evidence, *variances, weights, np.diag(precision), noise, *prior)
     assert best is not None
     return best
 

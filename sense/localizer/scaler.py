@@ -1,7 +1,7 @@
-"""Scaling of features to numbers of about 1, and of positions, depths and forces to the outputs of the networks.
+"""Scaling of features to about 1, and of positions, depths and forces to the outputs of the networks.
 
-Where depths vary, the networks predict depth (and force) too, and features are not centred, so that they stay in
-proportion to the depth.
+Where depths vary, the networks also predict depth (and force), and features are not centred, so that they remain
+proportional to the depth.
 """
 
 from collections.abc import Mapping, Sequence
@@ -14,17 +14,17 @@ from pydantic_core import PydanticCustomError
 
 from padforge.sense.arrays import MAX_MM, MAX_VOLTS, MIN_SCALE_V, Array, Floats, Indices, Mask
 from padforge.sense.localizer.features import PressFeatures
-from padforge.sense.localizer.moments import DOWN, NOW
+from padforge.sense.localizer.moments import LATEST_WINDOWS, PRESS_WINDOWS
 from padforge.sense.localizer.response_model import ResponseModel, interpolate_grid, leverages, remove_history
 from padforge.sense.localizer.response_process import ResponseFit, ResponsePrior, fit_response
 
-MAX_INPUT = 1e4  # largest scaled feature, in standard deviations; beyond lies no press, and features are clipped
-MAX_LEVERAGE = 0.9  # of a press far from all others; its residual grows tenfold at most
+MAX_INPUT = 1e4  # scaled features are clipped to it; no press exceeds it
+MAX_LEVERAGE = 0.9  # limits the leave-one-out residual of an isolated press to ten times its residual
 DOCUMENT_CONFIG = ConfigDict(extra="forbid", allow_inf_nan=False, strict=True)
 
 
 def array_field(low: float, high: float) -> tuple[PlainValidator, PlainSerializer]:
-    """Annotate an array that is nested lists of numbers from `low` to `high` in a document."""
+    """Annotate an array that a document holds as nested lists of numbers from `low` to `high`."""
 
     def check(value: object) -> Array:
         try:
@@ -41,10 +41,10 @@ def array_field(low: float, high: float) -> tuple[PlainValidator, PlainSerialize
 
 @dataclass(frozen=True)
 class ScaledFeatures:
-    """Features of Q presses as the networks take them."""
+    """Features of Q presses, scaled for the networks."""
 
     inputs: Floats  # (Q, C, F + G), about 1
-    fibre_mask: Mask  # (Q, C), whether the fibre gave enough readings
+    fibre_mask: Mask  # (Q, C), whether the fibre has enough readings
     complete: Mask  # (Q, K), which windows are complete, see `PressFeatures`
 
     def __getitem__(self, rows: slice | Indices) -> "ScaledFeatures":
@@ -90,7 +90,9 @@ class FeatureScaler:
     origin_mm: Annotated[Array, *array_field(-MAX_MM, MAX_MM)]  # (2,) position that is 0 when scaled
     scale_mm: Annotated[float, Field(gt=0, le=MAX_MM)]  # distance that is 1 when scaled
     half_size_mm: Annotated[Array, *array_field(0, MAX_MM)]  # (2,) half the size of the area that was pressed
-    measures: Annotated[tuple[TargetScaler, ...], Field(max_length=2, strict=False)] = ()  # where they are predicted
+    measures: Annotated[
+        tuple[TargetScaler, ...], Field(max_length=2, strict=False)
+    ] = ()  # depth and force, if predicted
 
     @classmethod
     def fit(
@@ -102,9 +104,17 @@ class FeatureScaler:
     ) -> tuple["FeatureScaler", Floats]:
         """Fit the response model of the pad and the scaling of its features.
 
-        A window is divided by the geometric mean of its own standard deviation and its fibre's, so that the fine
-        windows of a touch keep some of their smallness, and so of their noise. `phases` are as in `ResponseModel.fit`.
-        Also returned is the (S, S, C, F + G) scaled response by position, at the scaled depth 0 if depths vary.
+        A window is divided by the geometric mean of its own standard deviation and that of its fibre, so that small
+        windows stay smaller, and their noise with them.
+
+        Args:
+            features: of presses, V.
+            positions_mm: of the presses; shape (Q, 2).
+            measures: depth and force, to be predicted; shape (Q,) each.
+            phases: as in `ResponseModel.fit`.
+
+        Returns:
+            The scaler, and the scaled response by position (S, S, C, F + G), at the scaled depth 0 if depths vary.
         """
         targets = tuple(TargetScaler.fit(name, values) for name, values in (measures or {}).items())
         low, high = positions_mm.min(axis=0), positions_mm.max(axis=0)
@@ -118,7 +128,7 @@ class FeatureScaler:
         mean = _masked_mean(windows, features.fibre_mask)
         variance = _masked_mean((windows - mean) ** 2, features.fibre_mask)
         scale = (variance * variance.mean(axis=1, keepdims=True)) ** 0.25
-        scale = np.where(scale >= MIN_SCALE_V, scale, 1.0)  # what never varied keeps its size
+        scale = np.where(scale >= MIN_SCALE_V, scale, 1.0)  # constant windows are not scaled
         padding = ((0, 0), (0, len(phases)))
         mean = np.pad(np.zeros_like(mean) if targets else mean, padding)
         scale = np.pad(scale, padding, constant_values=1.0)
@@ -126,7 +136,7 @@ class FeatureScaler:
         return scaler, scaler.scale(response.table)
 
     def n_inputs(self, method: str, n_timed: int) -> int:
-        """Return D, the inputs of a network: features and, of method "ensemble", masks of C fibres and K windows."""
+        """Return D, the inputs of a network: features and, for method "ensemble", masks of C fibres and K windows."""
         return self.mean_v.size + (len(self.mean_v) + n_timed if method == "ensemble" else 0)
 
     def transform(self, features: PressFeatures) -> ScaledFeatures:
@@ -139,17 +149,17 @@ class FeatureScaler:
         return np.clip((windows - self.mean_v) / self.scale_v, -MAX_INPUT, MAX_INPUT).astype(np.float32)
 
     def uncentre(self, scaled: Floats) -> Array:
-        """Shift (..., C, F + G) scaled windows so that 0 is no response."""
+        """Undo the centring of (..., C, F + G) scaled windows, so that 0 is no response."""
         return scaled + self.mean_v / self.scale_v
 
     @property
     def depth_gain(self) -> float:
-        """Relative growth of the response for a scaled depth that is 1 larger; 0 where depths do not vary."""
+        """Relative growth of the response per scaled depth; 0 if depths do not vary."""
         return self.measures[0].scale / self.measures[0].origin if self.measures else 0.0
 
     def scale_targets(self, positions_mm: Array, measures: Mapping[str, Array] | None = None) -> Floats:
-        """Return (Q, 2 + T) scaled targets of (Q, 2) positions and (Q,) of each measure."""
-        columns = [each.transform((measures or {})[each.name]) for each in self.measures]
+        """Return the scaled targets (Q, 2 + T) of (Q, 2) positions and (Q,) values of each measure."""
+        columns = [target.transform((measures or {})[target.name]) for target in self.measures]
         return np.column_stack([(positions_mm - self.origin_mm) / self.scale_mm, *columns]).astype(np.float32)
 
     def positions_mm(self, targets: Floats) -> Array:
@@ -163,9 +173,9 @@ class FeatureScaler:
         measures: Mapping[str, Array] | None = None,
         rate_hz: float = np.inf,
     ) -> "TrainingPresses":
-        """Scale features and targets of presses, which slide in training if the rate of the readings is given."""
+        """Scale features and targets of presses; with the rate of their readings, they may slide in the training."""
         scaled, targets = self.transform(features), self.scale_targets(positions_mm, measures)
-        now_factor, now_offset = self.to_now(scaled.complete.shape[1])
+        now_factor, now_offset = self.latest_window_map(scaled.complete.shape[1])
         return TrainingPresses(
             scaled.inputs,
             scaled.fibre_mask,
@@ -178,40 +188,50 @@ class FeatureScaler:
             speed=1 / (self.scale_mm * rate_hz),
         )
 
-    def to_now(self, n_timed: int) -> tuple[Floats, Floats]:
-        """Return factors and offsets that turn scaled windows of `DOWN` into `NOW`; shapes (C, len(NOW), len(DOWN))."""
-        now = slice(n_timed, n_timed + len(NOW))
-        down = slice(len(DOWN) if n_timed else 0)
-        scale = self.scale_v[:, None, down] / self.scale_v[:, now, None]
-        offset = (self.mean_v[:, None, down] - self.mean_v[:, now, None]) / self.scale_v[:, now, None]
-        return scale.astype(np.float32), offset.astype(np.float32)
+    def latest_window_map(self, n_timed: int) -> tuple[Floats, Floats]:
+        """Return factors and offsets that map scaled `PRESS_WINDOWS` to scaled `LATEST_WINDOWS` of the same volts.
+
+        Their shapes are (C, len(LATEST_WINDOWS), len(PRESS_WINDOWS)).
+        """
+        latest = slice(n_timed, n_timed + len(LATEST_WINDOWS))
+        pressed = slice(len(PRESS_WINDOWS) if n_timed else 0)
+        factor = self.scale_v[:, None, pressed] / self.scale_v[:, latest, None]
+        offset = (self.mean_v[:, None, pressed] - self.mean_v[:, latest, None]) / self.scale_v[:, latest, None]
+        return factor.astype(np.float32), offset.astype(np.float32)
 
 
 def _masked_mean(windows: Array, fibre_mask: Mask) -> Array:
-    """(C, F) means over the presses in which a fibre is valid; 0 for one that never is."""
+    """(C, F) means over the presses in which a fibre is valid; 0 if it is in none."""
     total = np.where(fibre_mask[:, :, None], windows, 0.0).sum(axis=0)
     return total / np.maximum(fibre_mask.sum(axis=0), 1)[:, None]
 
 
 @dataclass(frozen=True)
 class TrainingPresses(ScaledFeatures):
-    """Scaled presses of known targets, to train or to check on."""
+    """Scaled presses and their targets, for training."""
 
     targets: Floats  # (Q, 2 + T)
     depth_gain: float  # see `FeatureScaler.depth_gain`
-    # (C, len(NOW), len(DOWN)), which turn scaled windows of `DOWN` into scaled ones of `NOW`
-    now_factor: Floats
+    now_factor: Floats  # see `FeatureScaler.latest_window_map`
     now_offset: Floats
     per_mm: float  # scaled distance of 1 mm
-    speed: float  # scaled distance that 1 mm/s goes from one reading to the next; 0 where presses do not slide
+    speed: float  # scaled distance per reading of 1 mm/s; 0 if presses do not slide
 
 
 def refit_response(
     scaler: FeatureScaler, presses: TrainingPresses, table: Floats, n_windows: int, prior: ResponsePrior
 ) -> tuple[Floats, ResponseFit]:
-    """Return a response table whose F windows are fitted anew to presses, of which there are few, and that fit.
+    """Refit the windows of a response table to few presses, with a prior.
 
-    The mean of the `prior`, if any, is as `FeatureScaler.uncentre` returns it.
+    Args:
+        scaler: of the presses and the table.
+        presses: to fit to.
+        table: scaled response by position; shape (S, S, C, F + G).
+        n_windows: F.
+        prior: its mean, if any, is scaled and not centred, see `FeatureScaler.uncentre`.
+
+    Returns:
+        The refitted table, and the fit.
     """
     relative_depth = 1 + presses.depth_gain * presses.targets[:, 2] if presses.depth_gain else None
     positions, windows = presses.targets[:, :2].astype(np.float64), scaler.uncentre(presses.inputs)[..., :n_windows]
@@ -221,10 +241,15 @@ def refit_response(
 
 
 def leave_one_out_residuals(presses: TrainingPresses, table: Floats, leverage: Array | None = None) -> TrainingPresses:
-    """Move presses as far from the response table as if it had been fitted without them, and others at their position.
+    """Enlarge the residuals of presses as if the response table had been fitted without their position.
 
-    The leave-one-out residual of a linear fit is the residual over 1 - leverage: of some hundred presses, a third more.
-    `leverage` (Q, C) is that of a fit with a prior; None without.
+    The leave-one-out residual of a linear fit is the residual over 1 - leverage; with some hundred presses it is larger
+    by a third.
+
+    Args:
+        presses: on which the table was fitted.
+        table: scaled response by position; shape (S, S, C, F + G).
+        leverage: of a fit with a prior; shape (Q, C). None for that of `ResponseModel`.
     """
     targets = presses.targets.astype(np.float64)
     positions, relative_depth = targets[:, :2], np.ones(len(targets))

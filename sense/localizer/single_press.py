@@ -1,9 +1,9 @@
-"""Whether one press explains the responses of a pad, and whether they are those of the pad of the calibration.
+"""Tests whether a single press explains the responses of a pad, and whether the pad is that of the calibration.
 
-The responses of a press are, but for its strength, those expected at some position, with the scatter of the presses
-near it. What the best position and strength leave, in units of that scatter, is the misfit of a press: on another pad,
-the typical press has a large one. Two fingers are told from one by the generalized likelihood ratio: by how much less
-two presses leave than one. What is usual of both is learnt on presses that were never trained on.
+The responses of a press are those expected at some position, times a strength, with the scatter of the presses near it.
+The misfit of a press is the residual at the best position and strength, in units of that scatter. It is large for most
+presses on another pad. Two fingers are distinguished from one by the generalized likelihood ratio of two presses and
+one. The distributions of both quantities are calibrated on presses that were not used in training.
 """
 
 from collections.abc import Mapping, Sequence
@@ -19,52 +19,52 @@ from scipy.special import stdtrit
 from padforge.design.objectives.fibre_loss import failure_subsets
 from padforge.sense.arrays import Array, Floats, Indices, Mask
 from padforge.sense.localizer.bayes import SCATTER_WIDTH, fit_projection, local_scatter, mean_distance
-from padforge.sense.localizer.moments import N_DOWN, N_TIMED, NOW, count_complete
+from padforge.sense.localizer.moments import LATEST_WINDOWS, N_PRESS_WINDOWS, N_TIMED, count_complete
 from padforge.sense.localizer.response_model import grid_positions, interpolate_grid
 from padforge.sense.localizer.scaler import ScaledFeatures, TrainingPresses
 
-STAGES = (N_DOWN, N_TIMED)
-"""Numbers of complete windows from which on presses are judged: while the finger rests, and after the release."""
-COMPONENTS = 4  # discriminant directions of a fibre: further ones are noise, in which two presses look like one
+STAGES = (N_PRESS_WINDOWS, N_TIMED)
+"""Numbers of complete windows from which on presses are tested: while the finger rests, and after the release."""
+COMPONENTS = 4  # linear discriminants of a fibre; further ones are noise
 COARSENING = 6  # cells of the response table along a side of a cell of the grid
-MIN_CELLS, MIN_SHARE = 2, 0.2
-"""Distance of two presses, in cells of the grid, and the response to the weaker over that to the stronger, at least:
-what lies nearer, or is weaker, is the error of the response model."""
+MIN_CELLS = 2  # minimum distance of two presses in cells of the grid; below it lie errors of the response model
+MIN_SHARE = 0.2  # minimum response to the weaker of two presses relative to the stronger, for the same reason
 MAX_STRENGTH = 1.5
-"""Response to either of two presses over that to the strongest of the training, at most: a single press that is twice
-as deep leaves much, which two strong ones would explain."""
-FALSE_RATE = 0.01  # share of single presses that are said to be none
-LEVELS, SUBSETS = 4, 4
-"""Numbers of failed fibres, from 0, that what is usual is learnt for; and sets of a size that it is learnt by."""
-MAX_LEFT_OUT = 2
-"""Fibres that may have failed before a pad is called another, but a third of them at most: few fit any press."""
-MIN_MISFIT, MIN_MISFIT_LEFT_OUT = 1.35, 0.4
-"""Mean logarithm of the misfits over that of the calibration, in standard deviations of single presses, from which on
-they are another pad's: with all fibres, and without those that fit worst. After 1500 presses, 30 of pads cast again by
-the same plan had 2.0 and 0.6 or more; of healthy ones 0.5 and 0.3 at most; of pads whose gains drifted by up to 20 %
-not both above these; with two fibres failed in any way 0.4 at most without them."""
-MIN_PRESSES, MAX_PRESSES = 25, 300  # of which a pad is judged
-MIN_DET = 1e-3  # of the Gram matrix of two responses over the product of their norms: below, they hardly differ
-MIN_SHARE_LEFT = 1e-6  # of a number, since its logarithm is taken
-MIN_STD = 0.1  # of logarithms of misfits, of which few presses may have hardly any
+"""Maximum response to either of two presses relative to the strongest of the training: a single press that is twice as
+deep has a large misfit, which two strong presses would explain."""
+FALSE_RATE = 0.01  # share of single presses that the test rejects
+LEVELS = 4  # numbers of failed fibres, from 0, that the tests are calibrated for
+SUBSETS = 4  # sets of failed fibres of a size in the calibration
+MAX_LEFT_OUT = 2  # fibres that may have failed on the same pad, up to a third of all: few fibres fit any press
+# Mean logarithm of the misfits above that of the calibration, in standard deviations of single presses, from which on a
+# pad is another one. With 30 presses after 1500 of training, pads cast again by the same plan had 2.0 and 0.6 or more,
+# healthy ones 0.5 and 0.3 or less, those with two failed fibres 0.4 or less without them; pads whose gains drifted by
+# up to 20 % did not exceed both limits.
+MIN_MISFIT = 1.35  # with all fibres
+MIN_MISFIT_LEFT_OUT = 0.4  # without the fibres that fit worst
+MIN_PRESSES = 25  # with fewer presses a pad is not tested
+MAX_PRESSES = 300  # presses of a pad that are used at most
+MIN_DET = 1e-3  # minimum determinant of the Gram matrix of two responses, relative to the product of their norms
+MIN_RELATIVE_MISFIT = 1e-6  # minimum misfit per component, since its logarithm is taken
+MIN_STD = 0.1  # minimum standard deviation of logarithms of misfits, which few presses underestimate
 PREFIX = "single_press."  # of the names of the arrays in files
 _CHUNK = 256
 
 
 @dataclass(frozen=True)
 class SinglePressTest:
-    """Expected responses of a pad at one stage of a press, and what presses usually leave of them."""
+    """Expected responses of a pad at one stage of a press, and the usual misfits."""
 
     projection: Array  # (C, F + G, D), scaled features to whitened discriminants
     positions: Array  # (P, 2), scaled, of a grid over the presses
-    expected: Array  # (P, C, D) discriminants of the response
+    expected: Array  # (P, C, D), discriminants of the response
     precision: Array  # (P, C, D, D), inverse of their scatter
-    offset: Array  # (C, D), discriminants of no response at all
+    offset: Array  # (C, D), discriminants without a response
     floor_share: Array  # (1,), share of the scatter that does not grow with the response
     max_strength: Array  # (1,), of either of two presses
-    limit: Array  # (L,) by number of failed fibres: root likelihood ratio that a single press does not exceed
-    usual_misfit: Array  # (L, 2), mean and standard deviation of its logarithm
-    n_presses: Array  # (1,), on which the last two rest; 0 before `calibrated`
+    limit: Array  # (L,), highest root likelihood ratio of a single press, by number of failed fibres
+    usual_misfit: Array  # (L, 2), mean and standard deviation of its logarithm, by number of failed fibres
+    n_presses: Array  # (1,), presses of the calibration of the last two; 0 before `calibrated`
 
     @classmethod
     def fit(
@@ -75,26 +75,26 @@ class SinglePressTest:
         n_complete: int,
         earlier: "SinglePressTest | None" = None,
     ) -> "SinglePressTest":
-        """Fit the scatter of presses about the response, when so many windows are complete.
+        """Fit the scatter of presses about the response at a stage of a press.
 
         Args:
             table: scaled response by position, over [-1, 1] in x and y; shape (S, S, C, F + G).
-            presses: presses of training, as far from the table as if it had been fitted without them.
-            zero: scaled features of a pad that does not respond, with a minus sign; shape (C, F + G).
-            n_complete: number of complete windows; 0 if features know no moment.
-            earlier: test of the pad before, whose discriminants are kept: few presses do not say how windows vary.
+            presses: of the training, with leave-one-out residuals.
+            zero: scaled features of a pad without response, with a minus sign; shape (C, F + G).
+            n_complete: number of complete windows; 0 for features without moments.
+            earlier: test of the earlier pad, whose discriminants are kept, since few presses do not determine them.
         """
         n_timed, side = presses.complete.shape[1], len(table)
         usable = np.ones(table.shape[3], bool)
-        usable[n_complete : n_timed + len(NOW) if n_timed else 0] = False
+        usable[n_complete : n_timed + len(LATEST_WINDOWS) if n_timed else 0] = False
         table = np.where(usable, table, 0.0)
         positions = presses.targets[:, :2].astype(np.float64)
         relative_depth = 1 + presses.depth_gain * presses.targets[:, 2:3] if presses.depth_gain else np.ones((1, 1))
         at_presses = relative_depth * interpolate_grid(table.reshape(side, side, -1), positions)
         residual = presses.inputs - at_presses.reshape(presses.inputs.shape)
         fibres = table.shape[2]
-        before = np.zeros((fibres, len(usable), COMPONENTS)) if earlier is None else earlier.projection
-        projection = fit_projection(table, residual, presses.fibre_mask, before)
+        earlier_projection = np.zeros((fibres, len(usable), COMPONENTS)) if earlier is None else earlier.projection
+        projection = fit_projection(table, residual, presses.fibre_mask, earlier_projection)
         residual = np.einsum("qcf,cfd->qcd", residual, projection) * presses.fibre_mask[:, :, None]
         offset = np.einsum("cf,cfd->cd", zero * usable, projection)
         responses = np.einsum("xycf,cfd->xycd", table, projection) + offset
@@ -105,7 +105,7 @@ class SinglePressTest:
         slopes = np.stack(np.gradient(responses, step, axis=(0, 1)), axis=-1)[::COARSENING, ::COARSENING][inside]
         width = max(cell, SCATTER_WIDTH * mean_distance(positions))
         scatter = local_scatter(grid[inside], positions, residual, presses.fibre_mask, width)
-        # A position of the grid stands for its cell, over which the response varies by its slope.
+        # Each position of the grid stands for its cell, over which the response varies by its slope.
         blurred = scatter.reshape(-1, fibres, COMPONENTS, COMPONENTS) + cell**2 / 12 * slopes @ slopes.swapaxes(2, 3)
         response = relative_depth * interpolate_grid(responses.reshape(side, side, -1), positions)
         return cls(
@@ -122,7 +122,7 @@ class SinglePressTest:
         )
 
     def calibrated(self, presses: ScaledFeatures) -> "SinglePressTest":
-        """Learn what is usual from presses that were never trained on, with any fibres failed."""
+        """Return the test with `limit` and `usual_misfit` of presses that were not used in training."""
         fibres, n_presses = len(self.expected[0]), len(presses)
         limit, usual = self.limit.copy(), self.usual_misfit.copy()
         for level in range(min(LEVELS, fibres) if n_presses > 1 else 0):
@@ -130,7 +130,7 @@ class SinglePressTest:
             masks = [presses.fibre_mask & ~np.isin(np.arange(fibres), failed) for failed in subsets]
             ratio = np.concatenate([self._root_likelihood_ratio(presses.inputs, mask) for mask in masks])
             misfit = np.concatenate([self._fit(presses.inputs, mask[:, None]).log_misfit[:, 0] for mask in masks])
-            # of a normal distribution that is known from so many presses only
+            # prediction limit of a normal distribution whose mean and variance are estimated
             quantile = stdtrit(n_presses - 1, 1 - FALSE_RATE) * sqrt(1 + 1 / n_presses)
             limit[level] = ratio.mean() + quantile * ratio.std()
             usual[level] = misfit.mean(), max(misfit.std(), MIN_STD)
@@ -139,7 +139,7 @@ class SinglePressTest:
     def is_unlike(self, inputs: Floats, fibre_mask: Mask) -> Mask:
         """Return (Q,) whether two presses explain (Q, C, F + G) scaled features much better than one."""
         limit = self.limit[np.minimum((~fibre_mask).sum(axis=1), LEVELS - 1)]
-        # the ratio is no more than what one press leaves
+        # the squared ratio does not exceed the misfit of a single press
         rows = np.flatnonzero(self._fit(inputs, fibre_mask[:, None]).misfit[:, 0] > limit**2)
         unlike = np.zeros(len(inputs), bool)
         unlike[rows] = self._root_likelihood_ratio(inputs[rows], fibre_mask[rows]) > limit[rows]
@@ -148,17 +148,17 @@ class SinglePressTest:
     def misfits(self, inputs: Floats, fibre_mask: Mask) -> Array:
         """Return (Q, M) misfits, in standard deviations from the usual, without each set of up to MAX_LEFT_OUT fibres.
 
-        The first is with all fibres in the (Q, C) mask.
+        The first of the M sets is empty: all fibres in the (Q, C) mask are used.
         """
         fibres = fibre_mask.shape[1]
-        most = min(MAX_LEFT_OUT, fibres // 3)
-        sets = [left_out for size in range(most + 1) for left_out in combinations(range(fibres), size)]
+        max_left_out = min(MAX_LEFT_OUT, fibres // 3)
+        sets = [left_out for size in range(max_left_out + 1) for left_out in combinations(range(fibres), size)]
         masks = fibre_mask[:, None] & np.array([~np.isin(np.arange(fibres), left_out) for left_out in sets])
         mean, std = self.usual_misfit[np.minimum((~masks).sum(axis=2), LEVELS - 1)].transpose(2, 0, 1)
         return (self._fit(inputs, masks).log_misfit - mean) / std
 
     def _fit(self, inputs: Floats, masks: Mask) -> "_Fit":
-        """Fit one press to each of Q, by the fibres in each of M masks; inputs (Q, C, F + G), masks (Q, M, C)."""
+        """Fit a single press to inputs (Q, C, F + G), with the fibres in each of the masks (Q, M, C)."""
         parts = [
             self._fit_chunk(self._project(inputs[first : first + _CHUNK]), masks[first : first + _CHUNK])
             for first in range(0, max(len(inputs), 1), _CHUNK)
@@ -166,7 +166,7 @@ class SinglePressTest:
         return _Fit(*map(np.concatenate, zip(*parts, strict=True)))
 
     def _fit_chunk(self, z: Array, masks: Mask) -> "_Fit":
-        """Fit presses of (Q, C, D) discriminants: at each position, the strength has a closed form."""
+        """Fit presses of (Q, C, D) discriminants; the strength at each position has a closed form."""
         first, second = np.triu_indices(COMPONENTS)
         squares = self.precision[:, :, first, second] * np.where(first == second, 1.0, 2.0)
         weighted = np.einsum("pcde,pce->pcd", self.precision, self.expected)
@@ -184,12 +184,12 @@ class SinglePressTest:
         best = misfit.argmin(axis=1)
         misfit, growth = (np.take_along_axis(part, best[:, None], axis=1)[:, 0] for part in (misfit, growth))
         numbers = np.maximum(COMPONENTS * masks.sum(axis=2), 1)
-        return _Fit(np.log(np.maximum(misfit / numbers, MIN_SHARE_LEFT)), misfit, best, growth)
+        return _Fit(np.log(np.maximum(misfit / numbers, MIN_RELATIVE_MISFIT)), misfit, best, growth)
 
     def _root_likelihood_ratio(self, inputs: Floats, fibre_mask: Mask) -> Array:
-        """Return (Q,) the root of twice the log-likelihood ratio of two presses over one.
+        """Return the root (Q,) of twice the log-likelihood ratio of two presses over one.
 
-        Both are taken to have the scatter of the one that fits best.
+        The scatter of both is that of the single press that fits best.
         """
         one, z = self._fit(inputs, fibre_mask[:, None]), self._project(inputs)
         ratios = np.empty(len(z))
@@ -199,7 +199,7 @@ class SinglePressTest:
             measured = (z[press, valid, None] @ whitening).ravel()
             gram, moment = expected @ expected.T, expected @ measured
             norm = np.diag(gram)[:, None] * np.diag(gram)
-            det = np.maximum(norm - gram**2, MIN_DET * norm)  # responses may hardly differ
+            det = np.maximum(norm - gram**2, MIN_DET * norm)  # the two responses may be nearly the same
             first = (np.diag(gram) * moment[:, None] - gram * moment) / np.maximum(det, 1e-9)  # strengths of both
             second = first.T
             is_pair = self._is_apart & (first > MIN_SHARE * second) & (second > MIN_SHARE * first)
@@ -210,29 +210,29 @@ class SinglePressTest:
         return ratios
 
     def _project(self, inputs: Floats) -> Array:
-        """(Q, C, D) discriminants of (Q, C, F + G) scaled features, of which missing fibres count for nothing."""
+        """Discriminants (Q, C, D) of scaled features (Q, C, F + G); missing values count as 0."""
         return np.einsum("qcf,cfd->qcd", np.nan_to_num(inputs), self.projection, optimize=True) + self.offset
 
     @cached_property
     def _is_apart(self) -> Mask:
-        """(P, P), which positions two fingers may press."""
+        """Pairs of positions (P, P) that are distant enough for two presses."""
         distance = np.linalg.norm(self.positions[:, None] - self.positions, axis=2)
         return distance > (MIN_CELLS - 0.5) * distance[distance > 0].min(initial=np.inf)
 
     def to_arrays(self, number: int) -> dict[str, Array]:
         """Return the arrays of the `number`-th stage by their names in files."""
-        return {f"{PREFIX}{number}.{each.name}": getattr(self, each.name) for each in fields(self)}
+        return {f"{PREFIX}{number}.{field.name}": getattr(self, field.name) for field in fields(self)}
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, Any], number: int) -> "SinglePressTest":
         """Read what `to_arrays` returned."""
-        return cls(**{each.name: arrays[f"{PREFIX}{number}.{each.name}"] for each in fields(cls)})
+        return cls(**{field.name: arrays[f"{PREFIX}{number}.{field.name}"] for field in fields(cls)})
 
 
 def find_unlike(tests: Sequence[SinglePressTest], presses: ScaledFeatures) -> Mask:
-    """Return (Q,) whether two presses explain the features much better than one, by the last stage that is complete.
+    """Return (Q,) whether two presses explain the features much better than one, by the test of the latest stage.
 
-    Presses that have reached none are not judged.
+    The result is false for presses before the first stage.
     """
     n_complete, unlike = count_complete(presses.complete), np.zeros(len(presses), bool)
     numbers = stages(presses.complete.shape[1])
@@ -248,7 +248,7 @@ def stages(n_timed: int) -> tuple[int, ...]:
 
 
 def find_misfits(tests: Sequence[SinglePressTest], presses: ScaledFeatures) -> Array:
-    """Return (Q, M) `SinglePressTest.misfits` of whole presses, MAX_PRESSES of them at most; none without tests."""
+    """Return (Q, M) `SinglePressTest.misfits` of up to MAX_PRESSES complete presses; none without tests."""
     if not tests:
         return np.empty((0, 1))
     finished = np.flatnonzero(presses.complete.all(axis=1))
@@ -259,7 +259,7 @@ def find_misfits(tests: Sequence[SinglePressTest], presses: ScaledFeatures) -> A
 def is_other_pad(tests: Sequence[SinglePressTest], misfits: Array) -> bool:
     """Return whether presses with (Q, M) misfits are of another pad than that of the calibration, or one cast again.
 
-    Fewer than MIN_PRESSES are not judged. A failed fibre fits badly, too, but the others fit well without it.
+    The result is false for fewer than MIN_PRESSES. After the failure of a fibre, the others still fit without it.
     """
     if len(misfits) < MIN_PRESSES or tests[-1].n_presses[0] < 2:
         return False
@@ -268,19 +268,19 @@ def is_other_pad(tests: Sequence[SinglePressTest], misfits: Array) -> bool:
 
 
 class _Fit(NamedTuple):
-    """The press that fits best, by the fibres in each mask; shapes (Q, M)."""
+    """The single press that fits best, with the fibres in each mask; shapes (Q, M)."""
 
-    log_misfit: Array  # logarithm of the misfit for each number that was measured
-    misfit: Array  # square of what it leaves, in units of the scatter
-    position: Indices  # of `SinglePressTest.positions`
-    scatter_growth: Array  # variance of a press so strong over that of those of the training
+    log_misfit: Array  # logarithm of the misfit per component
+    misfit: Array  # squared residual, in units of the scatter
+    position: Indices  # index in `SinglePressTest.positions`
+    scatter_growth: Array  # variance at the strength of the press, relative to that in training
 
 
 def _floor_share(residual: Array, response: Array) -> float:
     """Return the share of the scatter that does not grow with the response, from (Q, C, D) presses of training.
 
-    The scatter of the stronger half of the responses is compared with that of the weaker half. The strength of a press,
-    which all fibres have in common, is fitted to each press and does not count.
+    The scatter of the stronger half of the responses is compared with that of the weaker half, after the strength that
+    all fibres of a press have in common is fitted and removed.
     """
     norm = np.maximum((response**2).sum(axis=(1, 2)), 1e-9)
     strength = (residual * response).sum(axis=(1, 2)) / norm

@@ -1,10 +1,10 @@
-"""Training of the networks in torch: one loop for all, and what the localizer minimizes by it.
+"""Training of the networks in torch: the training loop, and the losses of the localizer.
 
-The loss is the distance, not its square, and a likelihood of the expected error. Every step masks random fibres and
-augments the positions (and depths) of presses, their features following the response model, and looks at them at random
-moments of its phase. The members of the ensemble know nothing of the Bayesian localizer, whose residual a smaller
-network learns: errors of different kinds, so that together they err by a tenth less. Nothing is selected on presses
-held back: of so few, chance would select.
+The loss is the distance, not its square, plus a likelihood of the expected error. Every step masks random fibres,
+augments the positions (and depths) of presses, whose features follow the response model, and reads them at random
+moments of a phase. The members of the ensemble are trained without the Bayesian localizer, whose residual a smaller
+network learns. Their errors differ in kind, so that the combination errs by a tenth less. No choice is made on presses
+held back, which are too few for it.
 """
 
 import math
@@ -12,6 +12,7 @@ import os
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from functools import partial
 from threading import Event, Lock
 from typing import Any, NamedTuple, cast
@@ -28,7 +29,7 @@ from padforge.common.validation import InputError
 from padforge.design.published.networks import fit_batch
 from padforge.sense.arrays import Array, Floats
 from padforge.sense.localizer.bayes import BayesianLocalizer, fit_stages
-from padforge.sense.localizer.moments import CORRECTED, PHASES, RESIDUAL, Phase
+from padforge.sense.localizer.moments import PHASES, RESIDUAL, RESIDUAL_PHASE, Phase
 from padforge.sense.localizer.network import (
     MAX_LOG_ERROR,
     MIN_LOG_ERROR,
@@ -44,7 +45,7 @@ from padforge.sense.localizer.torch_network import EnsembleMlp
 from padforge.sense.settings import LocalizerSettings
 
 WARM_UP = 0.2  # share of the steps in which the learning rate rises
-BETAS = 0.9, 0.95  # decay of the means of gradients and of their squares
+BETAS = 0.9, 0.95  # decay rates of AdamW
 AVERAGE_DECAY = 0.998  # decay of the exponential moving average of the weights
 REPORTS = 200  # calls of `on_progress` in a training
 
@@ -56,7 +57,7 @@ def one_cycle(share: float) -> float:
 
 @contextmanager
 def flushed_denormals() -> Iterator[None]:
-    """Take denormal numbers for 0 in this thread: means of gradients that stay 0 fade to them, and they take long."""
+    """Flush denormal numbers to 0 in this thread; they are slow, and moments of vanishing gradients decay to them."""
     torch.set_flush_denormal(True)
     try:
         yield
@@ -75,19 +76,29 @@ def fit_network(
     averaged: bool = True,
     on_progress: OnProgress = ignore_progress,
 ) -> dict[str, Floats]:
-    """Minimize a loss by AdamW with a one-cycle learning rate; return the moving average of the weights, or the last.
+    """Minimize a loss by AdamW with a one-cycle learning rate.
 
-    Weights by name require gradients and are changed in place. `loss_of_batch` draws a batch and returns its loss,
-    `seconds` limit the training in place of `steps`, and `on_progress` is called with (n, `REPORTS`, "").
+    Args:
+        parameters: weights by name, which require gradients and are changed in place.
+        loss_of_batch: samples a batch and returns its loss.
+        steps: of the training.
+        learning_rate: maximum.
+        seconds: limit the training in place of `steps`.
+        weight_decay: of AdamW.
+        averaged: whether to return the moving average of the weights, or the last ones.
+        on_progress: called with (n, `REPORTS`, "").
+
+    Returns:
+        The weights by name.
     """
     begin = time.monotonic()
     weights = list(parameters.values())
     average = [weight.detach().clone() for weight in weights]
-    # as torch.optim.AdamW, which imports its compiler: that takes a second
+    # The function behind torch.optim.AdamW, since that class imports the compiler of torch, which takes a second.
     means, squares = ([torch.zeros_like(weight) for weight in weights] for _ in range(2))
     counts = [torch.zeros(()) for _ in weights]
-    how: dict[str, Any] = dict(zip(("beta1", "beta2"), BETAS, strict=True))
-    how |= {"weight_decay": weight_decay, "eps": 1e-8, "amsgrad": False, "maximize": False, "fused": True}
+    adamw_options: dict[str, Any] = dict(zip(("beta1", "beta2"), BETAS, strict=True))
+    adamw_options |= {"weight_decay": weight_decay, "eps": 1e-8, "amsgrad": False, "maximize": False, "fused": True}
     share, step, reports = 0.0, 0, 0
     with flushed_denormals():
         while share < 1:
@@ -95,11 +106,12 @@ def fit_network(
             share = step / steps if seconds is None else min((time.monotonic() - begin) / max(seconds, 1e-9), 1.0)
             for weight in weights:
                 weight.grad = None
-            loss_of_batch().backward()  # lays gradients out as their weights, which a fused step takes for granted
+            loss_of_batch().backward()  # new gradients have the memory layout of their weights, as a fused step needs
             gradients = [cast(Tensor, weight.grad) for weight in weights]
             with torch.no_grad():
-                adamw(weights, gradients, means, squares, [], counts, lr=learning_rate * one_cycle(share), **how)
-            # The first steps are forgotten sooner than the later ones, or the average would begin at the initial draw.
+                rate = learning_rate * one_cycle(share)
+                adamw(weights, gradients, means, squares, [], counts, lr=rate, **adamw_options)
+            # The first steps decay faster, so that the initial weights do not weigh on the average.
             decay = min(AVERAGE_DECAY, step / (step + 9)) if averaged else 0.0
             for mean, weight in zip(average, weights, strict=True):
                 mean.lerp_(weight.detach(), 1 - decay)
@@ -114,9 +126,9 @@ class StoppedError(Exception):
 
 
 class JointProgress:
-    """Progress of trainings in threads, of `totals` steps, reported together.
+    """Joint progress of trainings in threads, of `totals` steps.
 
-    Those still at work when the `with` block ends stop at their next report.
+    Trainings that still run when the `with` block ends stop at their next report.
     """
 
     def __init__(self, totals: Sequence[int], on_progress: OnProgress) -> None:
@@ -124,9 +136,13 @@ class JointProgress:
         self._lock, self._stopped = Lock(), Event()
 
     def update(self, number: int, done: int, total: int, what: str) -> None:
-        """Report the progress of one training, in its own steps; raise StoppedError if the `with` block has ended.
+        """Report the progress of one training; raise StoppedError if the `with` block has ended.
 
-        `what` names work before or after these, which leaves the steps as they are.
+        Args:
+            number: of the training.
+            done: steps of this training so far, unless `what` is stated.
+            total: steps of this training.
+            what: work before or after the steps.
         """
         if self._stopped.is_set():
             raise StoppedError
@@ -142,29 +158,30 @@ class JointProgress:
         self._stopped.set()
 
 
-MEASURE_WEIGHT = 0.5  # weight of the error of a scaled depth or force, beside the distance
-LOG_ERROR_WEIGHT = 0.1  # weight of the likelihood of the expected error, beside the distance
-COMMON_SQUARE, COMMON_DIRECTIONS, COMMON_BATCHES = 10.0, 16, 16
-"""Mean square from which on directions of the inputs are scaled down, of the most that vary, and the batches that these
-are learnt from. Windows of a fibre vary alike, and so much that a network learns their differences late."""
+MEASURE_WEIGHT = 0.5  # weight of the error of a scaled depth or force, relative to that of the distance
+LOG_ERROR_WEIGHT = 0.1  # weight of the likelihood of the expected error, relative to that of the distance
+COMMON_SQUARE = 10.0
+"""Mean square above which directions of the inputs are scaled down. The windows of a fibre correlate, so strongly that
+a network would learn their differences late."""
+COMMON_DIRECTIONS = 16  # directions that are scaled down at most, those in which inputs vary most
+COMMON_BATCHES = 16  # batches on which these directions are fitted
 INPUT_NOISE = 0.02  # standard deviation of noise on scaled features, which are about 1
 AUGMENTATION = 2.2
-"""Standard deviation of augmented positions, in distances between neighbouring presses: 2 mm among 3000 presses on a
-pad of 45 mm, 7 mm among 240, which leave more to interpolate."""
-POSITION_AUGMENTATION, DEPTH_AUGMENTATION = 0.26, 0.3
-"""Where depths vary: standard deviations in scaled position and depth, of a press of the middle depth."""
-MIN_BATCHES, MAX_STEPS, HARDER = 9, 9900, 2
-"""Steps of an epoch at least, and of a training at most; how much longer training takes where depths vary, which is
-harder to learn."""
-RESIDUAL_NETWORK = {"hidden": 128, "layers": 3}
-"""Largest size of the network that corrects the Bayesian localizer: larger ones gain nothing."""
+"""Standard deviation of augmented positions, in distances between neighbouring presses: 2 mm with 3000 presses on a pad
+of 45 mm, and 7 mm with 240, between which there is more to interpolate."""
+POSITION_AUGMENTATION = 0.26  # the same where depths vary, scaled, for a press of the middle depth
+DEPTH_AUGMENTATION = 0.3  # standard deviation of augmented depths, scaled, for a press of the middle depth
+MIN_BATCHES = 9  # minimum steps of an epoch
+MAX_STEPS = 9900  # maximum steps of a training
+DEPTH_STEP_FACTOR = 2  # factor on the steps where depths vary, which is harder to learn
+MAX_RESIDUAL_SIZE = {"hidden": 128, "layers": 3}  # of the residual network; larger ones gain nothing
 PUBLISHED_HIDDEN = 50  # neurons of the published network, of one tanh layer
-PACE_STEPS, MIN_LENGTHS, MAX_MEMBERS = 12, 5, 64
-"""With a time budget: steps that measure the pace, usual lengths of a training before there is another for each core,
-and the most networks."""
+PACE_STEPS = 12  # steps that measure the pace, with a time budget
+MIN_LENGTHS = 5  # usual lengths of a training that a time budget must exceed for another member on each core
+MAX_MEMBERS = 64  # with a time budget
 MIN_STEPS = 36
-"""Steps that a time budget must allow each network: with 9 the error on the example is three times that of a whole
-training, with 36 a third greater."""
+"""Steps that a time budget must allow each network: with 9 the error on the example is three times that of a complete
+training, with 36 it is a third larger."""
 
 
 class TrainedNetworks(NamedTuple):
@@ -173,7 +190,18 @@ class TrainedNetworks(NamedTuple):
     networks: Networks
     bayes: tuple[BayesianLocalizer, ...]
     residual_network: Weights
-    trained_share: float  # of its usual steps, of the network that took the least
+    trained_share: float  # smallest share of its usual steps that a network took
+
+
+@dataclass
+class TrainingTask:
+    """Training of one network."""
+
+    name: str  # of its phase, or `RESIDUAL`
+    phase: Phase
+    steps: int  # usual number
+    seed: int
+    seconds: float | None = None  # limit in place of `steps`
 
 
 def train_members(
@@ -185,65 +213,82 @@ def train_members(
     time_budget: float | None = None,
     leverage: Array | None = None,
 ) -> TrainedNetworks:
-    """Train the members of the localizer; the last of several is a Bayesian localizer with its residual network.
+    """Train the members of the localizer in threads, each with a network for every phase of a press.
 
-    A member has a network for each phase of a press. Where depths vary there is no Bayesian localizer. Networks are
-    trained in threads. `table` is the (S, S, C, F + G) scaled response by position, over [-1, 1] in x and y.
-    `time_budget` is in seconds, for as many members as these are good for, and the progress is in seconds then, else in
-    steps of all networks. `leverage` is as in `leave_one_out_residuals`. InputError is raised if a budget ends before
-    each network has taken `MIN_STEPS`.
+    The last of several members is a Bayesian localizer with its residual network, unless depths vary.
+
+    Args:
+        presses: to train on.
+        table: scaled response by position, over [-1, 1] in x and y; shape (S, S, C, F + G).
+        options: size and number of the members.
+        rng: draws the seeds of the networks.
+        on_progress: called with the steps of all networks, or with seconds if there is a time budget.
+        time_budget: seconds for the training, which decide on the number of members.
+        leverage: as in `leave_one_out_residuals`.
+
+    Raises:
+        InputError: the time budget ends before each network has taken `MIN_STEPS`.
     """
     begin = time.monotonic()
     n_timed, presses = presses.complete.shape[1], leave_one_out_residuals(presses, table, leverage)
     phases = PHASES[n_timed]
-    steps = training_steps(len(presses.inputs), options) * (HARDER if presses.depth_gain else 1)
-    length, has_bayes = sum(phase.length for phase in phases.values()), options.members > 1 and not presses.depth_gain
-    members, cores, pace_s = max(1, options.members - has_bayes), os.cpu_count() or 1, 0.0
-    if time_budget is not None:
+    steps = training_steps(len(presses.inputs), options) * (DEPTH_STEP_FACTOR if presses.depth_gain else 1)
+
+    # 1. Number of members
+    cores, pace_s = os.cpu_count() or 1, 0.0
+    if time_budget is None:
+        has_bayes = options.members > 1 and not presses.depth_gain
+        members = max(1, options.members - has_bayes)
+    else:
+        has_bayes = not presses.depth_gain
         with one_thread():
             pace_s = Training(presses, table, options, 0, next(iter(phases.values()))).measure_pace()
-        has_bayes = not presses.depth_gain
+        length = sum(phase.length for phase in phases.values())
         members = max(1, min(round(cores * time_budget / (pace_s * MIN_LENGTHS * steps * length)), MAX_MEMBERS))
     fitted = presses.inputs, presses.fibre_mask, presses.targets
     bayes = fit_stages(table, *fitted, n_timed, on_progress) if has_bayes else ()
-    # Long trainings begin first, so that no core is idle at the end.
+
+    # 2. One task a network; long ones begin first, so that no core is idle at the end
     by_length = sorted(phases.items(), key=lambda item: -item[1].length)
-    tasks = [(name, phase) for name, phase in by_length for _ in range(members)]
-    tasks += [("", CORRECTED if n_timed else phases["press"])] * has_bayes
-    seeds = [int(seed) for seed in rng.integers(2**63, size=len(tasks))]
-    all_steps = [round(steps * phase.length) for _, phase in tasks]
-    totals, seconds = all_steps, list[float | None]([None] * len(tasks))
+    named_phases = [item for item in by_length for _ in range(members)]
+    if has_bayes:
+        named_phases.append((RESIDUAL, RESIDUAL_PHASE if n_timed else phases["press"]))
+    seeds = rng.integers(2**63, size=len(named_phases)).tolist()
+    tasks = [
+        TrainingTask(name, phase, round(steps * phase.length), seed)
+        for (name, phase), seed in zip(named_phases, seeds, strict=True)
+    ]
     if time_budget is not None:
         remaining_s = max(0.0, time_budget - (time.monotonic() - begin))
-        in_turn = [remaining_s * part / makespan(all_steps, cores) for part in all_steps]
-        totals, seconds = [max(1, round(each)) for each in in_turn], list[float | None](in_turn)
+        longest = makespan([task.steps for task in tasks], cores)
+        for task in tasks:
+            task.seconds = remaining_s * task.steps / longest
+    totals = [task.steps if task.seconds is None else max(1, round(task.seconds)) for task in tasks]
     on_progress(0, sum(totals), "")
-    n_steps = [0] * len(tasks)
     joint = JointProgress(totals, on_progress)
-    smaller = {name: min(size, getattr(options, name)) for name, size in RESIDUAL_NETWORK.items()}
+    residual_size = {name: min(size, getattr(options, name)) for name, size in MAX_RESIDUAL_SIZE.items()}
+    residual_options = options.model_copy(update=residual_size)
 
-    def train(number: int) -> Weights:
-        name, phase = tasks[number]
-        size, corrected = (options, ()) if name else (options.model_copy(update=smaller), bayes)
-        training = Training(presses, table, size, seeds[number], phase, corrected)
-
-        def loss_of_batch() -> Tensor:
-            n_steps[number] += 1
-            return training.loss()
-
+    # 3. Training
+    def train(number: int) -> tuple[Weights, int]:
+        """Return the weights of a network and the steps it has taken."""
+        task = tasks[number]
+        chosen = (residual_options, bayes) if task.name == RESIDUAL else (options, ())
+        training = Training(presses, table, chosen[0], task.seed, task.phase, chosen[1])
         fitted = fit_network(
             dict(training.network.named_parameters()),
-            loss_of_batch,
-            all_steps[number],
+            training.loss,
+            task.steps,
             options.learning_rate,
-            seconds=seconds[number],
+            seconds=task.seconds,
             on_progress=partial(joint.update, number),
         )
-        return training.weights(fitted)
+        return training.weights(fitted), training.n_steps
 
     with one_thread(), joint:
-        weights = dict(run_tasks((number, partial(train, number)) for number in range(len(tasks))))
-    missing = [max(0, min(MIN_STEPS, usual) - done) for done, usual in zip(n_steps, all_steps, strict=True)]
+        trained = dict(run_tasks((number, partial(train, number)) for number in range(len(tasks))))
+    weights, n_steps = zip(*(trained[number] for number in range(len(tasks))), strict=True)
+    missing = [max(0, min(MIN_STEPS, task.steps) - done) for task, done in zip(tasks, n_steps, strict=True)]
     if time_budget is not None and any(missing):
         needed_s = time.monotonic() - begin + pace_s * makespan(missing, cores)
         raise InputError(
@@ -251,11 +296,11 @@ def train_members(
             f"expected at least {MIN_STEPS}, about {math.ceil(needed_s)} s"
         )
     networks = {
-        name: stack_members([weights[number] for number, task in enumerate(tasks) if task[0] == name])
+        name: stack_members([weights[number] for number, task in enumerate(tasks) if task.name == name])
         for name in phases
     }
-    trained_share = min(min(done / usual, 1.0) for done, usual in zip(n_steps, all_steps, strict=True))
-    return TrainedNetworks(networks, bayes, weights[len(tasks) - 1] if has_bayes else {}, trained_share)
+    trained_share = min(min(done / task.steps, 1.0) for task, done in zip(tasks, n_steps, strict=True))
+    return TrainedNetworks(networks, bayes, weights[-1] if has_bayes else {}, trained_share)
 
 
 def training_steps(presses: int, options: LocalizerSettings) -> int:
@@ -264,7 +309,7 @@ def training_steps(presses: int, options: LocalizerSettings) -> int:
 
 
 def train_published(train: TrainingPresses, early_stop: TrainingPresses, rng: np.random.Generator) -> Weights:
-    """Train the published network by Levenberg-Marquardt; the error on presses of `early_stop` ends the training."""
+    """Train the published network by Levenberg-Marquardt with early stopping on the presses of `early_stop`."""
     x, y, *held_back = (
         part.reshape(len(part), -1).astype(np.float64)
         for part in (train.inputs, train.targets, early_stop.inputs, early_stop.targets)
@@ -284,13 +329,13 @@ def train_published(train: TrainingPresses, early_stop: TrainingPresses, rng: np
 
 
 def _loss(error: Tensor) -> Tensor:
-    """Return the (...) loss of (..., 2 + T) errors: the distance, and a share of the others."""
+    """Return the (...) loss of (..., 2 + T) errors: the distance, plus weighted errors of the measures."""
     distance = error[..., :2].square().sum(dim=-1).add(1e-8).sqrt()
     return distance if error.shape[-1] == 2 else distance + MEASURE_WEIGHT * error[..., 2:].abs().sum(dim=-1)
 
 
 class Training:
-    """A network and its loss; on the CPU, as a GPU, which waits for batches and orders, takes no less time."""
+    """A network and its loss, on the CPU: a GPU is no faster, since it waits for batches and kernel launches."""
 
     def __init__(
         self,
@@ -303,12 +348,13 @@ class Training:
         start: Weights | None = None,
     ) -> None:
         rng = np.random.default_rng(seed)
+        self.n_steps = 0  # batches so far
         self._presses = sampler = PressSampler(presses, table, options.max_failures, rng, phase, bayes)
         self._batch, targets = min(options.batch, len(presses.inputs)), sampler.targets
         self._bounds = low, high = targets[:, :3].min(axis=0), targets[:, :3].max(axis=0)
-        distance = math.sqrt((high - low)[:2].prod() / len(np.unique(targets[:, :2], axis=0)))
-        varying = POSITION_AUGMENTATION, POSITION_AUGMENTATION, DEPTH_AUGMENTATION
-        self._std = np.float32(varying if sampler.depth_gain else (AUGMENTATION * distance,) * 2)
+        spacing = math.sqrt((high - low)[:2].prod() / len(np.unique(targets[:, :2], axis=0)))
+        with_depth = POSITION_AUGMENTATION, POSITION_AUGMENTATION, DEPTH_AUGMENTATION
+        self._std = np.float32(with_depth if sampler.depth_gain else (AUGMENTATION * spacing,) * 2)
         self._force_per_depth = 0.0
         if sampler.depth_gain:
             centred = (targets - targets.mean(axis=0))[:, 2:]
@@ -322,7 +368,7 @@ class Training:
             self.network = EnsembleMlp.from_numpy({**start, "first.w": first.contiguous().numpy()})
 
     def weights(self, fitted: Weights) -> Weights:
-        """Return the weights for inputs as they are, of `fitted` parameters for scaled ones."""
+        """Return weights for unscaled inputs, from `fitted` parameters for scaled ones."""
         first = self.scale_down(torch.from_numpy(fitted["first.w"]).mT).mT
         return {**EnsembleMlp.join(fitted), "first.w": np.ascontiguousarray(first.numpy())}
 
@@ -337,30 +383,31 @@ class Training:
 
     def loss(self) -> Tensor:
         """Return the loss of the next batch."""
-        inputs, wanted = map(torch.from_numpy, self.draw())
+        self.n_steps += 1
+        inputs, targets = map(torch.from_numpy, self.sample_batch())
         predicted, log_error = self.network.forward_bfloat16(self.scale_down(inputs))[0].chunk(2, dim=1)
-        error, log_error = predicted - wanted, log_error.clamp(MIN_LOG_ERROR, MAX_LOG_ERROR)
+        error, log_error = predicted - targets, log_error.clamp(MIN_LOG_ERROR, MAX_LOG_ERROR)
         likelihood = (error.detach().abs() * (-log_error).exp() + log_error).sum(dim=1)  # of a Laplace distribution
         return (_loss(error) + LOG_ERROR_WEIGHT * likelihood).mean()
 
-    def draw(self) -> tuple[Floats, Floats]:
-        """Draw inputs (1, B, D), and what the network should answer (B, 2 + T)."""
-        rows = self._presses.draw(self._batch)
+    def sample_batch(self) -> tuple[Floats, Floats]:
+        """Sample inputs (1, B, D) and the targets of the network (B, 2 + T)."""
+        rows = self._presses.sample_rows(self._batch)
         targets = self._augment_position(self._presses.targets[rows])
         x, position = self._presses.inputs(rows, targets, INPUT_NOISE)
         return x[None], targets - position
 
     def _fit_directions(self) -> tuple[Tensor, Tensor]:
-        """Return the directions (D, n) in which inputs vary most, and the shares (n,) that are taken off these."""
-        x = np.concatenate([self.draw()[0][0] for _ in range(COMMON_BATCHES)]).astype(np.float64)
+        """Return the directions (D, n) in which inputs vary most, and the shares (n,) by which these are shrunk."""
+        x = np.concatenate([self.sample_batch()[0][0] for _ in range(COMMON_BATCHES)]).astype(np.float64)
         n_inputs = x.shape[1]
-        most = max(n_inputs - COMMON_DIRECTIONS, 0), n_inputs - 1
-        squares, directions = eigh(x.T @ x / len(x), subset_by_index=most)
+        largest = max(n_inputs - COMMON_DIRECTIONS, 0), n_inputs - 1
+        squares, directions = eigh(x.T @ x / len(x), subset_by_index=largest)
         shrinkage = 1 - (1 + squares.clip(0) / COMMON_SQUARE) ** -0.5
         return torch.from_numpy(directions.astype(np.float32)), torch.from_numpy(shrinkage.astype(np.float32))
 
     def scale_down(self, x: Tensor) -> Tensor:
-        """Scale (..., D) inputs down, most in the directions in which they vary most."""
+        """Scale (..., D) inputs down, most strongly in the directions in which they vary most."""
         return (x - x @ self._directions * self._shrinkage @ self._directions.T) / COMMON_SQUARE**0.5
 
     def scale_up(self, x: Tensor) -> Tensor:
@@ -369,19 +416,19 @@ class Training:
         return (x + x @ self._directions * growth @ self._directions.T) * COMMON_SQUARE**0.5
 
     def _augment_position(self, targets: Floats) -> Floats:
-        """Move (B, 2 + T) targets at random, and their force with their depth; reflect them at the bounds."""
+        """Augment (B, 2 + T) targets by normal noise, reflected at the bounds; force follows depth."""
         low, high = self._bounds
         gain = self._presses.depth_gain
         std = self._std / (1 + gain * targets[:, 2:3]) if gain else self._std
-        moved = targets[:, :3] + std * self._presses.rng.standard_normal((len(targets), len(self._std)))
-        moved = np.where(moved < low, 2 * low - moved, moved)
-        moved = np.clip(np.where(moved > high, 2 * high - moved, moved), -1, 1)
-        forces = targets[:, 3:] + self._force_per_depth * (moved - targets[:, :3])[:, 2:]
-        return np.concatenate([moved, forces], axis=1).astype(np.float32)
+        augmented = targets[:, :3] + std * self._presses.rng.standard_normal((len(targets), len(self._std)))
+        augmented = np.where(augmented < low, 2 * low - augmented, augmented)
+        augmented = np.clip(np.where(augmented > high, 2 * high - augmented, augmented), -1, 1)
+        forces = targets[:, 3:] + self._force_per_depth * (augmented - targets[:, :3])[:, 2:]
+        return np.concatenate([augmented, forces], axis=1).astype(np.float32)
 
 
-RETRAINING_STEPS, RETRAINING_RATE = 150, 1e-3
-"""Steps by which networks follow another response, which is near theirs; with 400 they err no less, and are surer."""
+RETRAINING_STEPS = 150  # from a similar response; with 400, networks err no less and are overconfident
+RETRAINING_RATE = 1e-3
 
 
 def retrain(
@@ -393,24 +440,34 @@ def retrain(
     rng: np.random.Generator,
     bayes: Sequence[BayesianLocalizer] = (),
 ) -> tuple[Networks, Weights]:
-    """Train networks further, from where they are, on presses of a pad that responds by another table.
+    """Fine-tune networks on presses of a pad with another response.
 
-    Networks that are not to be retrained are left out, and a residual network without weights stays so.
+    Args:
+        networks: to retrain, by phase.
+        residual_network: to retrain, if it has weights.
+        presses: of the pad.
+        table: its scaled response by position; shape (S, S, C, F + G).
+        max_failures: maximum number of masked fibres.
+        rng: draws the seeds of the networks.
+        bayes: that the residual network corrects.
+
+    Returns:
+        The retrained networks and residual network.
     """
     phases = PHASES[presses.complete.shape[1]]
     options = LocalizerSettings(max_failures=max_failures)
     tasks = [(name, weights, phases[name], ()) for name, weights in networks.items()]
     if residual_network:
-        phase = CORRECTED if presses.complete.shape[1] else phases["press"]
+        phase = RESIDUAL_PHASE if presses.complete.shape[1] else phases["press"]
         tasks.append((RESIDUAL, residual_network, phase, bayes))
     seeds = rng.integers(2**63, size=len(tasks)).tolist()
 
     def train(number: int) -> Weights:
-        _, weights, phase, corrected = tasks[number]
-        members = []
+        _, weights, phase, corrected_bayes = tasks[number]
+        members, steps = [], round(RETRAINING_STEPS * phase.length)
         for member in unstack_members(weights):
-            training = Training(presses, table, options, seeds[number], phase, corrected, member)
-            parameters, steps = dict(training.network.named_parameters()), round(RETRAINING_STEPS * phase.length)
+            training = Training(presses, table, options, seeds[number], phase, corrected_bayes, member)
+            parameters = dict(training.network.named_parameters())
             members.append(training.weights(fit_network(parameters, training.loss, steps, RETRAINING_RATE)))
         return stack_members(members)
 

@@ -18,7 +18,7 @@ from padforge.common.progress import OnProgress, ignore_progress
 from padforge.common.validation import InputError
 from padforge.design import Morphology
 from padforge.sense.health.fault_detector import HEALTH_FILES, FaultDetector
-from padforge.sense.localizer.calibration import calibrate, unlearnt_lines
+from padforge.sense.localizer.calibration import calibrate, missing_target_lines
 from padforge.sense.localizer.evaluation import Evaluation
 from padforge.sense.localizer.model import LocalizerModel
 from padforge.sense.recording.recording import Recording
@@ -70,7 +70,7 @@ def calibrate_into(
     model, evaluation = calibrate(
         recording, options, pad=pad, time_budget=time_budget, by_moment=by_moment, on_progress=on_progress
     )
-    for line in unlearnt_lines(recording, model):
+    for line in missing_target_lines(recording, model):
         _log.warning(line)
     detector = None
     if "health" not in without:

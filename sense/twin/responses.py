@@ -1,7 +1,7 @@
-"""Responses of the channels to presses at known positions, and what they say without a model of the pad.
+"""Responses of the channels to presses at known positions, and Gaussian processes fitted to them.
 
-A response is one number for a press and a channel: the mean while the tip rests in the silicone, minus the rest before
-and what the channel's history adds.
+The response of a channel to a press is its mean while the tip rests in the silicone, minus the baseline before the
+press and the effect of the history of the channel.
 """
 
 from dataclasses import dataclass, replace
@@ -12,21 +12,19 @@ from scipy.spatial import KDTree
 
 from padforge.sense.arrays import Array, Indices, Mask
 from padforge.sense.localizer.features import compute_features
-from padforge.sense.localizer.moments import DOWN
+from padforge.sense.localizer.moments import PRESS_WINDOWS
 from padforge.sense.localizer.response_model import ResponseModel, remove_history
 from padforge.sense.recording.recording import Recording
 
-DEPTH_TOLERANCE = 0.15  # share of its depth by which another press may differ that counts as equally deep
+DEPTH_TOLERANCE = 0.15  # relative difference of depths up to which presses count as equally deep
 FIRST_HELD = 3  # first window of the press that counts as held: the tip has come to rest in the silicone
-HOLD = np.array([(end - first) * (k >= FIRST_HELD) for k, (first, end) in enumerate(DOWN)], float)
+HOLD = np.array([(end - first) * (k >= FIRST_HELD) for k, (first, end) in enumerate(PRESS_WINDOWS)], float)
 HOLD /= HOLD.sum()
 """Weights of the windows of a press in its response; shape (9,)."""
-RIDGE_HISTORY = 300.0  # penalty on weights of the history: less than for places, as the responses themselves are wanted
-GP_WIDTHS = (0.4, 0.8)  # standard deviations of the Gaussian kernels that are tried, grid units
-GP_PRESSES = 800
-"""Presses that a Gaussian process is fitted to, at most: it takes the eigenvalues of a matrix of that size."""
-GP_RATIOS = np.append(0.0, np.geomspace(1e-2, 1e4, 61))
-"""Variances of the function that are tried, as multiples of that of the noise."""
+RIDGE_HISTORY = 300.0  # penalty on weights of the history; smaller than for a localizer, since responses are the result
+GP_WIDTHS = (0.4, 0.8)  # candidate standard deviations of the Gaussian kernel, grid units
+GP_PRESSES = 800  # maximum presses of a Gaussian process, the size of an eigenvalue problem
+GP_RATIOS = np.append(0.0, np.geomspace(1e-2, 1e4, 61))  # candidate ratios of the variances of function and noise
 MIN_GP_PRESSES = 10
 
 
@@ -36,7 +34,7 @@ class Responses:
 
     positions_mm: Array  # (Q, 2), in the arm's frame
     volts: Array  # (Q, C)
-    valid: Mask  # (Q, C), whether the channel gave enough readings
+    valid: Mask  # (Q, C), whether the channel has enough readings
 
     def __len__(self) -> int:
         return len(self.positions_mm)
@@ -47,7 +45,7 @@ class Responses:
 
     @property
     def variance(self) -> Array:
-        """Variance of each channel's responses; shape (C,); 1 where there are none."""
+        """Variance of the responses of each channel; shape (C,); 1 for a channel without responses."""
         counts = np.maximum(self.valid.sum(axis=0), 1)
         mean = np.where(self.valid, self.volts, 0).sum(axis=0) / counts
         variance = np.where(self.valid, (self.volts - mean) ** 2, 0).sum(axis=0) / counts
@@ -63,7 +61,7 @@ class Responses:
 def select_one_depth(recording: Recording) -> Recording:
     """Keep the positions of presses of the most common depth only, since a deeper one responds more.
 
-    The others stay in the history of those that follow. Where no depth is known, all are taken to be equal.
+    Other presses remain in the history of later ones. If no depth is known, all are assumed to be equal.
     """
     depths_mm = np.where(recording.has_position, recording.actual_depths_mm, np.nan)
     ordered = np.sort(depths_mm[depths_mm > 0])[::-1]
@@ -71,9 +69,9 @@ def select_one_depth(recording: Recording) -> Recording:
         return recording
     last = np.searchsorted(-ordered, -(1 - DEPTH_TOLERANCE) * ordered, "right")
     first = np.searchsorted(-ordered, -(1 + DEPTH_TOLERANCE) * ordered, "left")
-    usual = ordered[np.argmax(last - first)]  # the deepest of the most common, whose responses are largest
-    equal = np.abs(depths_mm - usual) <= DEPTH_TOLERANCE * usual
-    return replace(recording, presses_mm=np.where(equal[:, None], recording.presses_mm, np.nan))
+    common = ordered[np.argmax(last - first)]  # of equally common depths the largest, which has the largest responses
+    is_common = np.abs(depths_mm - common) <= DEPTH_TOLERANCE * common
+    return replace(recording, presses_mm=np.where(is_common[:, None], recording.presses_mm, np.nan))
 
 
 def compute_responses(recording: Recording, training: Mask) -> Responses:
@@ -81,7 +79,7 @@ def compute_responses(recording: Recording, training: Mask) -> Responses:
     positioned = recording.has_position
     down, up = recording.down_command[positioned], recording.up_command[positioned]
     inputs = compute_features(recording.readings, down, up, until=up)
-    pressed = inputs.windows[:, :, : len(DOWN)]
+    pressed = inputs.windows[:, :, : len(PRESS_WINDOWS)]
     positions_mm = recording.presses_mm[positioned]
     normalized, *_ = normalize(positions_mm)
     model = ResponseModel.fit(
@@ -111,24 +109,24 @@ def near_pairs(positions_mm: Array) -> tuple[Indices, Indices]:
 
 @dataclass(frozen=True)
 class GaussianProcess:
-    """A smooth function of the position, for one channel."""
+    """Gaussian process of the responses of one channel by position."""
 
     points: Array  # (n, 2), positions of the presses it was fitted to, grid units
     width: float  # standard deviation of its kernel, grid units
     weights: Array  # (n,), V
     mean_v: float
-    noise_v: float  # standard deviation of what it does not explain
-    log_bayes_factor: float  # log-likelihood of a smooth function minus that of noise alone
+    noise_v: float  # standard deviation of the noise
+    log_bayes_factor: float  # log-likelihood of the process minus that of noise alone
 
     def predict(self, points: Array) -> Array:
-        """Evaluate it at points (Q, 2), grid units; shape (Q,), V."""
+        """Predict the mean (Q,), V, at points (Q, 2), grid units."""
         return self.mean_v + np.exp(_squares(points, self.points) * (-0.5 / self.width**2)) @ self.weights
 
 
 def fit_gps(responses: Responses, unit_mm: float) -> list[GaussianProcess]:
     """Fit a Gaussian process to each channel, by maximum likelihood over kernel width and noise.
 
-    Where fewer than MIN_GP_PRESSES presses are valid, it is 0, with noise of NaN.
+    With fewer than MIN_GP_PRESSES valid presses, the process is 0 and its noise NaN.
     """
     points = responses.positions_mm[:GP_PRESSES] / unit_mm
     squares = _squares(points, points)
@@ -153,7 +151,7 @@ def fit_gps(responses: Responses, unit_mm: float) -> list[GaussianProcess]:
 
 
 def estimate_noise(responses: Responses, unit_mm: float) -> Array:
-    """Return the standard deviation (C,), V, of what no smooth function of the position explains, see `fit_gps`."""
+    """Return the standard deviation (C,), V, of the noise about a smooth function of the position, see `fit_gps`."""
     return np.array([gp.noise_v for gp in fit_gps(responses, unit_mm)])
 
 

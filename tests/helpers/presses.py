@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from padforge.sense.localizer.moments import DOWN, NOW
+from padforge.sense.localizer.moments import LATEST_WINDOWS, PRESS_WINDOWS
 from padforge.sense.localizer.scaler import TrainingPresses
 
 
@@ -18,7 +18,7 @@ def training_presses(
         n_timed: K; 0 for features that know no moment.
         speed: scaled distance that 1 mm/s goes from one reading to the next; the scale is 20 mm.
     """
-    factor = np.ones((inputs.shape[1], len(NOW), len(DOWN) if n_timed else 0), np.float32)
+    factor = np.ones((inputs.shape[1], len(LATEST_WINDOWS), len(PRESS_WINDOWS) if n_timed else 0), np.float32)
     return TrainingPresses(
         inputs.astype(np.float32),
         fibre_mask,

@@ -17,7 +17,7 @@ from padforge.sense.localizer.bayes import (
     fit_stages,
 )
 from padforge.sense.localizer.features import N_FEATURES
-from padforge.sense.localizer.moments import N_TIMED, NOW, STAGES, stage_of
+from padforge.sense.localizer.moments import BAYES_STAGES, LATEST_WINDOWS, N_TIMED, bayes_stage
 
 SIDE, FIBRES, WINDOWS, PRESSES, NOISE = 61, 4, 3, 2500, 0.05
 Response = Callable[[np.ndarray], np.ndarray]
@@ -183,10 +183,10 @@ def test_fit_stages_know_only_what_is_complete() -> None:
     inputs = (places @ slopes).reshape(200, 2, N_FEATURES) + NOISE * rng.standard_normal((200, 2, N_FEATURES))
     fibre_mask = np.ones((200, 2), dtype=bool)
     stages = fit_stages(table, inputs, fibre_mask, places, N_TIMED)
-    assert len(stages) == len(STAGES)
-    for n_complete, stage in zip(STAGES, stages, strict=True):
+    assert len(stages) == len(BAYES_STAGES)
+    for n_complete, stage in zip(BAYES_STAGES, stages, strict=True):
         spoilt = inputs.copy()
-        spoilt[:, :, n_complete : N_TIMED + len(NOW)] = 77.0
+        spoilt[:, :, n_complete : N_TIMED + len(LATEST_WINDOWS)] = 77.0
         found, _ = stage.predict(spoilt, fibre_mask)
         assert np.array_equal(found, stage.predict(inputs, fibre_mask)[0])
         spoilt[:, :, n_complete - 1] = 77.0
@@ -195,8 +195,8 @@ def test_fit_stages_know_only_what_is_complete() -> None:
 
 
 def test_stage_of_is_the_latest_that_is_complete() -> None:
-    assert [stage_of(count, N_TIMED) for count in range(N_TIMED + 1)] == [None] * 12 + [0, 1, 2, 3, 3, 4]
-    assert stage_of(0, 0) == 0
+    assert [bayes_stage(count, N_TIMED) for count in range(N_TIMED + 1)] == [None] * 12 + [0, 1, 2, 3, 3, 4]
+    assert bayes_stage(0, 0) == 0
 
 
 def test_fit_takes_discriminants_and_area_of_an_earlier_localizer(fitted_waves: Fitted) -> None:

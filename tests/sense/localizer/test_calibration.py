@@ -18,11 +18,16 @@ from padforge.design import Morphology
 from padforge.sense import Evaluation, Localizer, Recording, calibrate, evaluate, import_mat
 from padforge.sense.health.fault_detector import FibreFault, mask_faults
 from padforge.sense.localizer import training
-from padforge.sense.localizer.calibration import calibrate_uncertainty, known_measures, split_presses, unlearnt_lines
+from padforge.sense.localizer.calibration import (
+    calibrate_uncertainty,
+    missing_target_lines,
+    split_presses,
+    trainable_targets,
+)
 from padforge.sense.localizer.evaluation import calibration_lines, distances
 from padforge.sense.localizer.features import compute_features
 from padforge.sense.localizer.model import LocalizerModel
-from padforge.sense.localizer.moments import DOWN, N_DOWN, N_TIMED, complete_at
+from padforge.sense.localizer.moments import N_PRESS_WINDOWS, N_TIMED, PRESS_WINDOWS, complete_at
 from padforge.sense.localizer.network import predict_members
 from padforge.sense.settings import LocalizerSettings
 from padforge.sense.settings import LocalizerSettings as Options
@@ -188,11 +193,11 @@ def test_known_measures_need_depth_that_varies(
         if isinstance(value, float):
             change = {name: np.where(np.arange(400) == 7, value, deep_recording.depths_mm)}
     changed = replace(deep_recording, **change)
-    assert list(known_measures(changed, np.arange(400))) == learnt
+    assert list(trainable_targets(changed, np.arange(400))) == learnt
     if not learnt:
-        assert unlearnt_lines(changed, localizer) == lines
+        assert missing_target_lines(changed, localizer) == lines
     if lines:
-        assert len(known_measures(changed, np.arange(8, 400))) == 2
+        assert len(trainable_targets(changed, np.arange(8, 400))) == 2
 
 
 def test_calibrate_uncertainty_corrects_overconfidence(recording: Recording, localizer: LocalizerModel) -> None:
@@ -222,7 +227,7 @@ def test_calibrate_gives_radii_for_every_moment(recording: Recording, localizer:
     """Radii shrink as a press goes on, and hold; before any window is complete a press may be anywhere."""
     test, commands = np.array(localizer.test), (recording.down_command, recording.up_command)
     errors, radii = [], []
-    for n_complete in (2, N_DOWN, N_TIMED):
+    for n_complete in (2, N_PRESS_WINDOWS, N_TIMED):
         found = localizer.predict(recording, until=complete_at(n_complete, *commands))
         error = distances(found.positions_mm, recording.presses_mm)[test]
         assert (error <= found.r90_mm[test]).mean() > 0.9 - 0.25
@@ -296,7 +301,7 @@ TINY: dict[str, Any] = {"hidden": 16, "layers": 1, "epochs": 3, "batch": 64}
 @pytest.fixture(scope="module")
 def arrays(recording: Recording) -> tuple[np.ndarray, np.ndarray]:
     features = compute_features(recording.readings, recording.down_command, recording.up_command)
-    return features.windows[:, :, : len(DOWN)], recording.presses_mm
+    return features.windows[:, :, : len(PRESS_WINDOWS)], recording.presses_mm
 
 
 def test_localizer_scores_in_cross_validation(arrays: tuple[np.ndarray, np.ndarray], tmp_path: Path) -> None:

@@ -78,10 +78,10 @@ def test_a_finger_that_slides_is_followed(localizer: LocalizerModel, monkeypatch
     down, up = recording.down_command - 2, recording.up_command
 
     def error(least_slide: float) -> float:
-        monkeypatch.setattr(network, "LEAST_SLIDE", least_slide)
+        monkeypatch.setattr(network, "SLIDE_THRESHOLD", least_slide)
         features = localizer.scaler.transform(compute_features(recording.readings, down, up, up))
         return float(distances(localizer.predict_features(features).positions_mm, last).mean())
 
-    usual = network.LEAST_SLIDE
+    usual = network.SLIDE_THRESHOLD
     assert error(0.0) < 0.8 * error(np.inf)
     assert error(usual) < error(np.inf)

@@ -8,11 +8,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from padforge.sense.localizer.features import N_HISTORY, PressFeatures, compute_features, interpolate_gaps
-from padforge.sense.localizer.moments import DOWN, N_TIMED, NOW, UP
+from padforge.sense.localizer.moments import LATEST_WINDOWS, N_TIMED, PRESS_WINDOWS, RELEASE_WINDOWS
 from padforge.sense.localizer.scaler import MAX_INPUT, FeatureScaler
 
 PRESSES, FIBRES, WINDOWS = 5, 3, 4
-N_WINDOWS = N_TIMED + len(NOW)
+N_WINDOWS = N_TIMED + len(LATEST_WINDOWS)
 DOWN_COMMAND = 40 * np.arange(PRESSES) + 20
 UP_COMMAND = DOWN_COMMAND + 20
 
@@ -56,7 +56,9 @@ def test_compute_features_says_where_the_finger_is_now(until: int, now: list[int
     ramp = np.arange(5100.0)[:, None]
     found = compute_features(ramp, np.array([5000]), np.array([5020]), np.array([5000 + until]))
     np.testing.assert_allclose(found.windows[0, 0, N_TIMED:], np.array(now) + 5.5)
-    assert found.complete.sum() == sum(end <= until for _, end in DOWN) + sum(20 + end <= until for _, end in UP)
+    assert found.complete.sum() == sum(end <= until for _, end in PRESS_WINDOWS) + sum(
+        20 + end <= until for _, end in RELEASE_WINDOWS
+    )
 
 
 @pytest.mark.parametrize(("is_published", "until", "end"), [(False, None, 140), (True, None, 140), (False, 6, 106)])

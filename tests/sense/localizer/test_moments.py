@@ -6,14 +6,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from padforge.sense.localizer.moments import (
-    CORRECTED,
-    DOWN,
-    N_DOWN,
+    N_PRESS_WINDOWS,
     N_TIMED,
     PHASES,
+    PRESS_WINDOWS,
+    RELEASE_WINDOWS,
     RESIDUAL,
-    UP,
-    answering,
+    RESIDUAL_PHASE,
+    active_networks,
     complete_at,
     complete_windows,
     count_complete,
@@ -22,8 +22,8 @@ from padforge.sense.localizer.moments import (
 
 def completed(down: int, up: int, until: int) -> list[bool]:
     """Window by window: all its readings are before `until`, those of the release after one of it at least."""
-    of_touch = [until > up or all(down + n < until for n in range(*window)) for window in DOWN]
-    return of_touch + [until > up and all(up + n < until for n in range(*window)) for window in UP]
+    of_touch = [until > up or all(down + n < until for n in range(*window)) for window in PRESS_WINDOWS]
+    return of_touch + [until > up and all(up + n < until for n in range(*window)) for window in RELEASE_WINDOWS]
 
 
 @given(
@@ -45,7 +45,7 @@ def test_a_short_press_has_all_of_its_touch_once_it_has_ended(length: int, until
     assert count_complete(seen).tolist() == [expected]
 
 
-@given(count=st.integers(1, N_TIMED), length=st.integers(DOWN[-1][1], 60))
+@given(count=st.integers(1, N_TIMED), length=st.integers(PRESS_WINDOWS[-1][1], 60))
 def test_complete_at_is_the_first_reading_with_so_many_windows(count: int, length: int) -> None:
     down, up = np.array([0, 400]), np.array([length, 400 + length])
     at = complete_at(count, down, up)
@@ -58,20 +58,20 @@ def test_phases_cover_every_number_of_complete_windows(n_timed: int) -> None:
     phases = PHASES[n_timed].values()
     for count in range(n_timed > 0, n_timed + 1):
         names = {name: {} for name in PHASES[n_timed]}
-        assert len(answering(names, count, n_timed, False)) == 1
+        assert len(active_networks(names, count, n_timed, False)) == 1
         assert any(count in phase for phase in phases)
     assert not any(count in phase for count in (-1, n_timed + 1) for phase in phases)
     assert not any(0 in phase for phase in phases) or not n_timed
-    for phase in (*phases, CORRECTED):
+    for phase in (*phases, RESIDUAL_PHASE):
         assert sum(phase.shares) == pytest.approx(1)
         assert min(phase.shares) > 0
 
 
 def test_answering_adds_the_bayesian_localizer_after_the_release() -> None:
     networks = {name: {} for name in PHASES[N_TIMED]}
-    names = [answering(networks, count, N_TIMED, True) for count in range(N_TIMED + 1)]
-    plain = [[], *[["touched"]] * (N_DOWN - 1), ["settled"], *[["released"]] * len(UP)]
-    assert names == [each + [RESIDUAL] * (count in CORRECTED) for count, each in enumerate(plain)]
-    assert [answering(networks, count, N_TIMED, False) for count in range(N_TIMED + 1)] == plain
-    assert answering({"press": {}}, 0, 0, True) == ["press", RESIDUAL]
-    assert answering({"held": {}}, N_DOWN, N_DOWN, False) == ["held"]
+    names = [active_networks(networks, count, N_TIMED, True) for count in range(N_TIMED + 1)]
+    plain = [[], *[["touched"]] * (N_PRESS_WINDOWS - 1), ["settled"], *[["released"]] * len(RELEASE_WINDOWS)]
+    assert names == [each + [RESIDUAL] * (count in RESIDUAL_PHASE) for count, each in enumerate(plain)]
+    assert [active_networks(networks, count, N_TIMED, False) for count in range(N_TIMED + 1)] == plain
+    assert active_networks({"press": {}}, 0, 0, True) == ["press", RESIDUAL]
+    assert active_networks({"held": {}}, N_PRESS_WINDOWS, N_PRESS_WINDOWS, False) == ["held"]

@@ -10,7 +10,7 @@ from padforge.sense import Recording
 from padforge.sense.arrays import Array, Floats, Indices
 from padforge.sense.localizer.features import MODULATED, compute_features
 from padforge.sense.localizer.model import UNIFORM, LocalizerModel
-from padforge.sense.localizer.moments import N_DOWN, N_TIMED, complete_at
+from padforge.sense.localizer.moments import N_PRESS_WINDOWS, N_TIMED, complete_at
 from padforge.sense.localizer.scaler import FeatureScaler, ScaledFeatures, leave_one_out_residuals
 from padforge.sense.localizer.single_press import (
     MIN_PRESSES,
@@ -89,7 +89,7 @@ def fail(pad: Recording, fibres: list[int]) -> Recording:
     return replace(pad, readings=readings)
 
 
-@pytest.mark.parametrize(("n_complete", "least"), [(N_DOWN, 0.65), (N_TIMED, 0.85)])
+@pytest.mark.parametrize(("n_complete", "least"), [(N_PRESS_WINDOWS, 0.65), (N_TIMED, 0.85)])
 def test_two_fingers_are_unlike_a_press_and_single_ones_are_not(
     trained: Trained, pad: Recording, n_complete: int, least: float
 ) -> None:
@@ -117,7 +117,7 @@ def test_presses_before_the_first_stage_and_without_fibres_are_not_judged(traine
     presses = trained.later(pad)
     two = trained.superposed(presses, np.arange(100), np.arange(100, 200))
     assert find_unlike(trained.tests, two).any()
-    for n_complete in (0, N_DOWN - 1):
+    for n_complete in (0, N_PRESS_WINDOWS - 1):
         early = np.tile(np.arange(N_TIMED) < n_complete, (100, 1))
         assert not find_unlike(trained.tests, replace(two, complete=early)).any()
     assert not find_unlike(trained.tests, replace(two, fibre_mask=np.zeros_like(two.fibre_mask))).any()

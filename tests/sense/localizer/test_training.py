@@ -11,7 +11,7 @@ from padforge.benchmarks import localizer as bench
 from padforge.common.progress import ignore_progress
 from padforge.sense.localizer import network, torch_network, training
 from padforge.sense.localizer.features import N_FEATURES
-from padforge.sense.localizer.moments import CORRECTED, N_DOWN, N_TIMED, PHASES
+from padforge.sense.localizer.moments import N_PRESS_WINDOWS, N_TIMED, PHASES, RESIDUAL_PHASE
 from padforge.sense.localizer.press_sampler import PressSampler, sample_fibre_dropout
 from padforge.sense.localizer.response_model import interpolate_grid
 from padforge.sense.localizer.torch_network import EnsembleMlp
@@ -130,7 +130,7 @@ def test_train_members_reflects_augmented_positions_at_the_edge(monkeypatch: pyt
     assert np.sqrt(np.square(inwards).mean(axis=0)) == pytest.approx([0.1 * (1.2 / 4) ** 0.5] * 2, rel=0.06)
 
 
-@pytest.mark.parametrize(("n_timed", "members"), [(N_TIMED, 2), (N_TIMED, 1), (N_DOWN, 1), (0, 2)])
+@pytest.mark.parametrize(("n_timed", "members"), [(N_TIMED, 2), (N_TIMED, 1), (N_PRESS_WINDOWS, 1), (0, 2)])
 def test_train_members_trains_a_network_for_each_phase(n_timed: int, members: int) -> None:
     """And, as the last of several members, one that corrects the Bayesian localizers."""
     rng = np.random.default_rng(0)
@@ -145,7 +145,7 @@ def test_train_members_trains_a_network_for_each_phase(n_timed: int, members: in
 
     trained = training.train_members(presses, table, options, rng, show)
     phases = PHASES[n_timed]
-    lengths = [phase.length for phase in phases.values()] + [CORRECTED.length] * (members > 1)
+    lengths = [phase.length for phase in phases.values()] + [RESIDUAL_PHASE.length] * (members > 1)
     assert totals.pop("") == {sum(round(3 * training.MIN_BATCHES * length) for length in lengths)}
     assert list(totals) == ["Bayesian localizer"] * (members > 1)
     assert list(trained.networks) == list(phases)
@@ -161,7 +161,7 @@ def test_inputs_are_scaled_down_in_training_alone() -> None:
     common = 5 * rng.standard_normal((200, 1, 1)) + 0.1 * rng.standard_normal((200, 4, N_FEATURES))
     presses = training_presses(common, np.ones((200, 4), bool), rng.uniform(-1, 1, (200, 2)), N_TIMED)
     trained = training.Training(presses, table, Options(hidden=8, layers=1), 0, PHASES[N_TIMED]["released"])
-    x = torch.from_numpy(np.concatenate([trained.draw()[0] for _ in range(20)], axis=1))
+    x = torch.from_numpy(np.concatenate([trained.sample_batch()[0] for _ in range(20)], axis=1))
     scaled = trained.scale_down(x)
     squares = torch.linalg.eigvalsh(scaled[0].T @ scaled[0] / x.shape[1])
     assert torch.linalg.eigvalsh(x[0].T @ x[0] / x.shape[1])[-1] > 500
