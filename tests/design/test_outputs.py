@@ -171,7 +171,7 @@ def test_import(run, golden: Golden) -> None:
     upper = lines_mm(Morphology.load("out/plan/morphology.json"))[1]
     t = np.linspace(0, 1, 200)[:, None]
     control = np.array([[-20, 6], [-10, 15], [10, -3], [20, 6.13]])
-    drawn = sum(factor * (1 - t) ** (3 - k) * t**k * control[k] for k, factor in enumerate((1, 3, 3, 1)))
+    drawn = np.sum([factor * (1 - t) ** (3 - k) * t**k * control[k] for k, factor in enumerate((1, 3, 3, 1))], axis=0)
     stated = json.loads(printed.split("\n", 1)[1].rpartition("[")[0])
     assert stated["fibres"][1]["max_error_mm"] == pytest.approx(
         shapely.distance(shapely.points(drawn), upper).max(), abs=2e-3

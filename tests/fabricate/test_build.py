@@ -104,7 +104,7 @@ def test_3mf_is_one_named_object_of_one_material_in_strict_mode(built, golden):
 
 def step_lines(part: Any, indent: str = "") -> Iterator[str]:
     """The parts of a STEP file by name, with colour, solids, faces and volume."""
-    colour = "-" if part.color is None else to_hex([*part.color])
+    colour = "-" if part.color is None else to_hex(tuple(part.color))
     counts = f"{len(part.solids())} solids, {len(part.faces())} faces"
     yield f"{indent}{part.label}: {colour}, {counts}, {part.volume:.2f} mm³"
     for child in part.children:

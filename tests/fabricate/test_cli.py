@@ -3,7 +3,7 @@
 import io
 import json
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import ezdxf
 import pytest
@@ -80,7 +80,7 @@ def dxf_text(text: str) -> str:
     lines = [f"{name} {value}" for name, value in header.items()]
     for layer in document.layers:
         lines.append(f"layer {layer.dxf.name}: colour {layer.color}, {layer.rgb}")
-    for entity in document.modelspace():
+    for entity in cast(Any, document.modelspace()):
         match entity.dxftype():
             case "TEXT":
                 _, place, _ = entity.get_placement()

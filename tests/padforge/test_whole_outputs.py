@@ -19,8 +19,8 @@ from tests.helpers.less import blank_pictures, compare_little
 def command_names(command: click.Command) -> Iterator[tuple[str, ...]]:
     """The words of a command, if it is a group, and of all below it."""
     yield ()
-    for word in getattr(command, "commands", {}):
-        yield from ((word, *words) for words in command_names(command.commands[word]))
+    for word, below in getattr(command, "commands", {}).items():
+        yield from ((word, *words) for words in command_names(below))
 
 
 @pytest.mark.parametrize("word", cli.commands)

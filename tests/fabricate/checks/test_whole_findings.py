@@ -1,6 +1,7 @@
 """What every check says: of a sound pad, and of one with the fault that it is for, in whole sentences."""
 
 from collections.abc import Callable, Iterable
+from typing import Any
 
 import numpy as np
 from manifold3d import Manifold
@@ -85,7 +86,7 @@ def test_sentences_of_checks_of_plans(golden):
     golden("fabricate/findings_of_plans.txt", "\n".join(lines))
 
 
-def make_meshes() -> dict[str, object]:
+def make_meshes() -> dict[str, Any]:
     box = block(10, 20, 5)
     faces = np.array(box.faces)
     thin = Manifold.cube((5, 40, 20), True).translate((12.8, 0, 5))

@@ -62,7 +62,7 @@ def check_graph(graph: onnxruntime.InferenceSession, inputs: dict[str, np.ndarra
     positions_mm, *others = graph.run(["positions_mm", *names], inputs)
     check_positions(positions_mm, expected)
     for name, values in zip(names, others, strict=True):
-        np.testing.assert_allclose(values, getattr(expected, name), rtol=1e-4)
+        np.testing.assert_allclose(np.asarray(values), getattr(expected, name), rtol=1e-4)
 
 
 def test_graph_gives_the_predictions_with_masked_fibres(graph, localizer, brief) -> None:

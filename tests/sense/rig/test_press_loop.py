@@ -350,7 +350,11 @@ def test_run_keeps_what_each_press_reached(tmp_path):
     """
     arm, board, options = rig(pad_angle_deg=30.0, press_mm_s=400.0)
     move = arm.move
-    arm.move = lambda pose, *speeds: move((pose[0] + 0.01234, pose[1], pose[2] + 0.03456, *pose[3:]), *speeds)
+
+    def beside(pose, speed_mm_s, acceleration_mm_s2):
+        move((pose[0] + 0.01234, pose[1], pose[2] + 0.03456, *pose[3:]), speed_mm_s, acceleration_mm_s2)
+
+    arm.move = beside
     arm.hook = lambda arm: setattr(arm, "force_n", -min(50 - arm.pose[2], 4.5) * (1 + (7 * arm.time() % 1) ** 6))
     run(tmp_path / "run", arm, board, options, PressPlan(PLAN.positions_mm[:2], np.array([4.0, 5.0])))
     recording = Recording.open(tmp_path / "run")

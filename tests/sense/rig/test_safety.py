@@ -76,8 +76,10 @@ def test_check_target_on_the_limits_and_without_a_surface() -> None:
         check_target((*position, *TOOL), 250, 1200, LIMITS)
     for position in ((-100.1, Y, Z), (100.1, Y, Z), (X, -500.1, Z), (X, -299.9, Z), (X, Y, 43.9), (X, Y, 120.1)):
         assert "; allowed" in refusal((*position, *TOOL))
-    for pose, *speeds in ((SAFE, 250.1), (SAFE, 50, 1200.1), (SAFE, 50, 0), (SAFE[:5],), ((*SAFE[:5], -math.inf),)):
-        assert "; allowed" in refusal(pose, *speeds)
+    for speed, acceleration in ((250.1, 500), (50, 1200.1), (50, 0)):
+        assert "; allowed" in refusal(SAFE, speed, acceleration)
+    for pose in (SAFE[:5], (*SAFE[:5], -math.inf)):
+        assert "; allowed" in refusal(pose)
     check_target((X, Y, Z, *tilted(1.99)), 50, 500, LIMITS)
     assert "tilted" in refusal((X, Y, Z, *tilted(2.01)))
     assert "surface unknown" in refusal(SAFE, limits=replace(LIMITS, contact_mm=None))
