@@ -38,7 +38,9 @@ _MONITOR = re.compile(r"^(\d{1,2}:\d\d:\d\d(?:[.,]\d+)?) -> ?")  # time stamps o
 _GARBAGE = re.compile("^[\x00-\x08\x0e-\x1f\x7f-\xff\ufffd]*[\x00-\x08\x0e-\x1f\xfe\xff\ufffd]")  # sent while booting
 _CLOCK = re.compile(r"(\d{1,2}):(\d\d)(?::(\d\d(?:[.,]\d+)?))?")
 _DATE = re.compile(r"\d{1,4}[-/.]\d{1,2}[-/.]\d{1,4}[T ,]+\d{1,2}:\d\d.*|\d{1,2} \w{3} \d{4} .*|" + _CLOCK.pattern)
-_MEASURED = re.compile(r"(?:([A-Za-z]\w*) ?[:=] ?)?([-+]?[\d.,]+(?:[eE][-+]?\d+)?) ?([a-zA-Zµμ°%Ω]{1,4})?")
+_MEASURED = re.compile(
+    r"(?:([A-Za-z]\w*) ?[:=] ?)?([-+]?[.,]?\d[\d.,]*(?:[eE][-+]?\d+)?) ?((?![eE]$)[a-zA-Zµμ°%Ω]{1,4})?"
+)
 """A number with its name before it, as for the Arduino IDE's plotter, or its unit behind it: `left:1.84`, `0.05 s`."""
 _THOUSANDS = re.compile(r"[-+]?\d{1,3}(,\d{3})+(\.\d*)?")
 
@@ -332,10 +334,13 @@ def _fits(row: list[str], shares: Sequence[float]) -> bool:
 
 
 def _is_number(cell: str) -> bool:
+    cell = cell.strip()
     try:
-        float(cell.strip().replace(",", "."))
+        float(cell.replace(",", "."))
     except ValueError:
-        return bool(_THOUSANDS.fullmatch(cell.strip()) or _MEASURED.fullmatch(cell.strip()))
+        measured = _MEASURED.fullmatch(cell)
+        has_more = measured is not None and bool(measured[1] or measured[3])
+        return bool(_THOUSANDS.fullmatch(cell)) or (has_more and _is_number(measured[2]))
     return "_" not in cell
 
 

@@ -184,7 +184,8 @@ class LineBoard(SerialBoard):
         Raises:
             RigFault: "data" if the buffer overflowed, or the board was reset or sends impossible times.
         """
-        return self._assembler.assemble(self._drain())
+        blocks = self._drain()  # raises where the board is not connected
+        return self._assembler.assemble(blocks)
 
     def _start(self, stream: SerialStream) -> dict[str, Any]:
         self._decoder, self._settled = LineDecoder(), False
