@@ -413,9 +413,9 @@ def recalibration_lines(result: Recalibration) -> list[str]:
     names = {None: "as it was", "corrected": "corrected by gains and pose", "refitted": "response fitted again"}
     lines = [f"{result.presses} new presses, each predicted by what was changed without it; error in mm"]
     for each in result.candidates:
-        error = f" +- {each['standard_error_mm']:.2f}" if each["change"] else ""
+        error = f" ± {each['standard_error_mm']:.2f}" if each["change"] else ""
         mark = "  <- kept" if each["change"] == result.change else ""
-        lines.append(f"{each['mean_mm']:6.2f}{error:8}  {names[each['change']]}{mark}")
+        lines.append(f"{each['mean_mm']:6.2f}{error:7}  {names[each['change']]}{mark}")
     lines += [
         "failed  sets  before mm  after mm  in r90 before  in r90 after",
         *(
