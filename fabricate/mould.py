@@ -117,7 +117,7 @@ def ridge_prisms(
     """
     floor, height = plan.settings.mould.floor_mm, plan.heights_mm[plan.layer_indices[fibres[0]]]
     prisms = []
-    for below in terraces(height, plan.settings.terrace_mm):  # a printer makes terraces of a taper
+    for below in terraces(height, plan.settings.terrace_mm):  # a sloping side is printed as steps
         outline = plan.outline(fibres, below, tolerance_mm) if below else top
         prisms.append(Prism(outline, floor - INTO_FLOOR_MM, floor + height - below))
     return prisms

@@ -38,7 +38,8 @@ FAMILIES = ("horizontal", "vertical")
 FAMILY_COLOURS = (HORIZONTAL, VERTICAL)
 INTO_WALL_MM = 0.5
 """Depth of ridges in the walls: the tracks open to the pad's sides, and no two faces of the mould coincide."""
-COVER_MM = 1.0  # minimum silicone over the deepest track; a pad of more than two layers is made thicker for it
+COVER_MM = 1.0
+"""Minimum silicone between the deepest track and the far face; a pad of more than two layers is made thicker for it."""
 SNAP_MM = 1e-4
 """Grid to which areas are snapped by Boolean operations, mm.
 
@@ -237,7 +238,7 @@ class Plan:
 
         Args:
             tolerance_mm: tolerance against the curves.
-            past_mm: length of the paths past the ends of their tongues.
+            past_mm: length of the paths beyond the outer ends of the exits.
         """
         past = self.settings.mould.exit_mm, past_mm
         curves = flatten(self.pad, tolerance_mm / self.pad.unit_mm)

@@ -300,7 +300,7 @@ def expected_error(
     weights: Array,
     differentiate: bool = True,
 ) -> tuple[Array, Array]:
-    """Compute the expected error for each set of failed fibres, and its gradient by the responses.
+    """Compute the criterion, which approximates the expected error, for each set of failed fibres, and its gradient.
 
     Args:
         responses: responses to the Q = side^2 presses of a grid, row by row, and to P other presses of the regression;

@@ -377,9 +377,9 @@ class GradientSearch:
     def _objective(self, curves: FibreCurves, noise_factor: float) -> tuple[float, Array]:
         """Return the sum of the relative error and the weighted terms, and its gradient (3, F, n) by the curves.
 
-        Presses and failures are random. The error is computed under one contact, drawn with a probability equal to its
-        share of the mean; for the others, running means of earlier steps stand in. With the weight 1 / probability the
-        gradient is, on average, that of the mean over all contacts.
+        Presses and failures are random. The error is computed under one contact, drawn in proportion to its
+        contribution to the relative error; for the others, running means of earlier steps stand in. With the weight
+        1 / probability the gradient is, on average, that of the mean over all contacts.
         """
         search, pad, shares = self.problem.search, self.problem.pad, failure_shares(self.problem.search.max_failures)
         straight_errors = self.problem.straight_errors

@@ -98,7 +98,7 @@ def recording_line(recording: "Recording", out: Path) -> str:
 class Prediction(NamedTuple):
     """Predictions of the models in a folder for a recording; without a health model no faults and shifts."""
 
-    localization: "Localization"  # faulty fibres are masked from the press of their detection on
+    localization: "Localization"  # faulty fibres are masked from their first bad press on
     faults: "list[FibreFault]"
     shifts: "list[DomainShift]"
     detector: "FaultDetector | None"
@@ -108,7 +108,7 @@ class Prediction(NamedTuple):
 def predict_despite_faults(
     model: Path, recording: "Recording", failed: Sequence[int] = (), moment: tuple[str, float] | None = None
 ) -> Prediction:
-    """Localize all presses, with faulty fibres masked from the press of their detection on.
+    """Localize all presses, with faulty fibres masked from their first bad press on (`FibreFault.since`).
 
     Args:
         model: folder of the models.

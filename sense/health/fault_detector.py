@@ -107,7 +107,7 @@ class _WiringFault(NamedTuple):
 class FaultMonitor:
     """Detects faulty fibres press by press; they are masked from then on.
 
-    If responses of most fibres seem to be at fault, it is the model that does not fit: these are masked no more.
+    If the responses of most fibres seem faulty, the model does not fit the pad, and these fibres are unmasked.
 
     Args:
         model: of the healthy pad.
@@ -138,7 +138,7 @@ class FaultMonitor:
 
     @property
     def _is_misfit(self) -> bool:
-        """Whether these are most, by more than a single swap."""
+        """Whether two or more faults suspect over half of all fibres."""
         return len(self._response_faults) > 1 and 2 * len(self._suspected) > self.model.fibres
 
     def update(self, readings: Array, down_command: int, up_command: int) -> list[FibreFault]:
@@ -217,7 +217,7 @@ class FaultMonitor:
         return list(self._recent)[first - self.n_presses - 1 :]
 
     def _identify(self) -> FibreFault:
-        """Identify the faulty fibre, mask it, and compute the sums as if it always had been masked.
+        """Identify the faulty fibre, mask it, and recompute the sums without it from the earliest onset on.
 
         A faulty fibre disturbs the predictions for the others. So every suspect is tested again by the fibres that are
         not suspected; the faulty one still stands out.

@@ -97,8 +97,8 @@ class FaultLikelihoods:
     def log_likelihood_ratios(self, traces: Array, targets: Array, mean: Array, std: Array) -> tuple[Array, Array]:
         """Compute the log-likelihood ratios (Q, C, H) of all hypotheses against health, for successive presses.
 
-        From traces (Q, C, TRACE), V, of which the first counts as preceded by itself, targets, and their predicted mean
-        and std (Q, C, T). Returns `llr_continuing` if the fault was present at the press before, and `llr_onset` if it
+        Traces (Q, C, TRACE) are in V; targets, their predicted mean and std are (Q, C, T). The first press is its own
+        predecessor. Returns `llr_continuing` if the fault was present at the press before, and `llr_onset` if it
         has begun since; 0 for a fibre that misses readings.
         """
         constant = np.where(_is_constant(traces), -np.log(self.constant_share), -MAX_LLR)

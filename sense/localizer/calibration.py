@@ -202,10 +202,10 @@ def fit_model(
     if data.detected is not None:
         features, rows = features + data.detected[train], np.concatenate([train, train])
     n_timed = data.features.complete.shape[1]
-    phases = MODULATED if n_timed else ()
+    modulated = MODULATED if n_timed else ()
     positions_mm, measures = data.positions_mm[rows], {name: values[rows] for name, values in data.measures.items()}
     on_progress(0, 0, "response model")
-    scaler, table = FeatureScaler.fit(features, positions_mm, measures, phases)
+    scaler, table = FeatureScaler.fit(features, positions_mm, measures, modulated)
     presses = scaler.training_presses(features, positions_mm, measures, frame_rate_hz(data.rate_hz))
     leverage = None
     if data.pad is not None and is_ensemble and len(train) <= FEW_PRESSES:

@@ -365,10 +365,11 @@ def _joint_mean(values: Array, presses: int, prior: Array) -> float:
 
 
 def _conformal_quantile(share: float, ratios: Array, prior: Array = _NO_PRIOR) -> float:
-    """Conformal quantile of (sets, Q) ratios: the smallest that a share of them, plus one, does not exceed, if any.
+    """Compute the split-conformal quantile of (sets, Q) ratios: the smallest ratio that the share does not exceed.
 
     The sets of failed fibres of one press are not independent; the effective sample size is that of a binomial
-    distribution with the observed variance between presses. Values of the prior weigh PRIOR_PRESSES in total.
+    distribution with the observed variance between presses. Values of the prior weigh PRIOR_PRESSES in total; without
+    them one ratio more, above all others, is counted. The greatest ratio is returned where no other is large enough.
     """
     within = (ratios <= np.quantile(ratios, share)).mean(axis=0)
     presses, variance = len(within), float(within.var())

@@ -71,8 +71,8 @@ class Localization:
         r50_mm: (Q,) radius that holds the true position in 50 % of cases.
         r90_mm: (Q,) radius that holds it in 90 % of cases.
         measures: depth and force by the names of `Recording.measures`, where they are predicted.
-        unlike: (Q,) whether no single press explains the responses, for example those to two fingers; the radii of such
-            a press are those of an unknown position. None if not tested.
+        unlike: (Q,) whether two presses explain the responses much better than one, as those to two fingers; the radii
+            of such a press are those of an unknown position. None if not tested.
     """
 
     positions_mm: Array
@@ -119,8 +119,8 @@ class LocalizerDocument:
     features: FeatureSet
     rate_hz: Annotated[float, Field(ge=MIN_RATE_HZ, le=MAX_RATE_HZ)]  # of the training recording
     scaler: FeatureScaler
-    # (K + 1, L, 3 + T) by numbers of complete windows and of failed fibres: factors from the expected error to the
-    # standard deviation, the radii of 50 and 90 %, and the r90 of T measures, calibrated on presses held back
+    # (K + 1, L, 3 + T) by numbers of complete windows and of failed fibres: factors from the predicted standard
+    # deviation to the calibrated one, the radii of 50 and 90 %, and the r90 of T measures, by presses held back
     interval_factors: Annotated[Array, *array_field(1e-9, 1e6)]
     training_recording_sha256: Digest
     split: Split = "random"  # of training and test presses
@@ -310,7 +310,8 @@ class LocalizerModel(LocalizerDocument):
     def predict_features(self, presses: ScaledFeatures, failed: ArrayLike = ()) -> Localization:
         """Predict the positions of Q single presses.
 
-        A press without a valid fibre has the middle of the pressed area, and the radii of an unknown position.
+        A press without a valid fibre or without a complete window has the middle of the pressed area, and the radii of
+        an unknown position.
 
         Args:
             presses: scaled features.

@@ -14,12 +14,12 @@ They are complete one after the other, so that the number of complete windows, K
 is. Each phase of a press has its own network (`PHASES`), since one network for all phases learns each of them less
 well::
 
-    complete     phase            network       in addition
-    0            -                -             the press may be anywhere
+    complete     phase            network
+    0            -                none: the press may be anywhere
     1 .. 8       touch            "touched"
-    9            rest             "settled"     "touched", if the finger has slid since `EARLY_WINDOWS`
-    10 .. 17     release          "released"    from 12 on the Bayesian localizer of the last of `BAYES_STAGES` that is
-                                                complete, corrected by the network "residual"
+    9            rest             "settled"; from here on "touched" instead, if the finger slid since `EARLY_WINDOWS`
+    10 .. 17     release          "released"; from 12 on together with the Bayesian localizer of the last of
+                                  `BAYES_STAGES` that is complete, corrected by the network "residual"
 """
 
 from bisect import bisect_right

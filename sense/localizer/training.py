@@ -2,7 +2,7 @@
 
 The loss is the distance, not its square, plus a likelihood of the expected error. Every step masks random fibres,
 augments the positions (and depths) of presses, whose features follow the response model, and reads them at random
-moments of a phase. The members of the ensemble are trained without the Bayesian localizer, whose residual a smaller
+moments of a phase. The networks of the ensemble are trained without the Bayesian member, whose residual a smaller
 network learns. Their errors differ in kind, so that the combination errs by a tenth less. No choice is made on presses
 held back, which are too few for it.
 """
