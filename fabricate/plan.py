@@ -280,7 +280,11 @@ class Plan:
         return one_side_leads(ends, pad.layout, lead_spacing(self.settings, self.heights_mm[-1], self.flare_mm))
 
     def ends(self, end: int) -> list[Lead]:
-        """Return the leads at the starts (`end` = 0) or at the ends (1) of all fibres."""
+        """Return the leads at the starts (`end` = 0) or at the ends (1) of all fibres.
+
+        Args:
+            end: 0 for the starts, 1 for the other ends.
+        """
         return [pair[end] for pair in self.leads.pairs]
 
     @cached_property
@@ -295,7 +299,11 @@ class Plan:
         return min(self.pad.layout.pitch_x_mm, self.pad.layout.pitch_y_mm)
 
     def family(self, fibre: int) -> int:
-        """Return the family of a fibre: 0 horizontal, 1 vertical."""
+        """Return the family of a fibre: 0 horizontal, 1 vertical.
+
+        Args:
+            fibre: index among all fibres.
+        """
         return self.pad.layout.family(fibre)
 
     @cached_property
@@ -388,7 +396,11 @@ class Plan:
         return shapely.union_all(bands).simplify(_OUTLINE_SHARE * tolerance)
 
     def layer_fibres(self, layer: int) -> list[int]:
-        """Return the indices of the fibres of a layer, ascending."""
+        """Return the indices of the fibres of a layer, ascending.
+
+        Args:
+            layer: its index, from the lowest, 0.
+        """
         return [fibre for fibre, index in enumerate(self.layer_indices) if index == layer]
 
     @cached_property

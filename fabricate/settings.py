@@ -95,7 +95,11 @@ class PrinterSettings(Settings):
         return self.nozzle_mm * (2 if self.resin else 1)
 
     def is_whole_layers(self, height_mm: float) -> bool:
-        """Return whether a height is a whole number of layers."""
+        """Return whether a height is a whole number of layers.
+
+        Args:
+            height_mm: height.
+        """
         layers = height_mm / self.layer_mm
         return round(layers) > 0 and abs(layers - round(layers)) <= 1e-6
 
@@ -177,6 +181,9 @@ class FabricationSettings:
     def from_spec(cls, spec: Spec) -> "FabricationSettings":
         """Read the sections of a `pad.toml`.
 
+        Args:
+            spec: settings file.
+
         Raises:
             InputError: a key is unknown or a value out of range, or the mould contradicts `[contact]`.
         """
@@ -229,6 +236,9 @@ class FabricationSettings:
 
     def require_consistent(self, layout: Layout) -> None:
         """Check that settings do not contradict each other or the pitch of the pad.
+
+        Args:
+            layout: fibres and pitch.
 
         Raises:
             InputError: settings contradict each other.

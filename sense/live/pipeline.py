@@ -92,12 +92,20 @@ class Estimate:
         )
 
     def has_moved_from(self, earlier: "Estimate") -> bool:
-        """Return whether the distance to an earlier estimate of the same press exceeds both radii of 90 %."""
+        """Return whether the distance to an earlier estimate of the same press exceeds both radii of 90 %.
+
+        Args:
+            earlier: estimate of the same press.
+        """
         distance = hypot(self.x_mm - earlier.x_mm, self.y_mm - earlier.y_mm)
         return distance > max(self.r90_mm, earlier.r90_mm)
 
     def is_sharper_than(self, earlier: "Estimate") -> bool:
-        """Return whether the radius of 90 % is at most `SHARPER` times that of an earlier estimate."""
+        """Return whether the radius of 90 % is at most `SHARPER` times that of an earlier estimate.
+
+        Args:
+            earlier: estimate of the same press.
+        """
         return self.r90_mm <= SHARPER * earlier.r90_mm
 
     def to_dict(self) -> dict[str, Any]:

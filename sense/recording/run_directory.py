@@ -139,7 +139,11 @@ class Recorder:
 
     @classmethod
     def resume(cls, path: Path) -> "Recorder":
-        """Continue an unfinished run directory; torn ends are cut off, other damage raises InputError."""
+        """Continue an unfinished run directory; torn ends are cut off, other damage raises InputError.
+
+        Args:
+            path: of the run directory.
+        """
         fibres = read_fibres(path := check_path("path", path))
         self = cls.__new__(cls)
         with reraise_write_error(path), contextlib.ExitStack() as lock:
@@ -177,7 +181,12 @@ class Recorder:
         return self
 
     def append(self, times_s: ArrayLike, readings: ArrayLike) -> None:
-        """Add readings (n, C), V, at ascending times (n,), s; after an OSError (a full disk) none is added."""
+        """Add readings (n, C), V, at ascending times (n,), s; after an OSError (a full disk) none is added.
+
+        Args:
+            times_s: (n,) ascending.
+            readings: (n, C) V.
+        """
         times, volts = check_numbers(times_s, np.float64, "times"), check_numbers(readings, np.float64, "readings")
         if times.ndim != 1 or volts.shape != (len(times), self.fibres) or not np.isfinite(times).all():
             raise InputError(
@@ -190,7 +199,11 @@ class Recorder:
         self.n_readings += len(rows)
 
     def append_states(self, rows: Array) -> None:
-        """Add states (n, 10) of the arm, by `STATE_COLUMNS`."""
+        """Add states (n, 10) of the arm, by `STATE_COLUMNS`.
+
+        Args:
+            rows: (n, 10), by `STATE_COLUMNS`.
+        """
         if self._states is None:
             file = (self._path / STATES).open("xb", buffering=0)
             sync(self._path)
@@ -234,7 +247,11 @@ class Recorder:
         self._press, self._is_down = self._press + 1, False
 
     def abort(self, reason: str) -> None:
-        """Record that the current press, if any, was aborted for a reason."""
+        """Record that the current press, if any, was aborted for a reason.
+
+        Args:
+            reason: in words.
+        """
         if self._is_down:
             self._is_down = False
             self._write_event("aborted", self._press, self.n_readings, reason=reason)
