@@ -127,7 +127,7 @@ class Table:
                     if column in dates:
                         dates[column].append(cells[column])
                         value = np.nan  # filled in below
-                    elif (value := _parse(cells[column], dialect, column in may_be_unknown)) is None:
+                    elif (value := _parse(cells[column], dialect, column, column in may_be_unknown)) is None:
                         words[column][line], value = cells[column], np.nan
                     numbers.append(value)
         if not self._lines:
@@ -349,7 +349,7 @@ def _is_value(cell: str) -> bool:
     return word in MISSING or word in _TRUTH or word == "?" or _is_number(word) or bool(_DATE.fullmatch(cell.strip()))
 
 
-def _parse(cell: str, dialect: _Dialect, may_be_unknown: bool) -> float | None:
+def _parse(cell: str, dialect: _Dialect, column: int, may_be_unknown: bool) -> float | None:
     """Return the number in a cell, NaN if it is missing, None for anything else."""
     try:
         value = float(cell)
@@ -365,7 +365,9 @@ def _parse(cell: str, dialect: _Dialect, may_be_unknown: bool) -> float | None:
     if word == "?" and may_be_unknown:
         return UNKNOWN
     if (measured := _MEASURED.fullmatch(cell)) and (measured[1] or measured[3]):
-        return _parse(measured[2], dialect, may_be_unknown=False)
+        if measured[3] not in (None, dialect.units[column]):
+            return None  # another unit than that of the column
+        return _parse(measured[2], dialect, column, may_be_unknown=False)
     if dialect.decimal_comma:
         cell = cell.replace(".", "").replace(",", ".")
     elif _THOUSANDS.fullmatch(cell) and (dialect.separator == "," or "." in cell):

@@ -358,6 +358,9 @@ def test_import_csv_reads_numbers_with_names_before_and_units_behind_them(tmp_pa
         for t, row in zip(TIMES, VOLTS, strict=True)
     ]
     check(load(tmp_path, table(lines=measured)))
+    mixed = [row.replace("mV", " V") if i % 2 else row for i, row in enumerate(measured)]
+    with pytest.raises(InputError, match=r"line 3: column 'c0' holds no number but '.* V'"):
+        load(tmp_path, table(lines=mixed))
 
 
 def test_import_bag_reads_fields_of_messages(tmp_path: Path) -> None:
