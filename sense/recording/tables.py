@@ -339,8 +339,9 @@ def _is_number(cell: str) -> bool:
         float(cell.replace(",", "."))
     except ValueError:
         measured = _MEASURED.fullmatch(cell)
-        has_more = measured is not None and bool(measured[1] or measured[3])
-        return bool(_THOUSANDS.fullmatch(cell)) or (has_more and _is_number(measured[2]))
+        if measured is not None and (measured[1] or measured[3]):
+            return _is_number(measured[2])
+        return bool(_THOUSANDS.fullmatch(cell))
     return "_" not in cell
 
 
