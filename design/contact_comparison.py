@@ -5,11 +5,13 @@ The result is `contacts.json`.
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from padforge.common.files import provenance, write_json
+from padforge.common.parallel import one_thread, run_tasks
 from padforge.common.profiling import stage
 from padforge.design.contact_set import judged_contacts
 from padforge.design.morphology import Morphology
@@ -35,10 +37,11 @@ def errors_by_contact(
     pads: Mapping[str, Morphology], contacts: Mapping[str, Contact], size: PadSettings, search: SearchSettings
 ) -> list[ContactErrors]:
     """Compute the expected errors of pads of one layout under every contact, contact by contact, by the same draws."""
-    return [
-        ContactErrors(contact_name, name, tuple(pad.unit_mm * e for e in expected_errors(pad, contact, search, size)))
-        for (contact_name, contact), (name, pad) in product(contacts.items(), pads.items())
-    ]
+    names = list(product(contacts, pads))
+    with one_thread():
+        tasks = (((c, p), partial(expected_errors, pads[p], contacts[c], search, size)) for c, p in names)
+        errors = dict(run_tasks(tasks))
+    return [ContactErrors(c, p, tuple(pads[p].unit_mm * error for error in errors[c, p])) for c, p in names]
 
 
 def beside_straight(pad: Morphology) -> dict[str, Morphology]:

@@ -54,6 +54,10 @@ MIN_SETS = 8
 """Number of such sets for a window even if there are many windows."""
 MIN_NOISE = 5e-3
 """Minimum floor of the scatter, full scales: below, the grid would not resolve the posterior."""
+BLOCK = 128
+"""Readings whose posteriors are computed together, so that these stay in the cache of a core."""
+MIN_EXPONENT = np.float32(-60)
+"""Exponents are clipped to it: smaller ones are negligible, and several times slower to exponentiate."""
 Mask = NDArray[np.bool_]
 
 
@@ -168,12 +172,19 @@ def bayes_positions(readings: Array, positions: Positions, scatter: Scatter, wor
     excess = 1 + (shared**2 * precision).sum(axis=1)
     direction = shared * precision / np.sqrt(excess)[:, None]
     constant = (np.log(precision) - precision * x**2).sum(axis=1) - np.log(excess) + 2 * positions.log_prior
-    # single precision and operations in place are for speed
-    coefficients = np.hstack([-precision, 2 * precision * x])
-    log_posterior = np.float32(np.hstack([z**2, z])) @ np.float32(coefficients.T) + np.float32(constant)
-    gain = np.float32(z) @ np.float32(direction.T) - np.float32((direction * x).sum(axis=1))
-    log_posterior += np.square(gain, out=gain)
-    log_posterior -= log_posterior.max(axis=1, keepdims=True)
-    log_posterior *= np.float32(0.5)
-    posterior = np.exp(log_posterior, out=log_posterior)
-    return posterior @ np.float32(positions.places) / posterior.sum(axis=1)[:, None]
+    # Single precision, operations in place on blocks that fit the cache, and a clipped exponent are for speed.
+    quadratic = np.float32(np.vstack([-precision.T, 2 * precision.T * x.T, constant]) / 2)
+    linear = np.float32(np.vstack([direction.T, -(direction * x).sum(axis=1)]) / math.sqrt(2))
+    places = np.float32(np.column_stack([positions.places, np.ones(len(x))]))
+    estimates = np.empty((len(z), 2))
+    for first in range(0, len(z), BLOCK):
+        rows = slice(first, first + BLOCK)
+        block = np.float32(np.column_stack([z[rows], np.ones(len(z[rows]))]))
+        log_posterior = np.hstack([block[:, :-1] ** 2, block]) @ quadratic
+        gain = block @ linear
+        log_posterior += np.square(gain, out=gain)
+        log_posterior -= log_posterior.max(axis=1, keepdims=True)
+        posterior = np.exp(np.maximum(log_posterior, MIN_EXPONENT, out=log_posterior), out=log_posterior)
+        sums = posterior @ places
+        estimates[rows] = sums[:, :2] / sums[:, 2:]
+    return estimates
