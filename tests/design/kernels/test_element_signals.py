@@ -29,31 +29,20 @@ def contact_of(profile, length: Length = "euclidean"):
     return Contact(sensitivity_profile=tuple((DEFAULT_PITCH_MM * d, w) for d, w in profile), length=length)
 
 
-def pads():
-    yield Morphology.straight(3)
-    for knots, pitch_mm in ((21, 6.0), (5, (30.0, 5.0))):
-        yield Morphology.random(3, knots, knots, pitch_mm)
-
-
-def searched(pad, presses, contact):
-    """(Q, 2M) signals of the kind that a search takes."""
-    travel, cross, ends, _ = fibre_axes(pad)
-    return FibreCurves(travel[0], cross[0], ends, pad.unit_mm).signals(presses, contact)[0].T
-
-
 @pytest.mark.parametrize("length", ["manhattan", "euclidean"])
 @pytest.mark.parametrize("profile", PROFILES.values(), ids=PROFILES)
 def test_profile_signals_are_as_precise_as_asked(profile, length):
-    for knots in (0, 5):
-        rng = np.random.default_rng(knots)
-        pad, contact = Morphology.random(1, knots, rng), contact_of(profile, length)
-        presses = rng.uniform(0, 2, (2, 2))
-        expected = np.array([[dense_oracle(pad, press, contact, fibre) for fibre in range(2)] for press in presses])
-        for precision in (1e-3, 1e-5, 1e-6):
-            found = signals(pad, presses, contact, precision=precision)
-            assert np.abs(found - expected).max() < precision * np.abs(expected).max()
-        sampled = signals_quantized(pad, presses, contact, samples=200_001)
-        np.testing.assert_allclose(sampled, expected, atol=1e-3)
+    rng = np.random.default_rng(5)
+    pad, contact = Morphology.random(1, 5, rng), contact_of(profile, length)
+    presses = rng.uniform(0, 2, (2, 2))
+    expected = np.array([[dense_oracle(pad, press, contact, fibre) for fibre in range(2)] for press in presses])
+    for precision in (1e-3, 1e-5, 1e-6):
+        found = signals(pad, presses, contact, precision=precision)
+        assert np.abs(found - expected).max() < precision * np.abs(expected).max()
+    sampled = signals_quantized(pad, presses, contact, samples=50_001)
+    np.testing.assert_allclose(sampled, expected, atol=1e-3)
+    with pytest.raises(InputError, match="precision is 1e-07, allowed is 1e-06 to 1"):
+        signals(pad, presses, contact, precision=1e-7)
 
 
 @pytest.mark.parametrize("contact", [contact_of(PROFILES["broad"]), Contact()], ids=["profile", "layer"])
@@ -68,11 +57,6 @@ def test_signals_of_elements_agree_in_every_form(contact):
     np.testing.assert_allclose(together, found[0, ::2] + found[0, 1::2], rtol=1e-12, atol=1e-12)
 
 
-def test_precision_is_refused_beyond_its_range():
-    with pytest.raises(InputError, match="precision is 1e-07, allowed is 1e-06 to 1"):
-        signals(Morphology.straight(1), [[1, 1]], Contact(), precision=1e-7)
-
-
 def test_profile_signals_are_0_beyond_its_end():
     contact = contact_of(PROFILES["broad"])
     with profiled() as profile:
@@ -84,7 +68,7 @@ def test_profile_signals_are_0_beyond_its_end():
 
 
 @given(wild_pads((1, 2), (0, 6)), st.sampled_from([1e-2, 1.0, 5.0, 20.0, 200.0]), st.integers(8, 20), SEEDS)
-@settings(max_examples=20)
+@settings(max_examples=8)
 def test_profile_signals_on_wild_pads_are_bounded(pad, end_mm, points, seed):
     rng, distance = np.random.default_rng(seed), np.linspace(0, end_mm, points)
     waves = np.cos(np.pi * rng.uniform(0, 2) * distance / end_mm) * (1 - distance / end_mm) ** 2
@@ -99,8 +83,9 @@ def test_profile_signals_on_wild_pads_are_bounded(pad, end_mm, points, seed):
 
 @pytest.mark.parametrize("profile", PROFILES.values(), ids=PROFILES)
 def test_signals_of_a_search_are_within_precision(profile):
-    contact = contact_of(profile)
-    for pad in pads():
-        presses = np.random.default_rng(0).uniform(0, 4, (60, 2))
+    contact, presses = contact_of(profile), np.random.default_rng(0).uniform(0, 3, (30, 2))
+    for pad in (Morphology.straight(2), Morphology.random(2, 5, 5, (30.0, 5.0))):
+        travel, cross, ends, _ = fibre_axes(pad)
+        found = FibreCurves(travel[0], cross[0], ends, pad.unit_mm).signals(presses, contact)[0]
         fine = signals(pad, presses, contact, precision=1e-6)
-        assert abs(searched(pad, presses, contact) - fine).max() < PROFILE_PRECISION * abs(fine).max()
+        assert abs(found.T - fine).max() < PROFILE_PRECISION * abs(fine).max()

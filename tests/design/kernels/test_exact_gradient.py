@@ -64,24 +64,13 @@ def test_signal_gradient_passes_the_taylor_test(contact):
 
 @pytest.mark.parametrize("contact", [CONTACTS[0], CONTACTS[-1]], ids=["polygon", "profile"])
 @pytest.mark.parametrize("counts", [(2, 3), (0, 2)])
-def test_signals_and_gradients_match_exact_ones_on_rectangles(contact, counts):
+def test_signals_of_a_search_match_exact_ones_on_rectangles(contact, counts):
     pad, rng = Morphology.random(Layout.create(counts, (5.0, 20.0)), 3, seed=1), np.random.default_rng(1)
     presses = rng.uniform(0, pad.layout.extent, (20, 2))
     travel, cross, ends, _ = fibre_axes(pad)
-
-    def moved(across):
-        return FibreCurves(travel[0], across, ends, pad.unit_mm)
-
-    across, exact = cross[0], signals(pad, presses, contact)
-    found = moved(across).signals(presses, contact)[0]
+    exact = signals(pad, presses, contact)
+    found = FibreCurves(travel[0], cross[0], ends, pad.unit_mm).signals(presses, contact)[0]
     np.testing.assert_allclose(found.T, exact, rtol=1e-3, atol=2e-3 * abs(exact).max())
-    upstream, move = rng.normal(size=exact.T.shape), rng.normal(size=across.shape)
-    move[:, [0, -1]] = 0
-    by_across = gradient_of(moved(across), presses, contact, upstream)[1]
-    ahead, behind = (
-        (upstream * moved(across + step * move).signals(presses, contact)[0]).sum() for step in (1e-6, -1e-6)
-    )
-    assert (by_across * move).sum() == pytest.approx((ahead - behind) / 2e-6, rel=2e-3, abs=2e-3)
 
 
 @given(wild_pads((1, 2), (1, 5)), wild_contacts, SEEDS)
@@ -105,7 +94,3 @@ def test_gradient_at_grazing_fibres_is_limited():
     ):
         by_across = gradient_of(straight_curves(2), np.array([[1.5, 1 - height]]), contact, first)[1]
         assert by_across[0].sum() == pytest.approx(expected, rel=1e-4)
-    grazing = np.array([[2.0, 2.0 - 0.6], [2.0, 2.0 - 0.6 + 1e-12]])
-    by_across = gradient_of(straight_curves(3), grazing, Contact(sides=None), np.ones((6, 2)))[1]
-    assert np.isfinite(by_across).all()
-    assert not by_across[[2, 3, 5]].any()

