@@ -55,24 +55,6 @@ def test_vanishing_penalties_imply_kept_rules():
     assert 2 < passed < 14
 
 
-def test_max_crossings_penalty_counts_crossings():
-    """The share by which it is above 9, the fewest that 3 + 3 fibres have."""
-    rules = only(max_crossings=9)
-    for seed in range(2):
-        pad = Morphology.random(3, 3, seed)
-        number = sum((c.first < 3) != (c.second < 3) for c in crossings(pad))
-        assert number > 9
-        assert 9 * (found(pad, rules)["max_crossings"] + 1) == pytest.approx(number, rel=0.25)
-
-
-def test_max_crossings_penalty_never_asks_for_fewer_than_the_families_have():
-    """Else a repair, whose margin grows, bends fibres for what cannot be."""
-    straight, rules = Morphology.straight(2), only(max_crossings=4)
-    pad = Morphology(refine(straight.knots, 6, straight.layout))  # its samples are denser, so the soft number is exact
-    assert found(pad, rules, margin=1.3)["max_crossings"] == pytest.approx(0, abs=0.01)
-    assert found(Morphology.random(2, 5, seed=1), rules, margin=1.3)["max_crossings"] > 0.1
-
-
 @pytest.mark.parametrize(
     ("pad", "rules", "tolerance"),
     [
@@ -167,17 +149,6 @@ def test_gradients_of_turns_and_border_slopes_are_those_of_torch(bent_radius_mm,
     assert along.grad is not None
     assert across.grad is not None
     np.testing.assert_allclose(gradient, torch.stack([along.grad, across.grad]).numpy(), atol=1e-9)
-
-
-@pytest.mark.parametrize("margin", [1.0, 1.25])
-def test_max_length_penalty_is_the_relative_excess(margin):
-    """All fibres of the grid are 56.25 mm long; one alone counts by its share of the pad."""
-    limit = only(max_length_mm=45.0)
-    assert found(Morphology.straight(4), limit, margin)["max_length_mm"] == pytest.approx(1.25 * margin - 1)
-    pad = bent(3.0)
-    over = lengths(pad)[0] * pad.unit_mm / 57.0 - 1
-    limit = only(max_length_mm=57.0)
-    assert found(pad, limit)["max_length_mm"] == pytest.approx(over / 8, rel=0.02)
 
 
 @pytest.mark.parametrize("margin", [1.0, 1.2])
@@ -289,6 +260,28 @@ def test_same_family_crossings_penalty_counts_the_excess():
     assert penalty(6, margin=2.0) == pytest.approx((count - 3) / 3)
 
 
+def test_max_crossings_penalty_counts_those_above_the_fewest_that_families_have():
+    """Else a repair, whose margin grows, bends fibres for what cannot be."""
+    straight, rules = Morphology.straight(2), only(max_crossings=4)
+    pad = Morphology(refine(straight.knots, 6, straight.layout))  # its samples are denser, so the soft number is exact
+    assert found(pad, rules, margin=1.3)["max_crossings"] == pytest.approx(0, abs=0.01)
+    for seed in range(2):
+        pad = Morphology.random(3, 3, seed)
+        number = sum((c.first < 3) != (c.second < 3) for c in crossings(pad))
+        assert number > 9
+        assert 9 * (found(pad, only(max_crossings=9))["max_crossings"] + 1) == pytest.approx(number, rel=0.25)
+
+
+def test_max_length_penalty_is_the_relative_excess():
+    """All fibres of the grid are 56.25 mm long; one alone counts by its share of the pad."""
+    for margin in (1.0, 1.25):
+        penalty = found(Morphology.straight(4), only(max_length_mm=45.0), margin)["max_length_mm"]
+        assert penalty == pytest.approx(1.25 * margin - 1)
+    pad = bent(3.0)
+    over = lengths(pad)[0] * pad.unit_mm / 57.0 - 1
+    assert found(pad, only(max_length_mm=57.0))["max_length_mm"] == pytest.approx(over / 8, rel=0.02)
+
+
 @pytest.mark.parametrize("margin", [1.0, 1.5])
 def test_folds_penalty_matches_dense_distances(margin):
     """Against the nearest of many points of SciPy's curve that lie half a turn of a gap away or more."""
@@ -298,25 +291,22 @@ def test_folds_penalty_matches_dense_distances(margin):
     curve = PchipInterpolator(knots[:, 0], knots[:, 1])
     shares = (1 - np.cos(np.arange(12) * np.pi / 12)) / 2  # samples are denser towards the ends of spans
     samples = np.append(knots[:-1, :1] + np.diff(knots[:, :1], axis=0) * shares, 2.0)
-    place = np.column_stack([samples, curve(samples)])
     at = np.unique(np.concatenate([np.linspace(0, 2, 20_001), samples]))
     line = np.column_stack([at, curve(at)])
     arc = np.append(0, np.linalg.norm(np.diff(line, axis=0), axis=1).cumsum())
     expected = 0.0
-    for point in place:
-        here = arc[np.searchsorted(at, point[0])]
-        far = np.abs(arc - here) >= np.pi / 2 * gap
-        close = max(1 - np.linalg.norm(line[far] - point, axis=1).min() / gap, 0)
-        expected += (close + 10 * close**2) / (2 * len(place))
+    for index in np.searchsorted(at, samples):
+        far = np.abs(arc - arc[index]) >= np.pi / 2 * gap
+        close = max(1 - np.linalg.norm(line[far] - line[index], axis=1).min() / gap, 0)
+        expected += (close + 10 * close**2) / (2 * len(samples))
     rules = only(min_gap_mm=4.0)
     assert found(pad, rules, margin)["folds"] == pytest.approx(expected, rel=0.2)
     assert {v.fibres for v in check_rules(pad, rules)} == {(1,)}
 
 
 def test_folds_penalty_spares_steep_fibres_without_folds():
-    """Whose samples lie further apart than the gap: on a straight flank, parts a gap apart are no fold."""
+    """Whose samples lie further apart than the gap."""
     knots = np.array([[0, 1], [0.5, 1.9], [1.5, 1.9], [2, 1]])
     pad = Morphology(np.stack([knots, np.stack([np.ones(4), np.linspace(0, 2, 4)], axis=-1)]), 11.25)
-    rules = only(min_gap_mm=0.5)
-    assert found(pad, rules)["folds"] == 0
-    assert check_rules(pad, rules) == []
+    assert found(pad, only(min_gap_mm=0.5))["folds"] == 0
+    assert check_rules(pad, only(min_gap_mm=0.5)) == []
