@@ -1,9 +1,7 @@
 """Signals and forces of presses of known depth, against solved contacts and closed forms of the half-space."""
 
 import numpy as np
-import pytest
 
-from padforge import InputError
 from padforge.design import Contact, Morphology, indented_signals, press_forces_n, signals
 from padforge.design.layer import solve_press
 
@@ -43,15 +41,3 @@ def test_press_forces_are_those_of_solved_contacts() -> None:
     ]
     deepest_n = float(press_forces_n(contact.depth_mm, contact))
     np.testing.assert_allclose(press_forces_n(depths_mm, contact).ravel(), solved, rtol=0, atol=5e-4 * deepest_n)
-
-
-def test_indented_signals_refuse_other_contacts_and_depths() -> None:
-    with pytest.raises(InputError, match="contact is a profile, allowed is a layer"):
-        indented_signals(PAD, [[1, 1]], 0.1, Contact(model="profile"))
-    for depths_mm, message in (
-        ([0.1, 5.1], "depths_mm has 5.1, allowed is 0 to 5, the contact's depth"),
-        ([0.1, -0.1], "depths_mm has -0.1, allowed is 0 to 5"),
-        ([0.1], r"depths_mm have shape \(1,\), expected \(2,\)"),
-    ):
-        with pytest.raises(InputError, match=message):
-            indented_signals(PAD, [[1, 1], [2, 2]], depths_mm, Contact())

@@ -154,15 +154,6 @@ def test_contact_model_follows_from_the_stated_keys(stated, model, length):
     assert Spec(written).section(Contact) == contact
 
 
-def test_contact_written_out_accepts_keys_of_its_model_alone():
-    written = tomllib.loads(commented_toml({"contact": Contact}))["contact"]
-    assert Spec({"contact": written | {"depth_mm": 3.0}}).section(Contact) == Contact(depth_mm=3.0)
-    with pytest.raises(InputError, match=r"\[contact\] .*radius is 0.9, which counts where model is shape"):
-        Spec({"contact": written | {"radius": 0.9}}).section(Contact)
-    stated = {"model": "shape", "length": "manhattan", "radius": 0.9}
-    assert Spec({"contact": written | stated}).section(Contact) == Contact(radius=0.9)
-
-
 @pytest.mark.parametrize(
     ("tables", "thickness_mm", "depths_mm"),
     [

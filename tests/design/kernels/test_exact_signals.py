@@ -12,10 +12,7 @@ from scipy.integrate import quad
 from scipy.interpolate import PchipInterpolator
 from scipy.optimize import brentq
 
-from padforge import InputError
 from padforge.design import Contact, Morphology, signals, signals_quantized, signals_sparse
-from padforge.design.kernels.exact_signals import find_one_crossing
-from padforge.design.morphology import assemble_knots
 from padforge.design.settings import PUBLISHED_CONTACT, Layout
 from tests.design import wild_pads as wild
 
@@ -140,67 +137,6 @@ def test_signals_do_not_depend_on_batching_or_sparsity(kind, grid, count, popula
 def test_signals_at_corners_and_along_edges(sides, press, fibre, expected):
     found = signals(Morphology.straight(2), [press], Contact(radius=0.6, sides=sides))[0, fibre]
     assert found == pytest.approx(expected, abs=1e-6)
-
-
-@pytest.mark.parametrize("gap", [1e-12, 1e-6])
-def test_signals_of_nearly_coincident_knots_are_those_of_a_step(gap):
-    """A rise of 1 within `gap`, slope up to 1e12: the Manhattan signal is run plus rise."""
-    inner = np.array([[[1.0, 0.5], [1.0 + gap, 1.5]], [[1.0, 0.5], [1.0, 1.5]]])
-    pad = Morphology(assemble_knots(inner))
-    presses = [[1.0, 1.0], [1.0 + gap, 1.5], [1.0, 0.5]]
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        for length in wild.LENGTHS:
-            found = signals(pad, presses, Contact(radius=5, sides=None, length=length))
-            assert np.isfinite(found).all()
-            if length == "manhattan":
-                assert found[:, 0] == pytest.approx(2 + 0.5 + 1 + 0.5, rel=1e-9)
-
-
-def test_quadrature_ends_where_rounding_dominates():
-    """On a span all but vertical a small press is known to some digits only; halving it would go on for ever."""
-    steep = np.empty((6, 7, 2))
-    steep[:] = Morphology.straight(3).knots[:, :1]
-    for fibre, axis in enumerate((0, 0, 0, 1, 1, 1)):
-        steep[fibre, :, axis] = np.linspace(0, 4, 7)
-    steep[3, 1:6, 1] = 1.0791468550554812 + 1e-9 * np.arange(5)
-    steep[3, 1:6, 0] = 2.75378692228376, 0.5403860200896449, 2.1014172899029036, 1.9433414353271563, 3.7361740638249987
-    press = [3.5059369232428153, 1.0791468560554813]
-    contact = Contact(radius=1e-6, sides=5, weight="inverse", length="euclidean")
-    found = signals(Morphology(steep), [press, [1.801357466597148, 1.0791468580554815]], contact)
-    assert ((found[:, 3] > 1) & (found[:, 3] < 100)).all()
-
-
-def test_signals_refuse_invalid_presses_and_knots():
-    for presses in ([[np.nan, 1]], [[1, 2, 3]]):
-        for function in (signals, signals_quantized, signals_sparse):
-            with pytest.raises(InputError, match="presses"):
-                function(Morphology.straight(2), presses)
-    unsorted = np.array([[[0, 1.0], [1, 0.2], [1 + 2.0**-52, 1.8], [2, 1.0]]] * 2)
-    unsorted[1] = unsorted[1, :, ::-1]
-    for knots in (np.zeros((3, 2, 2)), np.full((4, 2, 2), np.nan), unsorted):
-        with pytest.raises(InputError, match="knots"):
-            signals(knots, [[1, 1]])
-
-
-@given(st.lists(st.floats(-1, 1), min_size=6, max_size=6), st.integers(-12, 0))
-@settings(max_examples=100)
-def test_single_crossings_are_exact_to_rounding(drawn, exponent):
-    """Also of nearly straight curves, on which a step of Newton's method may leave the bracket by rounding."""
-    cubic = np.array([*drawn[:2], *(10.0**exponent * np.array(drawn[2:4]))])  # v = e0 + e1 s + e2 s^2 + e3 s^3
-    span, line = np.array([0.0, 1.0, *cubic]), drawn[4:]
-    above = cubic[0] - line[0], cubic.sum() - line[1]
-    share = find_one_crossing(span, 0.0, 1.0, *above, line[1] - line[0], 1e-15)
-    if math.isnan(share):  # left to a slower way
-        return
-    difference = cubic - [line[0], line[1] - line[0], 0, 0]
-    height = np.polynomial.polynomial.polyval(np.append(np.linspace(0, 1, 101), share), difference)
-    steepest = np.abs(difference[1:]) @ [1, 2, 3]
-    if share == 0:
-        assert (np.sign(height) == np.sign(above[0])).all()
-    else:
-        assert above[0] * above[1] < 0
-        assert abs(height[-1]) <= 1e-15 * (1 + steepest)
 
 
 def test_signals_of_many_presses_are_those_of_each():

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from padforge.design import Contact, Morphology, signals, signals_quantized
-from padforge.design.contact import fibre_axes, half_width_mm
+from padforge.design.contact import fibre_axes
 from padforge.design.kernels.element_signals import LAYER_PRECISION
 from padforge.design.signal_gradients import FibreCurves
 from tests.design.kernels.oracle import dense_oracle
@@ -76,15 +76,3 @@ def test_layer_gradient_equals_differences_of_search_signals(contact):
     fibres = curves(pad)
     expected = (fibres.by_knots(fibres.signals(presses, contact)[1](upstream)) * move).sum()
     assert (value(1e-6) - value(-1e-6)) / 2e-6 == pytest.approx(expected, rel=1e-4, abs=1e-4)
-
-
-@pytest.mark.parametrize("model", ["layer", "profile"])
-def test_a_press_is_as_wide_in_mm_at_every_pitch(model):
-    """By what a straight fibre far from every border signals right below the press and half its width beside it."""
-    contact, found = Contact(model=model), []
-    for pitch_mm in (5.0, 20.0):
-        pad = Morphology.straight((60, 1) if pitch_mm < 10 else (20, 1), pitch_mm)
-        middle = np.array(pad.layout.extent) / 2
-        presses = middle + np.array([0.0, half_width_mm(contact)])[:, None] / pitch_mm * [1, 0]
-        found.append(signals(pad, presses, contact, precision=1e-5)[:, -1] * pitch_mm)
-    assert found[1] == pytest.approx(found[0], rel=1e-3)

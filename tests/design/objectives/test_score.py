@@ -5,7 +5,6 @@ import math
 import numpy as np
 import pytest
 
-from padforge import InputError
 from padforge.design import Contact, Morphology
 from padforge.design.contact import fibre_axes
 from padforge.design.objectives.score import TERMS, score, sharpness
@@ -34,20 +33,6 @@ def test_score_joint_entropy_saturates_before_those_of_families(little_scored):
     assert published_terms(pad)[0].entropy < 9
     one = score(Morphology.straight((1, 0)), max_failures=0)  # one family is all there is
     assert one["published_joint_entropy"] == one["published_entropy"]
-
-
-@pytest.mark.parametrize(
-    ("pad", "asked", "message"),
-    [
-        (Morphology.straight(3), {"size": PadSettings(sensed_mm=(46, 20))}, "the pad itself is 45 mm wide"),
-        (Morphology.random(16, 3000, seed=0), {"max_failures": 0}, "comparisons for so many fibres"),
-        (Morphology.straight(2), {"noise": 0.0}, r"\[search\] noise"),
-    ],
-)
-def test_score_refuses_invalid_arguments_in_one_line(pad, asked, message):
-    with pytest.raises(InputError, match=message) as refused:
-        score(pad, **asked)
-    assert len(str(refused.value).splitlines()) == 1
 
 
 def test_sharpness_has_a_closed_form():

@@ -23,7 +23,6 @@ from padforge.design.optimize.gradient import (
 )
 from padforge.design.optimize.problem import SearchProblem
 from padforge.design.paths.curves import refine
-from padforge.design.paths.keep_outs import straight_paths
 from padforge.design.settings import (
     PUBLISHED_CONTACT,
     PUBLISHED_SEARCH,
@@ -54,16 +53,6 @@ def finished(search, rules, start=0):
     while not run.done:
         run.advance()
     return run.morphology()
-
-
-@settings(max_examples=30)
-@given(st.integers(1, 5), st.integers(1, 9), st.integers(0, 99))
-def test_parametrization_restores_knots(grid, knots, seed):
-    pad = Morphology.random(grid, knots, seed)
-    back = Morphology(Parametrization.from_knots(pad.knots, pad.layout, 1e-3).knots())
-    clear = (pad.knots > 0.006 * (grid + 1)) & (pad.knots < 0.994 * (grid + 1))  # others are moved off the border
-    assert np.abs(back.knots - pad.knots)[clear].max(initial=0) < 1e-9
-    assert np.abs(back.knots - pad.knots).max() < 0.01 * (grid + 1)
 
 
 @settings(max_examples=20)
@@ -116,15 +105,6 @@ def test_every_fourth_start_is_nearly_straight_the_others_zigzags():
     offsets = [np.abs(each[:4, :, 1] - np.arange(1, 5)[:, None]) for each in paths]
     assert [each.max() < 0.5 for each in offsets] == 2 * [False, False, False, True]
     assert all((each[:, 1:-1] > 0).all() for each in offsets if each.max() < 0.5)
-
-
-def test_starts_of_pads_of_one_family_or_two_fibres():
-    for counts in ((0, 3), (3, 0), (1, 1)):
-        size = PadSettings(horizontals=counts[0], verticals=counts[1])
-        for start in (0, 3):
-            paths = initial_paths(size, RulesSettings(), 7, None, start, np.random.default_rng(start))
-            assert paths.shape == (sum(counts), 9, 2)
-            assert not np.array_equal(paths, straight_paths(size, RulesSettings(), 7))
 
 
 def test_gradient_search_for_several_contacts_serves_each():

@@ -6,7 +6,6 @@ from concurrent.futures import Executor, Future
 import numpy as np
 import pytest
 
-from padforge import InputError
 from padforge.benchmarks import search as benchmark
 from padforge.design import Contact, Morphology
 from padforge.design.objectives.expected_error import criterion_errors
@@ -173,21 +172,6 @@ def test_search_reports_rules_that_cannot_hold(monkeypatch):
     assert result.enforced
 
 
-@pytest.mark.parametrize(
-    ("settings", "rules", "pitch_mm"),
-    [
-        ({"knots": 1, "max_failures": 8, "noise": 1e-9, "sharpness": 1e6}, {"min_gap_mm": 1000.0}, 0.1),
-        ({"knots": 64, "max_failures": (1e-300, 1e6), "noise": 10.0}, {"min_mean_bend_radius_mm": 1000.0}, 1000.0),
-    ],
-)
-def test_search_with_extreme_settings_has_finite_terms(settings, rules, pitch_mm, monkeypatch):
-    monkeypatch.setattr(REPAIR, 20)
-    pad = PadSettings(grid=1, pitch_mm=pitch_mm)
-    result = search(pad, None, QUICK.model_copy(update=settings), RulesSettings(**rules))
-    assert result.morphology.pitch_mm == pitch_mm
-    assert np.isfinite([*result.terms.values()]).all()
-
-
 @pytest.mark.parametrize(("method", "counts"), [("descent", (3, 0)), ("genetic", (0, 1))])
 def test_search_of_pads_of_one_family(method, counts, monkeypatch):
     monkeypatch.setattr(REPAIR, 20)
@@ -197,12 +181,3 @@ def test_search_of_pads_of_one_family(method, counts, monkeypatch):
     assert np.isfinite([*found.terms.values()]).all()
     errors = localisation_error(found.morphology, n_failed=(0,), presses=64, test=50, hidden=4, subsets=1)
     assert errors[0].mean > 0
-
-
-def test_search_refuses_contradicting_arguments():
-    with pytest.raises(InputError, match=r"to start from has 3 \+ 3 fibres, .*, allowed is the pad.s, 2 \+ 2 fibres"):
-        search(PAD, settings=SMALL, origin=Morphology.straight(3))
-    with pytest.raises(InputError, match="population is 100000: that takes"):
-        search(PAD, settings=SearchSettings(method="genetic", population=100_000))
-    with pytest.raises(InputError, match="time_budget"):
-        SearchOptions(time_budget=-1)

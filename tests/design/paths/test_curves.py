@@ -96,13 +96,8 @@ def test_crossings_of_the_published_pads(published, name, all_, family):
 
 @given(wild_pads((1, 3), (0, 12)))
 @settings(max_examples=20)
-def test_wild_curves_are_monotone_between_knots_and_families_cross(pad):
+def test_families_of_wild_pads_cross(pad):
     assert np.isfinite(slope_beziers(pad)).all()
-    for fibre, (knots, d) in enumerate(zip(pad.knots, slopes(pad), strict=True)):
-        axis = 0 if fibre < pad.grid else 1
-        rise = np.diff(knots[:, 1 - axis]) / np.diff(knots[:, axis])
-        assert (d[:-1] * rise >= 0).all()
-        assert (np.abs(d[:-1]) <= 3 * np.abs(rise) * (1 + 1e-9) + 1e-300).all()
     assert (lengths(pad) >= (pad.grid + 1) * (1 - 1e-9)).all()
     found = crossings(pad)
     across = [c for c in found if c.first < pad.grid <= c.second]

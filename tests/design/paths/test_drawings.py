@@ -120,16 +120,6 @@ def test_import_refuses_other_drawings_in_one_line(tmp_path: Path, golden: Golde
     golden("design/import_refusals.txt", "\n".join(messages), forget=["(?<=read [(])maximum recursion.*"])
 
 
-def test_import_refuses_other_files_in_one_line(tmp_path: Path) -> None:
-    for name in ("plan.svg", "plan.dxf"):
-        for content in (b"nonsense", b"<html/>", b"  0\nSECTION\n  2\nHEADER\n"):
-            (tmp_path / name).write_bytes(content)
-            with pytest.raises(InputError, match=name):
-                import_plan(tmp_path / name, LAYOUT, 0.05)
-    with pytest.raises(InputError, match=r"allowed are \.svg and \.dxf"):
-        import_plan(tmp_path / "plan.pdf", LAYOUT, 0.05)
-
-
 def test_import_replaces_entities_of_plain_text(tmp_path: Path, plain: Morphology) -> None:
     path = svg(tmp_path, PATHS)
     declared = '<!DOCTYPE svg [<!ENTITY ns "http://www.w3.org/2000/svg">]>'

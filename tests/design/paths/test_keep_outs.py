@@ -5,14 +5,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from padforge import InputError
 from padforge.design import Morphology
 from padforge.design.contact import fibre_axes
-from padforge.design.objectives.ambiguity import free_presses
 from padforge.design.objectives.penalties import penalties
 from padforge.design.objectives.rules import check_rules
 from padforge.design.paths.curves import bend_radius, rolled_turns
-from padforge.design.paths.keep_outs import check_fibre_ends, is_outside, keep_outs, pass_keep_outs, straight_paths
+from padforge.design.paths.keep_outs import is_outside, keep_outs, pass_keep_outs, straight_paths
 from padforge.design.settings import Layout, PadSettings, RulesSettings
 from tests.design.objectives.pads import only
 
@@ -136,19 +134,3 @@ def test_keep_out_distances_and_free_presses_are_exact():
     assert not free[(np.abs(mm) < 8).all(axis=1)].any()
     assert free[(mm[:, 0] > 8.1)].all()
     assert sum(polygon.area for polygon in keep_outs(size)) * size.layout.unit_mm**2 == pytest.approx(16**2 + 50)
-
-
-def test_keep_outs_without_room_are_refused_in_one_line():
-    for polygon, message in (
-        (((0, 0), (4, 4), (4, 0), (0, 4)), "polygon 1 crosses or touches itself or has no area"),
-        (((0, 0), (4, 4)), "polygon 1 has 2 corners, allowed are 3 to 1000"),
-        (square(100, 0, 4), r"polygon 1 lies beside the pad, which is 56 by 60 mm about \(0, 0\)"),
-        ((-25.0, -15.0, 4.0), r"keep-out 1 is 0.998 mm from an end of fibre 1, at \(-28, -15\) mm, allowed is 1.5"),
-        (square(-25.0, -15.0, 4.0), r"is 1 mm from an end of fibre 1, at \(-28, -15\) mm, allowed is 1.5"),
-        (((-28, -30), (28, -30), (28, 30), (-28, 30)), "covers all that is pressed"),
-    ):
-        with pytest.raises(InputError, match=rf"^[^\n]*keep_out_mm:? [^\n]*{message}"):  # noqa: PT012
-            size = kept_off(polygon)
-            free_presses(size)
-            check_fibre_ends(size, RulesSettings())
-    check_fibre_ends(kept_off(square(-24.0, -15.0, 4.0)), RulesSettings())

@@ -5,7 +5,6 @@ import os
 import numpy as np
 import pytest
 
-from padforge.common.validation import InputError
 from padforge.design import Contact, Morphology, signals
 from padforge.design.published.networks import (
     SimulatedPresses,
@@ -62,12 +61,3 @@ def test_fresh_presses_differ_from_training_presses(grid):
         assert presses.min() >= low
         assert high - 0.1 < presses.max() <= high + beyond
         assert np.unique(presses, axis=0).shape == presses.shape
-
-
-def test_localisation_error_refuses_invalid_arguments():
-    for asked, message in (
-        ({"presses": 1000}, "presses is 1000, allowed is a square number"),
-        ({"n_failed": (-1,)}, "n_failed is -1, allowed is"),
-    ):
-        with pytest.raises(InputError, match=message):
-            localisation_error(**{"pad": Morphology.straight(4)} | asked)

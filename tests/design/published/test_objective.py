@@ -7,7 +7,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from padforge import InputError
 from padforge.benchmarks import contact as objective
 from padforge.design import Contact, Morphology, published_objective, signals
 from padforge.design.contact import serpentine_presses
@@ -36,8 +35,6 @@ def test_objective_of_the_joint_entropy_is_formula_5():
     assert published_terms(pad, weights=(2, 1e-6, 1e-5), entropy="joint")[0].objective == pytest.approx(expected)
     [untouched] = published_terms(pad, presses=[[1e3, 1e3]] * 9, entropy="joint")
     assert (untouched.joint_entropy, untouched.objective > 1e8) == (0, True)
-    with pytest.raises(InputError, match="entropy is 'all', allowed are families, joint"):
-        published_terms(pad, entropy="all")  # type: ignore[arg-type]
 
 
 def test_published_terms_add_up_for_each_pad_of_a_population():
