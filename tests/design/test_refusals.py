@@ -10,23 +10,8 @@ from typing import Any
 import numpy as np
 from click.testing import CliRunner
 
-from padforge.design import (
-    Contact,
-    Morphology,
-    PadSettings,
-    RulesSettings,
-    SearchOptions,
-    SearchSettings,
-    Twin,
-    indented_signals,
-    localisation_error,
-    score,
-    search,
-    signals,
-    signals_quantized,
-    signals_sparse,
-)
-from padforge.design.cli import design
+from padforge import design
+from padforge.design import Contact, Morphology, PadSettings, SearchSettings, Twin, cli, signals
 from padforge.design.layer import solve_press
 from padforge.design.objectives.ambiguity import free_presses
 from padforge.design.paths.import_plan import import_plan
@@ -57,7 +42,7 @@ def keep_out(*polygon: Any) -> Callable[[], None]:
     def use() -> None:
         size = PadSettings(keep_out_mm=(polygon,), **Layout.create((3, 6), (8.0, 15.0)).settings)
         free_presses(size)
-        check_fibre_ends(size, RulesSettings())
+        check_fibre_ends(size, design.RulesSettings())
 
     return use
 
@@ -69,7 +54,7 @@ def square(x: float, y: float) -> tuple[tuple[float, float], ...]:
 
 def depths(depths_mm: object) -> Callable[[], object]:
     """Signals of two presses by their depths."""
-    return lambda: indented_signals(PAD, [[1, 1], [2, 2]], depths_mm, Contact())  # pyright: ignore[reportArgumentType]
+    return lambda: design.indented_signals(PAD, [[1, 1], [2, 2]], depths_mm, Contact())  # pyright: ignore[reportArgumentType]
 
 
 VALUES: dict[str, Callable[[], object]] = {
@@ -86,11 +71,11 @@ VALUES: dict[str, Callable[[], object]] = {
     "knots of signals that do not ascend": lambda: signals(UNSORTED, [[1, 1]]),
     "presses that are NaN": lambda: signals(PAD, [[np.nan, 1]]),
     "presses of three numbers": lambda: signals(PAD, [[1, 2, 3]]),
-    "sampled presses that are NaN": lambda: signals_quantized(PAD, [[np.nan, 1]]),
-    "sparse presses that are NaN": lambda: signals_sparse(PAD, [[np.nan, 1]]),
+    "sampled presses that are NaN": lambda: design.signals_quantized(PAD, [[np.nan, 1]]),
+    "sparse presses that are NaN": lambda: design.signals_sparse(PAD, [[np.nan, 1]]),
     "a precision": lambda: signals(PAD, [[1, 1]], Contact(), precision=1e-7),
-    "depths of a profile": lambda: indented_signals(PAD, [[1, 1]], 0.1, Contact(model="profile")),
-    "depths of a shape": lambda: indented_signals(PAD, [[1, 1]], 0.1, Contact(radius=0.6)),
+    "depths of a profile": lambda: design.indented_signals(PAD, [[1, 1]], 0.1, Contact(model="profile")),
+    "depths of a shape": lambda: design.indented_signals(PAD, [[1, 1]], 0.1, Contact(radius=0.6)),
     "a depth beyond the contact's": depths([0.1, 5.1]),
     "a depth below 0": depths([0.1, -0.1]),
     "depths of another number": depths([0.1]),
@@ -101,15 +86,15 @@ VALUES: dict[str, Callable[[], object]] = {
     "a screw by an end": keep_out(-25.0, -15.0, 4.0),
     "a keep-out by an end": keep_out(*square(-25.0, -15.0)),
     "a keep-out of all": keep_out((-28, -30), (28, -30), (28, 30), (-28, 30)),
-    "a sensed area": lambda: score(Morphology.straight(3), size=PadSettings(sensed_mm=(46, 20))),
-    "too many fibres to compare": lambda: score(Morphology.random(16, 3000, seed=0), max_failures=0),
-    "no noise": lambda: score(PAD, noise=0.0),
+    "a sensed area": lambda: design.score(Morphology.straight(3), size=PadSettings(sensed_mm=(46, 20))),
+    "too many fibres to compare": lambda: design.score(Morphology.random(16, 3000, seed=0), max_failures=0),
+    "no noise": lambda: design.score(PAD, noise=0.0),
     "an entropy": lambda: published_terms(PAD, entropy="all"),  # pyright: ignore[reportArgumentType]
-    "training presses": lambda: localisation_error(PAD, presses=1000),
-    "failed fibres": lambda: localisation_error(PAD, n_failed=(-1,)),
-    "an origin of other fibres": lambda: search(PadSettings(grid=2), origin=Morphology.straight(3)),
-    "a population": lambda: search(settings=SearchSettings(method="genetic", population=100_000)),
-    "a time budget": lambda: SearchOptions(time_budget=-1),
+    "training presses": lambda: design.localisation_error(PAD, presses=1000),
+    "failed fibres": lambda: design.localisation_error(PAD, n_failed=(-1,)),
+    "an origin of other fibres": lambda: design.search(PadSettings(grid=2), origin=Morphology.straight(3)),
+    "a population": lambda: design.search(settings=SearchSettings(method="genetic", population=100_000)),
+    "a time budget": lambda: design.SearchOptions(time_budget=-1),
 }
 
 
@@ -201,7 +186,7 @@ def test_commands_refuse_before_they_write(golden: Golden, here: Path, twin: Pat
 
     def run(arguments: list[str], spec: str) -> object:
         Path("pad.toml").write_text(spec)
-        return CliRunner().invoke(design, arguments, catch_exceptions=False)
+        return CliRunner().invoke(cli.design, arguments, catch_exceptions=False)
 
     rows = {f"{' '.join(each[0])} {number}": lambda each=each: run(*each) for number, each in enumerate(COMMANDS)}
     golden("design/refusals_of_commands.txt", refusal_table(rows), forget=[CAUSE])

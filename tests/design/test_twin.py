@@ -1,6 +1,5 @@
 """Twins: what their files keep, what they refuse, and what their fibres answer as laid."""
 
-import json
 from dataclasses import replace
 
 import numpy as np
@@ -48,7 +47,6 @@ def test_twin_file_round_trip(twin, tmp_path):
             assert getattr(back, name) == getattr(each, name)
         assert back.contact() == each.contact()
         assert back.contact().sensitivity_profile == tuple(zip(each.distance_mm, each.weight, strict=True))
-        assert back.contact().length == "euclidean"
         for part in (None, *each.parts):
             expected = each.as_built_stretch(PLACES, part)
             assert back.as_built_stretch(PLACES, part) == pytest.approx(expected, abs=1e-3)
@@ -57,7 +55,6 @@ def test_twin_file_round_trip(twin, tmp_path):
     assert (back.residual.middle_mm, back.residual.half_mm) == ((1.0, -2.0), 11.0)
     assert back.residual.volts == pytest.approx(whole.residual.volts, abs=1e-6)
     assert np.abs(back.as_built_stretch(PLACES, "after")).sum() < np.abs(back.as_built_stretch(PLACES)).sum()
-    assert json.loads((tmp_path / "twin.json").read_text())["format"] == "padforge-twin/1"
 
 
 def test_as_built_stretch_matches_the_contact_model(twin):
@@ -72,10 +69,8 @@ def test_as_built_stretch_matches_the_contact_model(twin):
     over, beside = np.array([[0.0, 0.0], [0.0, 12.0]])
     assert angled.as_built_stretch([over])[0, 0] > plain.as_built_stretch([over])[0, 0]
     assert angled.as_built_stretch([beside])[0, 0] < plain.as_built_stretch([beside])[0, 0]
-
-    assert PlanTransform(True, 90.0, (1.0, 2.0), 2.0).to_plan(np.array([[3.0, 0.5]])) == pytest.approx(
-        np.array([[0.0, -4.0]])
-    )
+    planned = PlanTransform(True, 90.0, (1.0, 2.0), 2.0).to_plan(np.array([[3.0, 0.5]]))
+    assert planned == pytest.approx(np.array([[0.0, -4.0]]))
 
 
 def test_effects_that_another_pad_does_not_have(twin: Twin, golden: Golden) -> None:

@@ -62,8 +62,8 @@ def test_failure_subsets_are_all_or_a_sample():
 @pytest.mark.parametrize(
     ("pad", "contact"),
     [
-        (Morphology.random((2, 3), 3, 2, (8.0, 13.0)), PUBLISHED_CONTACT),
-        (Morphology.random((2, 3), 3, 2, (8.0, 5.0)), Contact()),
+        (Morphology.random((2, 5), 3, 2, (8.0, 13.0)), PUBLISHED_CONTACT),
+        (Morphology.random((2, 5), 3, 2, (8.0, 5.0)), Contact()),
     ],
 )
 def test_ambiguity_map_has_the_ambiguity_as_mean(pad, contact):

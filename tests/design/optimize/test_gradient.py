@@ -87,14 +87,13 @@ def test_steps_of_adam_are_those_of_kingma_and_ba():
 
 
 def test_initial_paths_from_an_origin_are_it_and_near_it():
+    def begin(origin, start):
+        return initial_paths(PadSettings(), RulesSettings(), 5, origin, start, np.random.default_rng(start))
+
     origin = Morphology.random(4, 5, seed=3)
-    courses = [
-        initial_paths(PadSettings(), RulesSettings(), 5, origin, start, np.random.default_rng(start))
-        for start in (0, 1)
-    ]
-    assert np.array_equal(courses[0], origin.knots)
-    assert 0 < np.abs(courses[1] - origin.knots).max() < 1
-    straight = initial_paths(PadSettings(), RulesSettings(), 5, Morphology.straight(4), 0, np.random.default_rng(0))
+    assert np.array_equal(begin(origin, 0), origin.knots)
+    assert 0 < np.abs(begin(origin, 1) - origin.knots).max() < 1
+    straight = begin(Morphology.straight(4), 0)
     assert 0 < np.abs(straight[:4, :, 1] - np.arange(1, 5)[:, None]).max() < 1
 
 

@@ -1,6 +1,7 @@
 """Both searches through their one face: what they find, judge and refuse, and that they depend on the seed alone."""
 
 import pickle
+import re
 from concurrent.futures import Executor, Future
 
 import numpy as np
@@ -8,16 +9,17 @@ import pytest
 
 from padforge.benchmarks import search as benchmark
 from padforge.design import Contact, Morphology
+from padforge.design.contact_comparison import ContactErrors
 from padforge.design.objectives.expected_error import criterion_errors
 from padforge.design.objectives.rules import check_rules
 from padforge.design.objectives.score import describe_terms, score
 from padforge.design.optimize.gradient import GENTLE
-from padforge.design.optimize.search import SearchOptions, better_half, search
+from padforge.design.optimize.search import SearchOptions, better_half, choose, search, search_for_twin
 from padforge.design.paths.curves import refine
 from padforge.design.published.networks import localisation_error
 from padforge.design.settings import PUBLISHED_CONTACT, PadSettings, RulesSettings, SearchSettings
 
-PAD, FREE = PadSettings(grid=2), RulesSettings(enforce=False)
+PAD, FREE, RULES = PadSettings(grid=2), RulesSettings(enforce=False), RulesSettings()
 SMALL = SearchSettings(knots=3, starts=2, steps=10, population=10, generations=3, max_failures=1, contacts="assumed")
 QUICK = SMALL.model_copy(update={"starts": 1, "steps": 1, "generations": 1})
 REPAIR = "padforge.design.optimize.gradient.REPAIR_STEPS"
@@ -110,9 +112,8 @@ HOLE = ((-4.0, 2.0), (4.0, 2.0), (4.0, 10.0), (-4.0, 10.0))
 
 def test_search_around_a_keep_out_obeys_the_rules():
     pad = PadSettings(horizontals=2, verticals=2, pitch_mm=(8.0, 15.0), keep_out_mm=(HOLE,))
-    rules = RulesSettings()
-    result = search(pad, None, QUICK.model_copy(update={"knots": 6}), rules)
-    assert result.violations == check_rules(result.morphology, rules, pad) == []
+    result = search(pad, None, QUICK.model_copy(update={"knots": 6}), RULES)
+    assert result.violations == check_rules(result.morphology, RULES, pad) == []
     assert result.morphology.layout == pad.layout
     assert result.terms["penalty_keep_out_mm"] < 0.01
 
@@ -136,13 +137,10 @@ def test_search_bench_evaluates_what_the_search_finds(monkeypatch):
         monkeypatch.setattr(benchmark, name, value)
     trials = list(benchmark.trials())
     result = trials[1].work()
-    settings = SearchSettings(method="genetic", generations=1, knots=3, seed=1)
-    assert result.morphology == search(PadSettings(grid=1), settings=settings, rules=FREE).morphology
     errors = [level.mean for level in localisation_error(result.morphology, subsets=2)]
     judged = trials[1].evaluate(result)
     assert [judged["failed_0"], judged["failed_1"]] == errors
-    assert judged["error"] == np.mean(errors)
-    assert judged["violations"] == len(check_rules(result.morphology, RulesSettings()))
+    assert (judged["error"], judged["violations"]) == (np.mean(errors), len(check_rules(result.morphology, RULES)))
 
 
 def test_better_half_compares_the_last_objectives_before_a_step():
@@ -151,7 +149,6 @@ def test_better_half_compares_the_last_objectives_before_a_step():
     assert better_half(histories, 30) == [1, 2]
     assert better_half(histories, 20) == [0, 1]
     assert better_half(histories | {3: high * [1.0, 9.0]}, 30) == [1, 3]  # a strict start goes on
-    assert better_half(histories | {3: high / [1.0, 9.0]}, 30) == [1, 3]
     assert better_half(dict.fromkeys(range(8), low), 30) == [0, 1, 2, 3]
 
 
@@ -181,3 +178,53 @@ def test_search_of_pads_of_one_family(method, counts, monkeypatch):
     assert np.isfinite([*found.terms.values()]).all()
     errors = localisation_error(found.morphology, n_failed=(0,), presses=64, test=50, hidden=4, subsets=1)
     assert errors[0].mean > 0
+
+
+PLAIN = {"default": np.array([1.0, 1.0, 1.5, 2.0]), "straight fibres": np.array([0.9, 1.2, 2.0, 3.0])}
+
+
+@pytest.mark.parametrize(
+    ("twin", "expected"),
+    [
+        ([0.9, 0.9, 1.0, 1.5], "twin"),  # better everywhere
+        ([0.92, 1.02, 1.0, 1.0], "twin"),  # within what networks tell
+        ([1.02, 0.5, 0.5, 0.5], "default"),  # far better with fibres failed, but an eighth worse with all alive
+        ([2.0, 2.0, 2.0, 3.5], "default"),
+    ],
+)
+def test_choose_takes_no_pad_that_is_worse_than_plain_ones(twin, expected):
+    assert choose(PLAIN | {"twin": np.array(twin)}) == expected
+
+
+def test_choose_takes_the_least_bad_where_each_is_worse_somewhere():
+    errors = {"default": np.array([2.0, 1.0]), "straight fibres": np.array([1.0, 2.0]), "twin": np.array([1.3, 1.3])}
+    assert choose(errors) == "twin"
+
+
+@pytest.mark.parametrize(
+    ("rules", "expected"), [({"enforce": False}, "straight fibres"), ({"max_length_mm": 20}, "twin")]
+)
+def test_search_for_twin_hands_back_what_locates_best_and_can_be_built_if_any_can(rules, expected, monkeypatch, golden):
+    """What a criterion promises does not count."""
+    monkeypatch.setattr(REPAIR, 20)
+
+    def judged(pads, contacts, size, search):
+        assert set(pads) == ({"default", "straight fibres", "twin", "from default"} if expected != "twin" else {"twin"})
+        for name in pads:
+            errors = (1.0, 1.0) if name == "straight fibres" else (2.0, 2.0)
+            yield ContactErrors("", name, errors)
+
+    monkeypatch.setattr("padforge.design.optimize.search.errors_by_contact", lambda *asked: list(judged(*asked)))
+    quick = SearchSettings(knots=3, starts=1, steps=2, max_failures=1)
+    pad, contact = PadSettings(grid=1), Contact(sensitivity_profile=((0, 1), (5, 0.6), (9, 0.1), (12, 0)))
+    steps = []
+    run = SearchOptions(on_progress=lambda done, total, what: steps.append(what))
+    found = search_for_twin(pad, contact, quick, RulesSettings(**rules), quick, run=run)
+    assert found.candidate == expected
+    assert bool(found.violations) == (expected == "twin")
+    if expected == "straight fibres":
+        assert found.morphology == Morphology.straight(pad.layout)
+        assert found.terms["expected_error_mm_0"] == pytest.approx(found.straight["expected_error_mm_0"], rel=1e-6)
+    words = dict.fromkeys(re.sub(r"\d+\.\d+", "#", what) for what in steps)
+    history = [f"{row['run']}, step {row['step']}" for row in found.history]
+    golden("design/twin_search.txt", "\n".join([*words, *history]))

@@ -8,14 +8,10 @@ from scipy.interpolate import PchipInterpolator
 
 from padforge.design import Morphology, crossings, flatten
 from padforge.design.contact import fibre_axes
+from padforge.design.kernels.pchip import pchip_sample as sample_curve
 from padforge.design.kernels.pchip import (
-    add_samples_gradient,
-    arc_lengths_gradient,
-    fibre_slopes_gradient,
-    population_slopes,
     sample_spans,
 )
-from padforge.design.kernels.pchip import pchip_sample as sample_curve
 from padforge.design.paths.curves import beziers, common_stretches, crossing_angles, lengths, slope_beziers, slopes
 from tests.design.wild_pads import SEEDS, wild_pads
 
@@ -122,29 +118,3 @@ def test_lengths_and_crossings_match_closed_forms():
     found = crossings(pad)
     np.testing.assert_allclose([c.position for c in found], [(0.4, 0.4), (1, 1), (1.6, 1.6)])
     np.testing.assert_allclose(crossing_angles(pad, found), [90, 0, 90])
-
-
-@pytest.mark.parametrize("knots", [0, 5])
-def test_gradients_of_slopes_lengths_and_samples_match_finite_differences(knots):
-    along, across = (axis[0] for axis in fibre_axes(Morphology.random(2, knots, seed=3))[:2])
-    rng, shares = np.random.default_rng(0), np.array([0.0, 0.3, 0.8])
-    samples = 3 * (along.shape[1] - 1) + 1
-    by_slope, by_length = rng.standard_normal(along.shape), rng.standard_normal(len(along))
-    by_points, by_rate = rng.standard_normal((len(along), samples, 2)), rng.standard_normal((len(along), samples))
-
-    def total(along, across):
-        slope = population_slopes(along[None], across[None])[0]
-        points, rate, unused = np.empty_like(by_points), np.empty_like(by_rate), np.empty((3, *along.shape))
-        sample_spans(along, across, slope, shares, points, rate)
-        length = arc_lengths_gradient(along, across, slope, unused)
-        return (by_slope * slope).sum() + by_length @ length + (by_points * points).sum() + (by_rate * rate).sum()
-
-    slope = population_slopes(along[None], across[None])[0]
-    gradient, lengthen = np.zeros((3, *along.shape)), np.empty((3, *along.shape))
-    add_samples_gradient(along, across, slope, shares, by_points, by_rate, *gradient)
-    arc_lengths_gradient(along, across, slope, lengthen)
-    gradient += lengthen * by_length[:, None]
-    gradient[:2] += fibre_slopes_gradient(along, across, slope, gradient[2] + by_slope)
-    step = 1e-6 * rng.standard_normal((2, *along.shape))
-    difference = total(*(np.array([along, across]) + step)) - total(*(np.array([along, across]) - step))
-    assert difference / 2 == pytest.approx((gradient[:2] * step).sum(), rel=1e-5)

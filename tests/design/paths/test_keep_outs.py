@@ -32,9 +32,9 @@ def penalty(pad, size, cross=None, clearance=3.0):
 
 def test_keep_out_penalty_vanishes_with_clearance_and_has_its_gradient():
     size = kept_off(square(2.0, 6.0, 9.0))
-    assert penalty(Morphology.straight(size.layout), size, clearance=1.0).values["keep_out_mm"] > 0
-    free = Morphology.straight(size.layout)
-    assert penalty(free, kept_off(square(0.0, 7.0, 1.8))).values["keep_out_mm"] == 0
+    straight = Morphology.straight(size.layout)
+    assert penalty(straight, size, clearance=1.0).values["keep_out_mm"] > 0
+    assert penalty(straight, kept_off(square(0.0, 7.0, 1.8))).values["keep_out_mm"] == 0
     pad, rng = Morphology.random(size.layout, 4, seed=3), np.random.default_rng(0)
     cross = fibre_axes(pad)[1][0]
     step = 1e-6 * rng.standard_normal(cross.shape)
@@ -51,8 +51,6 @@ def test_straight_paths_pass_keep_outs_within_the_rules():
     assert check_rules(pad, rules, size) == []
     away = np.abs(pad.knots[:3, :, 1] - size.layout.levels[:3, None]).max(axis=1)
     assert (away[1] > 0.3, away[0] == 0) == (True, True)
-    few = Morphology.from_layout(straight_paths(size, rules, 3), size.layout)
-    assert few.knots.shape == (9, 5, 2)
 
 
 @given(st.integers(0, 99), st.floats(-8, 8), st.floats(-8, 8), st.sampled_from([6.0, 25.0]))
