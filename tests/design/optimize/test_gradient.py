@@ -201,15 +201,12 @@ def test_repair_moves_only_fibres_that_break_rules_and_goes_on_from_its_state():
 
 
 def test_what_fine_steps_do_not_repair_firm_ones_do():
-    """Fibres as tangled as after three steps alone; also from a state between the two kinds of steps."""
+    """Fibres as tangled as after three steps alone."""
     run = begun(SearchSettings(knots=9, steps=3, starts=1, seed=3, contacts="assumed"), RulesSettings())
     advance(run, 3 + FINE_STEPS)
     assert check_rules(run.morphology(), RulesSettings()) != []
-    resumed = GradientSearch(run.problem, 0, run.state())
-    for each in (run, resumed):
-        advance(each, REPAIR_STEPS)
+    advance(run, REPAIR_STEPS)
     assert check_rules(run.morphology(), RulesSettings()) == []
-    assert run.morphology() == resumed.morphology()
 
 
 def test_steps_are_by_the_contact_unless_they_are_stated():

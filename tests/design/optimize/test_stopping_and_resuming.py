@@ -125,26 +125,20 @@ def test_executor_that_hangs_is_left_at_the_end_of_the_budget_or_on_a_second_ctr
 def test_search_broken_off_anywhere_resumes_as_if_unbroken(method, tmp_path):
     """The report raises, as a kill would end it, again and again; every attempt goes on from the last state."""
     settings = SMALL.model_copy(update={"method": method, "steps": 10})
-    unbroken, kills = search(PAD, None, settings, FREE), 0
+    unbroken, kills, resumed = search(PAD, None, settings, FREE), 0, None
 
-    def attempt():
+    def report(*progress):
+        reported.append(progress)
+        if len(reported) == 2:
+            raise KilledError
+
+    while resumed is None:
         reported = []
-
-        def report(*progress):
-            reported.append(progress)
-            if len(reported) == 2:
-                raise KilledError
-
-        return search(PAD, None, settings, FREE, run=SearchOptions(report, tmp_path / "search", resume=True))
-
-    while kills < 30:
         try:
-            resumed = attempt()
-            break
+            resumed = search(PAD, None, settings, FREE, run=SearchOptions(report, tmp_path / "search", resume=True))
         except KilledError:
             kills += 1
-    else:
-        pytest.fail("it does not get on")
+            assert kills < 30, "it does not get on"
     assert kills > 0
     assert (resumed.morphology, resumed.history) == (unbroken.morphology, unbroken.history)
 

@@ -21,7 +21,7 @@ def max_misfit(knots, points):
 def test_fit_knots_needs_few_knots():
     points = np.stack([np.linspace(-20, 20, 50), np.full(50, 3.0)], axis=1)
     assert np.array_equal(fit_knots(points, 0.05), points[[0, -1]])
-    x = np.linspace(-6, 3, 300)
+    x = np.linspace(-6, 3, 150)
     points = np.stack([x, 4 * np.sin(x / 3)], axis=1)
     knots = fit_knots(points, 0.05)
     assert max_misfit(knots, points) < 0.06
