@@ -1,4 +1,4 @@
-"""Searches for a twin, and what commands of design refuse before they write; `test_outputs` has what they print."""
+"""Searches for a twin and plans of measured profiles; `test_outputs` has what commands print."""
 
 import json
 from pathlib import Path

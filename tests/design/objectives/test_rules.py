@@ -9,7 +9,7 @@ from padforge.design import Morphology, crossings
 from padforge.design.contact import fibre_axes
 from padforge.design.objectives.penalties import penalties
 from padforge.design.objectives.rules import check_rules
-from padforge.design.paths.curves import common_stretches, flatten, slopes
+from padforge.design.paths.curves import slopes
 from padforge.design.settings import PadSettings, RulesSettings
 from tests.design.objectives.pads import bent, climbing, only, swung
 
@@ -84,21 +84,6 @@ def test_max_common_track_without_a_crossing():
     assert found.measured > 5
     place = np.array(found.place_mm)
     assert min(np.hypot(*(pad.to_mm(c.position) - place)) for c in crossings(pad)) > found.measured / 2
-
-
-def test_max_common_track_names_each_pair_once():
-    pad = Morphology.random(2, 9, seed=6)
-    found = check_rules(pad, only(max_common_track_mm=2.0))
-    lines = [pad.to_mm(line) for line in flatten(pad, 1e-4)]
-    longest = {}
-    for one, other in ((range(2), range(2, 4)), (range(2, 4), range(2))):
-        shared = common_stretches([lines[i] for i in one], [lines[i] for i in other], 0.4)
-        for i, j, length in zip(shared.line, shared.other, shared.length, strict=True):
-            pair = tuple(sorted((one[i] + 1, other[j] + 1)))
-            longest[pair] = max(longest.get(pair, 2.0), length)
-    assert {v.fibres: v.measured for v in found} == pytest.approx(
-        {pair: length for pair, length in sorted(longest.items()) if length > 2.0}, abs=0.01
-    )
 
 
 def test_crossings_are_placed_and_measured():

@@ -1,4 +1,4 @@
-"""Searches that end before they are done, and that go on where they were broken off: here, by process, on a cluster."""
+"""Searches that end before they are done, and that go on where they were broken off, also by process."""
 
 import json
 import math
