@@ -84,9 +84,14 @@ def test_little_of_a_time_budget_is_left_for_repair():
 
 
 class Hung(Executor):
-    """Takes work and never does it."""
+    """Takes work and never does it; Ctrl-C is pressed so many seconds after it has taken the first."""
+
+    def __init__(self, *interrupts_s):
+        self.interrupts_s = list(interrupts_s)
 
     def submit(self, fn, /, *args, **kwargs):
+        while self.interrupts_s:
+            threading.Timer(self.interrupts_s.pop(), os.kill, (os.getpid(), signal.SIGINT)).start()
         future = Future()
         future.set_running_or_notify_cancel()
         return future
@@ -116,9 +121,7 @@ def test_executor_that_hangs_is_left_at_the_end_of_the_budget_or_on_a_second_ctr
     assert result.stopped == "out of time"
     assert len(result.morphology.knots) == 2
     if os.name == "posix":
-        for after in (0.2, 0.4):
-            threading.Timer(after, os.kill, (os.getpid(), signal.SIGINT)).start()
-        assert search(PAD, None, SMALL, run=SearchOptions(executor=Hung())).stopped == "interrupted"
+        assert search(PAD, None, SMALL, run=SearchOptions(executor=Hung(0.2, 0.4))).stopped == "interrupted"
 
 
 @pytest.mark.parametrize("method", ["descent", "genetic"])
