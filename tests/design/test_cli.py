@@ -1,4 +1,4 @@
-"""Searches for a twin, and what commands of design refuse before they write; `test_outputs` has what they print."""
+"""Searches for a twin and plans of measured profiles; `test_outputs` has what commands print."""
 
 import json
 from pathlib import Path
@@ -8,7 +8,7 @@ import pytest
 from click.testing import CliRunner
 from matplotlib.patches import Circle
 
-from padforge import InputError, Spec
+from padforge import Spec
 from padforge.common.files import sha256
 from padforge.common.settings import commented_toml
 from padforge.design import Contact, Morphology, SearchOptions, Twin, draw_plan, score, search
@@ -71,29 +71,6 @@ def test_design_for_twin_uses_its_contact_and_resumes(here, twin, little_scored,
     assert list(states.glob("start_*.npz"))
     assert run("--twin", twin, "--resume", spec=SEARCH)["terms"] == unbroken["terms"]
     assert not list(Path("out/pad").glob("search*"))
-
-
-@pytest.mark.parametrize(
-    ("stated", "message"),
-    [
-        ("[contact]\nradius = 0.9\n", r"pad\.toml: \[contact\] is given beside .*twin\.json.*; leave one out"),
-        ("[pad]\ngrid = 4\n", r"pad\.toml: \[pad\] asks for 4 \+ 4 fibres, .*, but .*twin\.json is of a pad of 2 \+ 2"),
-        ("", "none.json"),
-    ],
-)
-def test_design_for_twin_refuses_contradicting_settings_and_invalid_files(here, twin, stated, message):
-    with pytest.raises(InputError, match=message):
-        run("--twin", twin if stated else message, spec=SEARCH + stated)
-
-
-def test_commands_refuse_before_writing(here):
-    Path("plan.svg").touch()
-    Path("pad.toml").write_text("[rules]\nlost = 1\n")
-    with pytest.raises(InputError, match=r"\[rules\] lost: no such key"):
-        CliRunner().invoke(design, ["import", "plan.svg"], catch_exceptions=False)
-    with pytest.raises(InputError, match=r"--out is a\.pdf, allowed are \.svg and \.png"):
-        CliRunner().invoke(design, ["show", "pad/morphology.json", "--out", "a.pdf"], catch_exceptions=False)
-    assert sorted(path.name for path in here.iterdir()) == ["pad.toml", "plan.svg"]
 
 
 def test_plan_draws_the_half_width_of_a_measured_profile():

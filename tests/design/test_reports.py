@@ -56,9 +56,8 @@ def contacts_document() -> dict[str, Any]:
 
 def test_design_section(golden: Golden, tmp_path: Path) -> None:
     (tmp_path / "design.svg").write_text('<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 1 1"/>')
-    texts = [
-        page_text(page("Pad", "", design_sections(tmp_path, design_document(enforce)))) for enforce in (True, False)
-    ]
+    sections = [design_sections(tmp_path, design_document(enforce)) for enforce in (True, False)]
+    texts = [page_text(page("Pad", "", each)) for each in sections]
     golden("design/report_design.txt", "\n\n".join(texts))
 
 
@@ -87,7 +86,7 @@ def test_contact_section_and_lines(golden: Golden) -> None:
     golden("design/contact_lines.txt", "\n".join(lines))
 
 
-@pytest.mark.parametrize("tool", ["dome", "ball", "flat"])
+@pytest.mark.parametrize("tool", ["dome", "flat"])
 def test_press_is_drawn_to_scale(golden: Golden, tool: str) -> None:
     contact = PRESS.model_copy(update={"tool": tool})
     figure = draw_press(contact, 11.25)

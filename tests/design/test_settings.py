@@ -12,7 +12,6 @@ from padforge.design import Contact, Morphology, PadSettings, RulesSettings, Sea
 from padforge.design.published.objective import information
 from padforge.design.settings import (
     BUILT,
-    BUILT_CONTACT,
     MEASURED_PROFILE,
     PUBLISHED,
     PUBLISHED_CONTACT,
@@ -98,54 +97,14 @@ def test_wrong_override_is_not_blamed_on_the_file():
         spec.section(PadSettings, horizontals=3)
 
 
-def test_published_and_built_contacts_differ_from_the_default_by_this():
-    assert Contact(model="shape") == PUBLISHED_CONTACT
-    assert PUBLISHED_CONTACT.model_dump() == Contact().model_dump() | {"model": "shape", "length": "manhattan"}
-    assert BUILT_CONTACT.model_dump() == Contact().model_dump() | {"fibre_depths_mm": (0.25, 1.05)}
-
-
-@pytest.mark.parametrize(
-    ("model", "key", "kept", "refused"),
-    [
-        (PadSettings, "sensed_mm", ("beyond", "fibres", (56.25, 0.1)), ("all", (0.0, 1.0), (1.0, 56.3), (1.0,), 5.0)),
-        (SearchSettings, "max_failures", (0, (0.0, 1.0)), (-1, (0.0, 0.0), (-1.0, 2.0))),
-        (SearchSettings, "weights", ((1.0, 0.0, 0.0), (0.0, 1e6, 5e-324)), ((0.0, 0.0, 0.0), (-1.0, 1.0, 1.0), (1.0,))),
-        (RulesSettings, "max_crossings", (0, "any"), (-1, "all")),
-    ],
-)
-def test_limits_of_settings(model, key, kept, refused):
-    require_ends(model, key, kept, refused)
-
-
-def test_pad_settings_of_a_rectangle_and_its_sensed_area():
-    pad = {"horizontals": 3, "verticals": 6, "pitch_mm": [8, 15], "bent_radius_mm": 40}
-    hole = {"keep_out_mm": [[[0, 0], [4, 0], [0, 4]]]}
-    stated = Spec({"pad": pad | hole}).section(PadSettings)
-    assert stated.layout == Layout(3, 6, 8.0, 15.0)
-    assert stated.sensed == sensed_rectangle(stated.layout)
-    assert Spec(tomllib.loads(commented_toml({"pad": PadSettings}, {"pad": stated}))).section(PadSettings) == stated
-    assert PadSettings.model_validate_json(stated.model_dump_json()) == stated
-    assert stated.for_layout(Layout.create(4)).layout == Layout.create(4)
-    assert PadSettings(grid=5, verticals=0).layout.counts == (5, 0)
-    assert sensed_rectangle(Layout.create(4)) == PadSettings().sensed == ((0.5, 0.5), (4.5, 4.5))
-    assert sensed_rectangle(Layout.create(4), "fibres") == ((1, 1), (4, 4))
-    assert sensed_rectangle(Layout.create(1), "fibres") == ((0.5, 0.5), (1.5, 1.5))
-    assert PadSettings(grid=3, pitch_mm=2, sensed_mm=(8, 3)).sensed == ((0, 1.25), (4, 2.75))
-    again = PadSettings.model_validate_json(PadSettings(sensed_mm=(40, 20)).model_dump_json())
-    np.testing.assert_allclose(again.sensed, [(2.5 - 16 / 9, 2.5 - 8 / 9), (2.5 + 16 / 9, 2.5 + 8 / 9)])
-
-
-def test_size_of_a_pad_sets_its_pitches():
-    pad = PadSettings(size_mm=(120, 30), horizontals=2, verticals=7)
-    assert pad.layout == Layout(2, 7, 15.0, 10.0)
-    assert pad.layout.size_mm == (120, 30)
-    assert pad == PadSettings(pitch_mm=(15, 10), horizontals=2, verticals=7)
-    assert PadSettings(size_mm=(120, 30), sensed_mm=(119, 29)).layout == Layout(4, 4, 24.0, 6.0)
-    assert pad.for_layout(Layout.create(4)).layout == Layout.create(4)
-    stated = Spec({"pad": {"size_mm": [60, 60], "grid": 5}})
-    assert stated.section(PadSettings).layout == Layout.create(5, 10.0)
-    assert stated.section(PadSettings, grid=2).layout == Layout.create(2, 20.0)
-    assert stated.section(PadSettings, **Layout.create(3, 8.0).settings).layout == Layout.create(3, 8.0)
+def test_limits_of_settings():
+    for model, key, kept, refused in (
+        (PadSettings, "sensed_mm", [(56.25, 0.1)], ["all", (0.0, 1.0), (1.0, 56.3), (1.0,), 5.0]),
+        (SearchSettings, "max_failures", [0, (0.0, 1.0)], [-1, (-1.0, 2.0)]),
+        (SearchSettings, "weights", [(0.0, 1e6, 5e-324)], [(0.0, 0.0, 0.0), (-1.0, 1.0, 1.0), (1.0,)]),
+        (RulesSettings, "max_crossings", [0], [-1]),
+    ):
+        require_ends(model, key, kept, refused)
 
 
 def test_holes_of_a_pad_are_polygons_around_their_screws():
@@ -159,6 +118,7 @@ def test_holes_of_a_pad_are_polygons_around_their_screws():
     np.testing.assert_array_equal(polygon, HOLE)
 
 
+HOLE = [[0, 0], [4, 0], [0, 4]]
 PROFILE = [[0, 1], [0.5, 0.25], [1, 0]]
 SHAPE = {"radius": 0.6, "sides": 30, "weight": "uniform"}
 
@@ -185,66 +145,10 @@ def test_contact_model_follows_from_the_stated_keys(stated, model, length):
     contact = Spec({"contact": stated}).section(Contact)
     assert (contact.model, contact.length) == (model, length)
     assert Contact.model_validate_json(contact.model_dump_json()) == contact
-    assert Contact.model_validate(contact.model_dump()) == contact
     search = SearchSettings(contacts=(contact, Contact(radius=0.9)))
     assert SearchSettings.model_validate_json(search.model_dump_json()) == search
     written = tomllib.loads(commented_toml({"contact": Contact}, {"contact": contact}))
     assert Spec(written).section(Contact) == contact
-
-
-def test_contact_written_out_accepts_keys_of_its_model_alone():
-    written = tomllib.loads(commented_toml({"contact": Contact}))["contact"]
-    assert Spec({"contact": written | {"depth_mm": 3.0}}).section(Contact) == Contact(depth_mm=3.0)
-    with pytest.raises(InputError, match=r"\[contact\] .*radius is 0.9, which counts where model is shape"):
-        Spec({"contact": written | {"radius": 0.9}}).section(Contact)
-    stated = {"model": "shape", "length": "manhattan", "radius": 0.9}
-    assert Spec({"contact": written | stated}).section(Contact) == Contact(radius=0.9)
-
-
-def test_measured_profile_is_a_gaussian_and_negative_skirts_are_valid():
-    for d, weight in MEASURED_PROFILE:
-        assert weight == pytest.approx(np.exp(-(d**2) / (2 * 6.2**2)), abs=0.015)
-    for points in (5, 13, 40):
-        for skirt in (0.0, 0.3):
-            distance = np.linspace(0, 18, points)
-            weight = np.exp(-0.5 * (distance / 5) ** 2) - skirt * np.exp(-0.5 * ((distance - 13) / 2.5) ** 2)
-            profile = np.column_stack([distance, np.append(weight[:-1], 0)])
-            assert len(Contact(sensitivity_profile=profile).sensitivity_profile) == points  # pyright: ignore[reportArgumentType]
-
-
-HOLE = [[0, 0], [4, 0], [0, 4]]
-
-
-@pytest.mark.parametrize(
-    ("model", "arrays", "plain"),
-    [
-        (PadSettings, {"grid": np.int64(3), "pitch_mm": np.array([8, 15.0])}, {"grid": 3, "pitch_mm": (8, 15.0)}),
-        (PadSettings, {"keep_out_mm": [np.array(HOLE)]}, {"keep_out_mm": [HOLE]}),
-        (SearchSettings, {"contacts": ({"radius": np.float32(0.5)},)}, {"contacts": (Contact(radius=0.5),)}),
-        (RulesSettings, {"enforce": np.bool_(False)}, {"enforce": False}),
-    ],
-)
-def test_settings_accept_numpy_numbers(model, arrays, plain):
-    assert model(**arrays) == Spec({}).section(model, **arrays) == model(**plain)
-    assert model(**arrays).model_dump_json() == model(**plain).model_dump_json()
-
-
-def test_default_contact_is_measured_or_published():
-    pad, presses = Morphology.random(1, 3, seed=0), [[1.2, 0.7], [0.5, 0.8]]
-    np.testing.assert_array_equal(signals(pad, presses), signals(pad, presses, Contact()))
-    np.testing.assert_array_equal(design.signals_sparse(pad, presses).toarray(), signals(pad, presses))
-    np.testing.assert_array_equal(
-        design.signals_quantized(pad, presses), design.signals_quantized(pad, presses, PUBLISHED_CONTACT)
-    )
-    assert design.published_objective(pad) == design.published_objective(pad, PUBLISHED_CONTACT)
-    quick = {"n_failed": (1,), "presses": 64, "test": 50, "hidden": 4, "subsets": 1}
-    assert design.localisation_error(pad, **quick) == design.localisation_error(pad, PUBLISHED_CONTACT, **quick)
-    assert SearchSettings().default_contact == Contact()
-    assert SearchSettings(method="genetic").default_contact == PUBLISHED_CONTACT
-    terms, published = design.score(pad, max_failures=0), design.score(pad, PUBLISHED_CONTACT, max_failures=0)
-    assert information(pad) == information(pad, Contact()) == terms["information"]
-    for name in terms:
-        assert (terms[name] == published[name]) == name.startswith(("published", "penalty")), name
 
 
 @pytest.mark.parametrize(
@@ -268,9 +172,6 @@ def test_other_contacts_do_not_depend_on_the_mould():
     tables: list[dict[str, Any]] = [{"radius": 0.5}, {"model": "profile"}, {"sensitivity_profile": []}]
     for stated in tables:
         assert read_contact(Spec({"contact": stated, "mould": {"silicone_mm": 8.0}})) == Contact(**stated)
-
-
-def test_contact_refuses_mould_too_thin_for_press():
     with pytest.raises(InputError, match=r"^pad: \[contact\] .*depth_mm is 5, the pad is 4 mm thick"):
         read_contact(Spec({"mould": {"silicone_mm": 4.0}}, "pad"))
 
@@ -281,3 +182,49 @@ def test_gains_scatter_by_their_share_and_have_the_common_part_of_its_variance()
     assert gains.std(axis=0) == pytest.approx([0.2] * 3, rel=0.02)
     expected = 0.36 + 0.64 * np.eye(3)
     np.testing.assert_allclose(np.corrcoef(gains.T), expected, atol=0.02)
+
+
+def test_measured_profile_is_a_gaussian():
+    for d, weight in MEASURED_PROFILE:
+        assert weight == pytest.approx(np.exp(-(d**2) / (2 * 6.2**2)), abs=0.015)
+
+
+def test_settings_accept_numpy_numbers():
+    for model, arrays, plain in (
+        (PadSettings, {"grid": np.int64(3), "keep_out_mm": [np.array(HOLE)]}, {"grid": 3, "keep_out_mm": [HOLE]}),
+        (SearchSettings, {"contacts": ({"radius": np.float32(0.5)},)}, {"contacts": (Contact(radius=0.5),)}),
+    ):
+        assert model(**arrays) == Spec({}).section(model, **arrays) == model(**plain)
+        assert model(**arrays).model_dump_json() == model(**plain).model_dump_json()
+
+
+def test_default_contact_is_a_layer_or_published():
+    pad, presses = Morphology.random(1, 3, seed=0), [[1.2, 0.7], [0.5, 0.8]]
+    np.testing.assert_array_equal(signals(pad, presses), signals(pad, presses, Contact()))
+    np.testing.assert_array_equal(design.signals_sparse(pad, presses).toarray(), signals(pad, presses))
+    sampled = design.signals_quantized(pad, presses, PUBLISHED_CONTACT)
+    np.testing.assert_array_equal(design.signals_quantized(pad, presses), sampled)
+    assert design.published_objective(pad) == design.published_objective(pad, PUBLISHED_CONTACT)
+    assert information(pad) == information(pad, Contact())
+    assert SearchSettings().default_contact == Contact()
+    assert SearchSettings(method="genetic").default_contact == PUBLISHED_CONTACT
+
+
+def test_pad_settings_of_a_rectangle_and_its_sensed_area():
+    assert PadSettings(horizontals=3, verticals=6, pitch_mm=(8, 15)).layout == Layout(3, 6, 8.0, 15.0)
+    assert PadSettings(grid=5, verticals=0).layout.counts == (5, 0)
+    assert sensed_rectangle(Layout.create(4)) == PadSettings().sensed == ((0.5, 0.5), (4.5, 4.5))
+    assert sensed_rectangle(Layout.create(4), "fibres") == ((1, 1), (4, 4))
+    assert sensed_rectangle(Layout.create(1), "fibres") == ((0.5, 0.5), (1.5, 1.5))
+    assert PadSettings(grid=3, pitch_mm=2, sensed_mm=(8, 3)).sensed == ((0, 1.25), (4, 2.75))
+
+
+def test_size_of_a_pad_sets_its_pitches():
+    pad = PadSettings(size_mm=(120, 30), horizontals=2, verticals=7)
+    assert (pad.layout, pad.layout.size_mm) == (Layout(2, 7, 15.0, 10.0), (120, 30))
+    assert pad == PadSettings(pitch_mm=(15, 10), horizontals=2, verticals=7)
+    assert pad.for_layout(Layout.create(4)).layout == Layout.create(4)
+    stated = Spec({"pad": {"size_mm": [60, 60], "grid": 5}})
+    assert stated.section(PadSettings).layout == Layout.create(5, 10.0)
+    assert stated.section(PadSettings, grid=2).layout == Layout.create(2, 20.0)
+    assert stated.section(PadSettings, **Layout.create(3, 8.0).settings).layout == Layout.create(3, 8.0)

@@ -1,13 +1,10 @@
 """Twins: what their files keep, what they refuse, and what their fibres answer as laid."""
 
-import json
 from dataclasses import replace
-from functools import reduce
 
 import numpy as np
 import pytest
 
-from padforge import InputError
 from padforge.design import Morphology, Twin
 from padforge.design.contact import relative_stretch
 from padforge.design.paths.curves import flatten
@@ -50,7 +47,6 @@ def test_twin_file_round_trip(twin, tmp_path):
             assert getattr(back, name) == getattr(each, name)
         assert back.contact() == each.contact()
         assert back.contact().sensitivity_profile == tuple(zip(each.distance_mm, each.weight, strict=True))
-        assert back.contact().length == "euclidean"
         for part in (None, *each.parts):
             expected = each.as_built_stretch(PLACES, part)
             assert back.as_built_stretch(PLACES, part) == pytest.approx(expected, abs=1e-3)
@@ -59,7 +55,6 @@ def test_twin_file_round_trip(twin, tmp_path):
     assert (back.residual.middle_mm, back.residual.half_mm) == ((1.0, -2.0), 11.0)
     assert back.residual.volts == pytest.approx(whole.residual.volts, abs=1e-6)
     assert np.abs(back.as_built_stretch(PLACES, "after")).sum() < np.abs(back.as_built_stretch(PLACES)).sum()
-    assert json.loads((tmp_path / "twin.json").read_text())["format"] == "padforge-twin/1"
 
 
 def test_as_built_stretch_matches_the_contact_model(twin):
@@ -74,62 +69,8 @@ def test_as_built_stretch_matches_the_contact_model(twin):
     over, beside = np.array([[0.0, 0.0], [0.0, 12.0]])
     assert angled.as_built_stretch([over])[0, 0] > plain.as_built_stretch([over])[0, 0]
     assert angled.as_built_stretch([beside])[0, 0] < plain.as_built_stretch([beside])[0, 0]
-    for none in ([[1.0, 2.0, 3.0]], [[np.nan, 0.0]]):
-        with pytest.raises(InputError, match="positions_mm"):
-            twin.as_built_stretch(none)
-    with pytest.raises(InputError, match="part is 'of', allowed are none, of this twin"):
-        twin.as_built_stretch(PLACES, "of")
-    with pytest.raises(InputError, match="part is"):
-        twin.as_built_stretch(PLACES, np.zeros(2))
-    assert PlanTransform(True, 90.0, (1.0, 2.0), 2.0).to_plan(np.array([[3.0, 0.5]])) == pytest.approx(
-        np.array([[0.0, -4.0]])
-    )
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"channels": (TwinChannel(0, 9, 0.1, 0.0, 0.9),)}, "a channel reads fibre 9"),
-        ({"channels": tuple(TwinChannel(c, 0, 0.1, 0.0, 0.9) for c in (0, 1))}, "two channels read the same fibre"),
-        ({"weight": WEIGHT[:-1]}, "weight of sensitivity_profile"),
-        ({"as_built_mm": (None,)}, "as_built_mm must have"),
-        ({"sensitivity": (None, None, None, None)}, "sensitivity must have"),
-        ({"sensed_mm": (20.0, 0.0)}, "sensed_mm"),
-        (
-            {"parts": {"onset": TwinPart(DISTANCE, WEIGHT, np.zeros(4))}},
-            "parts are onset, expected none or held, onset",
-        ),
-        (
-            {"parts": dict.fromkeys(PARTS, TwinPart(DISTANCE, WEIGHT, np.zeros(3)))},
-            "gains_v of held must be a row of 4",
-        ),
-        ({"residual": TwinResidual((0.0, 0.0), 1.0, np.zeros((4, 4, 2, 2)))}, "residual and parts go together"),
-    ],
-)
-def test_twin_refuses_inconsistent_values(twin, change, message):
-    with pytest.raises(InputError, match=message):
-        replace(twin, **change)
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"format": "padforge-design/1"}, "padforge-twin/1"),
-        ({"channels": [{"gain": 1}]}, "no valid twin"),
-        ({"frame__scale": -1}, "scale"),
-        ({"readings__noise_mv": "much"}, "noise_mv"),
-    ],
-)
-def test_twin_load_refuses_other_files_in_one_line(twin, tmp_path, change, message):
-    path = tmp_path / "twin.json"
-    replace(twin, readings=READINGS).save(path)
-    document = json.loads(path.read_text())
-    for way, value in change.items():
-        *outer, last = way.split("__")
-        reduce(dict.__getitem__, outer, document)[last] = value
-    path.write_text(json.dumps(document))
-    with pytest.raises(InputError, match=rf"^{path}: .*{message}"):
-        Twin.load(path)
+    planned = PlanTransform(True, 90.0, (1.0, 2.0), 2.0).to_plan(np.array([[3.0, 0.5]]))
+    assert planned == pytest.approx(np.array([[0.0, -4.0]]))
 
 
 def test_effects_that_another_pad_does_not_have(twin: Twin, golden: Golden) -> None:

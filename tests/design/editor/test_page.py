@@ -8,7 +8,6 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import chdir
 from http.client import HTTPConnection
 from pathlib import Path
 from typing import Any
@@ -17,7 +16,7 @@ import pytest
 from click.testing import CliRunner
 
 from padforge.design import Morphology
-from padforge.design.cli import design, edit
+from padforge.design.cli import design
 from tests.helpers.chromium import CHROMIUM, Chromium
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="Ctrl-C is a signal here")
@@ -63,7 +62,7 @@ def pad(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def program(tmp_path: Path, pad: Path) -> Iterator[Program]:
-    """The command, which is gone afterwards whatever fails meanwhile."""
+    """The command, which is gone afterwards."""
     program = Program(tmp_path, "pad.json")
     try:
         yield program
@@ -90,16 +89,6 @@ def test_editor_refuses_hostile_requests_and_saves_beside_pad(program: Program, 
     assert sorted(path.name for path in tmp_path.iterdir()) == ["pad-edited.json", "pad.json"]
     assert Morphology.load(tmp_path / "pad-edited.json").knots.shape == (4, 6, 2)
     assert pad.read_bytes() == before
-
-
-def test_editor_refuses_mistakes_before_serving(tmp_path: Path, pad: Path) -> None:
-    for arguments, message in (
-        (["missing.json"], "missing.json"),
-        (["pad.json", "--out", "pad.mat"], r"--out is pad.mat, allowed is a name that ends in \.json"),
-        (["pad.json", "--out", "pad.json/x.json"], r"pad.json: cannot be written"),
-    ):
-        with chdir(tmp_path):
-            assert re.search(message, str(CliRunner().invoke(edit, arguments).exception))
 
 
 CENTRE = "(r => [r.x + r.width / 2, r.y + r.height / 2])(document.querySelectorAll('{}')[{}].getBoundingClientRect())"
@@ -133,55 +122,37 @@ def control_key(browser: Chromium, key: str, modifiers: int = 2) -> None:
 
 
 @pytest.mark.slow
-def test_dragging_updates_page_at_once(program: Program, browser: Chromium, tmp_path: Path) -> None:
-    first = {name: browser.ask(TEXT.format(name)) for name in ("rules", "ambiguity")}
+def test_page_follows_mouse_keys_and_other_pages(program: Program, browser: Chromium, tmp_path: Path) -> None:
     colours = "[...document.querySelectorAll('#map rect')].map(each => each.getAttribute('fill-opacity')).join()"
-    coloured = browser.ask(colours)
-    begin = browser.ask(CENTRE.format(".knot .dot", 0))
+    shown = [TEXT.format("rules"), TEXT.format("ambiguity"), colours]
+    first, begin = [browser.ask(each) for each in shown], browser.ask(CENTRE.format(".knot .dot", 0))
     drag(browser, begin, (20, -60))
     browser.wait_for("document.getElementById('message').textContent.startsWith('not saved yet')")
     browser.wait_for("!busy && !queue.length")
     assert browser.ask(CENTRE.format(".knot .dot", 0)) == pytest.approx([begin[0] + 20, begin[1] - 60], abs=1)
-    for name, before in first.items():
-        assert browser.ask(TEXT.format(name)) != before
-    assert browser.ask(colours) != coloured
+    for each, before in zip(shown, first, strict=True):
+        assert browser.ask(each) != before
     assert browser.ask("document.querySelectorAll('#violations path').length") > 0
     control_key(browser, "z")
     browser.wait_for("document.getElementById('undo').disabled")
     assert browser.ask(CENTRE.format(".knot .dot", 0)) == pytest.approx(begin, abs=0.5)
-    assert browser.ask(TEXT.format("rules")) == first["rules"]
     control_key(browser, "Z", modifiers=10)
     browser.wait_for("document.getElementById('redo').disabled")
     control_key(browser, "s")
     browser.wait_for("document.getElementById('message').textContent == 'saved to pad-edited.json'")
     checked = CliRunner().invoke(design, ["check", str(tmp_path / "pad-edited.json")], catch_exceptions=False)
-    assert checked.output.splitlines() == browser.ask(TEXT.format("rules")).splitlines()
-    assert browser.complaints == []
-    assert {address for address in browser.requests if not address.startswith("data:")} <= {
-        program.url + path for path in ("", "events", "edit", "save")
-    }
+    assert checked.output.splitlines() == browser.ask(shown[0]).splitlines()
 
-
-@pytest.mark.slow
-def test_editor_works_by_keyboard_and_touch_and_pages_reconnect(program: Program, browser: Chromium) -> None:
-    browser.ask("document.getElementById('fibre').focus()")
-    for _ in range(12):  # once round the page, to the first knot
-        browser.call("Input.dispatchKeyEvent", type="rawKeyDown", key="Tab", windowsVirtualKeyCode=9)
-        if browser.ask("document.activeElement.classList.contains('knot')"):
-            break
+    browser.ask("document.querySelector('.knot').focus()")
     label = "document.activeElement.getAttribute('aria-label')"
     assert browser.ask(label).startswith("fibre 1, knot 1 of 3")
     y_mm = "view.fibres[selected.fibre].knots[selected.knot][1]"
     before = browser.ask(y_mm)
     step = 0.5 if before < 14 else -0.5
-    key = "ArrowUp" if step > 0 else "ArrowDown"
-    browser.press(key)
+    browser.press("ArrowUp" if step > 0 else "ArrowDown")
     browser.wait_for(f"Math.abs({y_mm} - {before + step}) < 1e-3")
-    browser.call("Input.dispatchKeyEvent", type="rawKeyDown", key=key, modifiers=8)
-    browser.wait_for(f"Math.abs({y_mm} - {before + 1.1 * step}) < 1e-3")
     browser.press("Insert")
     browser.wait_for("view.fibres[0].knots.length == 6")
-    assert browser.ask(label).startswith("fibre 1, knot")
     browser.press("Delete")
     browser.wait_for("view.fibres[0].knots.length == 5")
     browser.press("PageDown")
@@ -198,16 +169,15 @@ def test_editor_works_by_keyboard_and_touch_and_pages_reconnect(program: Program
     lowered = browser.ask(CENTRE.format(".knot .dot", 5))[1] - y
     assert lowered == pytest.approx(20, abs=6)  # the first bit may count as a tap
 
-    # a second page follows, and one that comes back
     browser.call("Emulation.setTouchEmulationEnabled", enabled=False)
-    moved = program.ask(do="move", fibre=1, knot=1, x_mm=-12.0, y_mm=3.25)
-    shown = "view.fibres[0].knots[1][1]"
-    browser.wait_for(f"{shown} == 3.25")
-    browser.open("about:blank")
-    program.ask(do="move", fibre=1, knot=1, x_mm=-12.0, y_mm=-3.5)
+    program.ask(do="move", fibre=1, knot=1, x_mm=-12.0, y_mm=3.25)
+    browser.wait_for("view.fibres[0].knots[1][1] == 3.25")
     browser.open(program.url, 360, 740)
-    browser.wait_for(f"view && {shown} == -3.5", PATIENCE_S)
+    browser.wait_for("view && view.fibres[0].knots[1][1] == 3.25", PATIENCE_S)
     assert browser.ask("document.scrollingElement.scrollWidth <= innerWidth") is True
-    assert moved["number"] < browser.ask("view.number")
+    assert browser.complaints == []
+    assert {address for address in browser.requests if not address.startswith("data:")} <= {
+        program.url + path for path in ("", "events", "edit", "save")
+    }
     program.end()
     browser.wait_for("document.getElementById('link').textContent == 'ended in the terminal'")

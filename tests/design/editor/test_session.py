@@ -58,52 +58,6 @@ def test_gestures_are_undone_together(tmp_path):
     assert [view["number"] for view in views[1:]] == list(range(1, len(views)))
 
 
-def test_move_clips_knots_to_the_pad_and_between_their_neighbours(tmp_path):
-    """27 mm wide and 24 mm high."""
-    editor, _ = session(tmp_path, Morphology.random((1, 2), 4, 1, (9.0, 12.0)))
-    knots = np.array(move(editor, 1, 3, 900.0, -900.0)["fibres"][0]["knots"])
-    assert knots[4, 0] - 0.1 < knots[3, 0] < knots[4, 0]
-    for y_mm, edge_mm in ((900.0, 12.0), (-900.0, -12.0)):
-        assert move(editor, 1, 2, 0.0, y_mm)["fibres"][0]["knots"][2][1] == pytest.approx(edge_mm)
-    for x_mm, edge_mm in ((900.0, 13.5), (-900.0, -13.5)):
-        assert move(editor, 3, 2, x_mm, 0.0)["fibres"][2]["knots"][2][0] == pytest.approx(edge_mm)
-
-
-def test_add_and_remove_change_one_fibre(tmp_path):
-    editor, views = session(tmp_path, Morphology.random(2, 5, 3))
-    before = views[-1]
-    more = ask(editor, do="add", fibre=2, x_mm=1.0, y_mm=0.0)
-    fibre, knot = more["selected"]
-    assert (fibre, len(more["fibres"][1]["knots"])) == (1, 8)
-    assert more["fibres"][1]["knots"][knot][0] == pytest.approx(1.0)
-    for other in (0, 2, 3):
-        assert more["fibres"][other]["knots"] == before["fibres"][other]["knots"]
-    x = np.array(more["fibres"][1]["knots"])[:, 0]
-    longest = int(np.diff(x).argmax())
-    middle = ask(editor, do="add", fibre=2)
-    assert (len(middle["fibres"][1]["knots"]), middle["selected"]) == (9, (1, longest + 1))
-    assert middle["fibres"][1]["knots"][longest + 1][0] == pytest.approx(x[longest : longest + 2].mean(), abs=1e-3)
-    ask(editor, do="undo")
-    fewer = ask(editor, do="remove", fibre=2, knot=knot)
-    assert fewer["fibres"][1]["knots"] == before["fibres"][1]["knots"]
-
-
-def test_save_writes_view_with_provenance(tmp_path):
-    editor, _ = session(tmp_path, Morphology.random(2, 3, 3))
-    read = sha256(tmp_path / "pad.json")
-    Morphology.straight(2).save(tmp_path / "pad.json")  # what was read counts
-    ask(editor, do="add", fibre=1)
-    move(editor, 1, 1, -10.0, 2.0)
-    saved = editor.save(b"{}")
-    assert (saved["unsaved"], saved["message"]) == (False, f"saved to {tmp_path / 'out.json'}")
-    pad = Morphology.load(tmp_path / "out.json")
-    assert pad.to_mm(pad.knots[0])[1] == pytest.approx(saved["fibres"][0]["knots"][1], abs=1e-4)
-    assert saved["fibres"][0]["knots"][1][1] == 2.0
-    assert pad.provenance["command"] == "padforge design edit"
-    assert pad.provenance["inputs"] == {"pad.json": read}
-    assert (editor.unsaved, ask(editor, do="undo")["unsaved"]) == (False, True)
-
-
 MOVE = b'{"do": "move", "fibre": 1, "knot": 1, "x_mm": %s, "y_mm": 0, "gesture": %s}'
 INVALID = (
     *(b"{}", b'{"do": "shell"}', b'{"do": ["move"]}', b'{"do": "move"}', b'{"do": "remove", "fibre": 1}'),
@@ -111,28 +65,6 @@ INVALID = (
     *(b'{"do": "add", "fibre": %s}' % fibre for fibre in (b"0", b"5", b"1.5")),
     *(MOVE % (x, b'""') for x in (b"NaN", b"1e7", b'"0"')),
 )
-
-
-def test_invalid_edits_are_refused_and_change_nothing(tmp_path):
-    editor, views = session(tmp_path, grid=2)
-    for body in INVALID:
-        with pytest.raises(InputError) as error:
-            editor.edit(body)
-        assert len(str(error.value)) < 300, body
-    assert len(views) == 2
-    assert ask(editor, do="undo")["fibres"] == views[1]["fibres"]
-    for pad, edit, message in (
-        (Morphology.straight(1), {"do": "remove", "fibre": 1, "knot": 1}, "no inner knot"),
-        (Morphology.random(1, 64, 0), {"do": "add", "fibre": 1}, "64 knots"),
-    ):
-        with pytest.raises(InputError, match=message):
-            ask(session(tmp_path, pad)[0], **edit)
-    editor, _ = session(tmp_path, grid=1)
-    move(editor, 1, 1, 0.0, 3.0)
-    (tmp_path / "out.json").mkdir()
-    with pytest.raises(InputError, match=r"out.json: cannot be written"):
-        editor.save(b"{}")
-    assert editor.unsaved
 
 
 def test_save_does_not_replace_file_of_other_session(tmp_path):
@@ -159,3 +91,62 @@ def test_save_does_not_replace_pad_with_mould(tmp_path):
     assert (tmp_path / "out.json").read_bytes() == before
     with pytest.raises(InputError, match=r"out.json: fabrication.json was made from it"):
         session(tmp_path)
+
+
+def test_move_clips_knots_to_the_pad_and_between_their_neighbours(tmp_path):
+    """27 mm wide and 24 mm high."""
+    editor, _ = session(tmp_path, Morphology.random((1, 2), 4, 1, (9.0, 12.0)))
+    knots = np.array(move(editor, 1, 3, 900.0, -900.0)["fibres"][0]["knots"])
+    assert knots[4, 0] - 0.1 < knots[3, 0] < knots[4, 0]
+    assert knots[3, 1] == pytest.approx(-12.0)
+    assert move(editor, 3, 2, 900.0, 0.0)["fibres"][2]["knots"][2][0] == pytest.approx(13.5)
+
+
+def test_add_and_remove_change_one_fibre(tmp_path):
+    editor, views = session(tmp_path, Morphology.random(2, 5, 3))
+    before = views[-1]["fibres"]
+    more = ask(editor, do="add", fibre=2, x_mm=1.0, y_mm=0.0)
+    fibre, knot = more["selected"]
+    assert (fibre, len(more["fibres"][1]["knots"])) == (1, 8)
+    assert more["fibres"][1]["knots"][knot][0] == pytest.approx(1.0)
+    assert [more["fibres"][n]["knots"] for n in (0, 2, 3)] == [before[n]["knots"] for n in (0, 2, 3)]
+    x = np.array(more["fibres"][1]["knots"])[:, 0]
+    longest = int(np.diff(x).argmax())
+    middle = ask(editor, do="add", fibre=2)
+    assert middle["selected"] == (1, longest + 1)
+    assert middle["fibres"][1]["knots"][longest + 1][0] == pytest.approx(x[longest : longest + 2].mean(), abs=1e-3)
+    ask(editor, do="undo")
+    assert ask(editor, do="remove", fibre=2, knot=knot)["fibres"][1]["knots"] == before[1]["knots"]
+
+
+def test_save_writes_view_with_provenance(tmp_path):
+    editor, _ = session(tmp_path, Morphology.random(2, 3, 3))
+    read = sha256(tmp_path / "pad.json")
+    Morphology.straight(2).save(tmp_path / "pad.json")  # what was read counts
+    ask(editor, do="add", fibre=1)
+    move(editor, 1, 1, -10.0, 2.0)
+    saved = editor.save(b"{}")
+    pad = Morphology.load(tmp_path / "out.json")
+    assert pad.to_mm(pad.knots[0])[1] == pytest.approx(saved["fibres"][0]["knots"][1], abs=1e-4)
+    assert pad.provenance["inputs"] == {"pad.json": read}
+    assert (editor.unsaved, ask(editor, do="undo")["unsaved"]) == (False, True)
+
+
+def test_invalid_edits_are_refused_and_change_nothing(tmp_path):
+    editor, views = session(tmp_path, grid=2)
+    for body in INVALID:
+        with pytest.raises(InputError) as error:
+            editor.edit(body)
+        assert len(str(error.value)) < 300, body
+    assert len(views) == 2
+    for pad, edit, message in (
+        (Morphology.straight(1), {"do": "remove", "fibre": 1, "knot": 1}, "no inner knot"),
+        (Morphology.random(1, 64, 0), {"do": "add", "fibre": 1}, "64 knots"),
+    ):
+        with pytest.raises(InputError, match=message):
+            ask(session(tmp_path, pad)[0], **edit)
+    move(editor, 1, 1, 0.0, 3.0)
+    (tmp_path / "out.json").mkdir()
+    with pytest.raises(InputError, match=r"out.json: cannot be written"):
+        editor.save(b"{}")
+    assert editor.unsaved

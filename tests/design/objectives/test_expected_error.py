@@ -14,7 +14,6 @@ from padforge.design.objectives.expected_error import (
     WIDTH,
     averages,
     confusable,
-    criterion_errors,
     evaluation_windows,
     expected_error,
     kernel_weights,
@@ -23,7 +22,7 @@ from padforge.design.objectives.expected_error import (
     straight_full_scale,
     window_presses,
 )
-from padforge.design.settings import Contact, PadSettings, Scatter, SearchSettings
+from padforge.design.settings import Contact, PadSettings, Scatter
 
 SIDE, SIZE = 14, np.array([4.0, 4.0])
 PAD = PadSettings(grid=4, sensed_mm=(45.0, 45.0))
@@ -75,25 +74,6 @@ def test_evaluation_windows_tile_the_pressed_area(size):
     assert area / np.prod(high - low) == pytest.approx(round(area / np.prod(high - low)))
 
 
-def test_window_presses_sample_the_remaining_pad_coarsely():
-    size = PadSettings(grid=9)
-    window = place_window(size.sensed, 0.6)
-    presses = window_presses(size, window, SIDE, np.random.default_rng(2))
-    each = presses.positions.reshape(SIDE, SIDE, 2)
-    assert np.diff(each[..., 0], axis=1) == pytest.approx(presses.step[0])
-    assert np.diff(each[..., 1], axis=0) == pytest.approx(presses.step[1])
-    low, high = np.array(window)
-    assert ((presses.far < low - module.WINDOW_MARGIN) | (presses.far > high + module.WINDOW_MARGIN)).any(axis=1).all()
-    rest = np.prod(np.diff(np.array(size.sensed), axis=0)) - np.prod(high - low)
-    assert 0.5 * rest < len(presses.far) * module.COARSE_STEP**2 < rest
-    assert not len(window_presses(PAD, PAD.sensed, SIDE, np.random.default_rng(2)).far)
-    corner = np.array([(-40.0, -40.0), (-40.0, 0.0), (0.0, 0.0), (0.0, -40.0)])
-    holed = PadSettings(grid=9, keep_out_mm=(tuple(map(tuple, corner.tolist())),))
-    far = window_presses(holed, window, SIDE, np.random.default_rng(2)).far
-    assert 0 < len(far) < len(presses.far)
-    assert not (abs(Morphology.straight(9).to_mm(far) + 20) < 20).all(axis=1).any()
-
-
 def test_expected_error_ignores_presses_in_keep_outs():
     corner = ((-30.0, -30.0), (-30.0, 0.0), (0.0, 0.0), (0.0, -30.0))
     size = PadSettings(grid=4, keep_out_mm=(corner,))
@@ -106,21 +86,6 @@ def test_expected_error_ignores_presses_in_keep_outs():
     rows = np.flatnonzero(presses.free)
     expected = REGRESSION_WEIGHT * leave_one_out_error(answers, rows)
     assert errors(answers, kept, SILENT, presses.free)[0] == pytest.approx(expected, rel=1e-5)
-
-
-def test_expected_error_ignores_failed_fibres():
-    other = random_responses()
-    other[1] = other[1, ::-1]
-    kept, scatter = [[1.0, 0.0, 1.0], [1.0, 1.0, 1.0]], Scatter(0.01, 0.18, 0.36)
-    found, changed = errors(random_responses(), kept, scatter), errors(other, kept, scatter)
-    assert found[0] == pytest.approx(changed[0])
-    assert found[1] != pytest.approx(changed[1])
-    assert found[0] == pytest.approx(error(random_responses()[[0, 2]], scatter))
-
-
-def test_averages_are_means_over_the_sets_of_each_size():
-    kept = np.array([[1.0, 1.0, 1.0], [0.0, 1.0, 1.0], [1.0, 1.0, 0.0]])
-    assert averages(kept, 3) @ [0.1, 0.2, 0.4] == pytest.approx([0.1, 0.3, 0.0])
 
 
 def test_relative_error_is_a_power_mean_of_shares_of_straight_fibres():
@@ -165,16 +130,6 @@ def test_expected_error_gradient_matches_finite_differences(scatter):
     assert slope == pytest.approx(parts.sum(), abs=1e-3 * np.abs(parts).sum())
 
 
-def test_expected_error_counts_distant_presses_with_equal_responses():
-    signals, kept = PLACES.T / 4, np.ones((1, 2))
-    alike, other = signals[:, 90:91], signals[:, 90:91] + 3.0
-    places = np.vstack([PLACES, [[30.0, 30.0]]])
-    given = places, STEPS, FREE, kept, SILENT, np.ones(2)
-    confused, apart = (expected_error(np.hstack([signals, far]), *given)[0][0] for far in (alike, other))
-    assert apart == pytest.approx(error(signals), rel=0.2)
-    assert confused > 5 * apart
-
-
 def test_confusable_matches_all_differences():
     """An oracle that forms every difference, of fibres that no press of the window touches too."""
     rng = np.random.default_rng(3)
@@ -191,27 +146,6 @@ def test_confusable_matches_all_differences():
     assert 0 < len(found) <= module.MAX_PARTNERS
 
 
-def test_evaluation_of_a_huge_pad_samples_windows_and_presses():
-    size = PadSettings(grid=96)
-    windows = evaluation_windows(size.sensed)
-    assert len(windows) == len(set(windows)) == module.MAX_WINDOWS
-    presses = window_presses(size, windows[0], SIDE, np.random.default_rng(0))
-    assert 0.9 * module.MAX_FAR < len(presses.far) <= module.MAX_FAR
-    assert np.ptp(presses.far, axis=0).min() > 90
-    # a straight fibre's largest response does not depend on how many others there are, but for its length
-    for contact, grid in ((Contact(model="profile"), 4), (Contact(), 16)):  # the border cuts strains below 0 off
-        small, large = (straight_full_scale(PadSettings(grid=n).layout, contact, "beyond") for n in (grid, 96))
-        assert large * 97 == pytest.approx(small * (grid + 1), rel=0.02)
-
-
-def test_expected_errors_grow_with_failures_and_scatter():
-    size = PadSettings(horizontals=2, verticals=5, pitch_mm=6.0)
-    pad = Morphology.straight(size.layout)
-    quiet, loud = (criterion_errors(pad, Contact(), SearchSettings(scatter=share), size) for share in (0.18, 0.4))
-    assert quiet == sorted(quiet)
-    assert np.all(np.array(loud) > quiet)
-
-
 def test_kernel_weights_scale_fibres_of_a_strip():
     """Those along a strip show a third of those across it; a localizer scales its inputs, and is no worse for it."""
     size, profile = PadSettings(horizontals=3, verticals=12), Contact(model="profile")
@@ -226,3 +160,59 @@ def test_bound_in_single_precision_does_not_overflow_under_faint_noise():
     responses = np.repeat(2 * (PLACES @ [[1.0, 1.0], [1.0, 0.5]]).T, 8, axis=0).astype(np.float32)
     expected = REGRESSION_WEIGHT * leave_one_out_error(responses.astype(float))
     assert error(responses, Scatter(1e-9)) == pytest.approx(expected, rel=1e-4)
+
+
+def test_window_presses_sample_the_remaining_pad_coarsely():
+    """Without the presses in a keep-out."""
+    size = PadSettings(grid=9)
+    window = place_window(size.sensed, 0.6)
+    presses = window_presses(size, window, SIDE, np.random.default_rng(2))
+    each = presses.positions.reshape(SIDE, SIDE, 2)
+    assert np.diff(each[..., 0], axis=1) == pytest.approx(presses.step[0])
+    assert np.diff(each[..., 1], axis=0) == pytest.approx(presses.step[1])
+    low, high = np.array(window)
+    assert ((presses.far < low - module.WINDOW_MARGIN) | (presses.far > high + module.WINDOW_MARGIN)).any(axis=1).all()
+    rest = np.prod(np.diff(np.array(size.sensed), axis=0)) - np.prod(high - low)
+    assert 0.5 * rest < len(presses.far) * module.COARSE_STEP**2 < rest
+    corner = ((-40.0, -40.0), (-40.0, 0.0), (0.0, 0.0), (0.0, -40.0))
+    far = window_presses(PadSettings(grid=9, keep_out_mm=(corner,)), window, SIDE, np.random.default_rng(2)).far
+    assert 0 < len(far) < len(presses.far)
+    assert not (abs(Morphology.straight(9).to_mm(far) + 20) < 20).all(axis=1).any()
+
+
+def test_evaluation_of_a_huge_pad_samples_windows_and_presses():
+    size = PadSettings(grid=96)
+    windows = evaluation_windows(size.sensed)
+    assert len(windows) == len(set(windows)) == module.MAX_WINDOWS
+    presses = window_presses(size, windows[0], SIDE, np.random.default_rng(0))
+    assert 0.9 * module.MAX_FAR < len(presses.far) <= module.MAX_FAR
+    assert np.ptp(presses.far, axis=0).min() > 90
+
+
+def test_full_scale_of_straight_fibres_is_by_their_length_alone():
+    profile = Contact(model="profile")
+    small, large = (straight_full_scale(PadSettings(grid=n).layout, profile, "beyond") for n in (4, 96))
+    assert large * 97 == pytest.approx(small * 5, rel=0.02)
+
+
+def test_expected_error_ignores_failed_fibres():
+    other = random_responses()
+    other[1] = other[1, ::-1]
+    kept, scatter = [[1.0, 0.0, 1.0], [1.0, 1.0, 1.0]], Scatter(0.01, 0.18, 0.36)
+    found, changed = errors(random_responses(), kept, scatter), errors(other, kept, scatter)
+    assert [changed[0], error(random_responses()[[0, 2]], scatter)] == pytest.approx([found[0]] * 2)
+    assert found[1] != pytest.approx(changed[1])
+
+
+def test_expected_error_counts_distant_presses_with_equal_responses():
+    signals, kept = PLACES.T / 4, np.ones((1, 2))
+    alike, other = signals[:, 90:91], signals[:, 90:91] + 3.0
+    given = np.vstack([PLACES, [[30.0, 30.0]]]), STEPS, FREE, kept, SILENT, np.ones(2)
+    confused, apart = (expected_error(np.hstack([signals, far]), *given)[0][0] for far in (alike, other))
+    assert apart == pytest.approx(error(signals), rel=0.2)
+    assert confused > 5 * apart
+
+
+def test_averages_are_means_over_the_sets_of_each_size():
+    kept = np.array([[1.0, 1.0, 1.0], [0.0, 1.0, 1.0], [1.0, 1.0, 0.0]])
+    assert averages(kept, 3) @ [0.1, 0.2, 0.4] == pytest.approx([0.1, 0.3, 0.0])

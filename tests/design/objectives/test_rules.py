@@ -3,14 +3,13 @@
 import numpy as np
 import pytest
 from scipy.interpolate import PchipInterpolator
-from scipy.spatial import KDTree
 
 from padforge import Spec
 from padforge.design import Morphology, crossings
 from padforge.design.contact import fibre_axes
 from padforge.design.objectives.penalties import penalties
 from padforge.design.objectives.rules import check_rules
-from padforge.design.paths.curves import common_stretches, flatten, slopes
+from padforge.design.paths.curves import slopes
 from padforge.design.settings import PadSettings, RulesSettings
 from tests.design.objectives.pads import bent, climbing, only, swung
 
@@ -29,35 +28,10 @@ def test_check_rules_of_the_straight_grid_at_its_limits():
         assert len(check_rules(grid, only(**broken))) == count
 
 
-@pytest.mark.parametrize("key", ["max_crossings", "max_common_track_mm"])
-def test_rules_settings_write_no_limit_as_any(key):
-    assert getattr(Spec({"rules": {key: "any"}}).section(RulesSettings), key) is None
-    assert RulesSettings.model_validate({key: None}).model_dump()[key] == "any"
-
-
-def test_min_crossing_angle_is_measured_exactly():
-    found = check_rules(swung(), only(min_crossing_angle_deg=40))
-    assert [(v.rule, v.fibres) for v in found] == [("min_crossing_angle_deg", (1, 2))]
-    assert found[0].measured == pytest.approx(np.degrees(np.arctan(1 / 1.5)), abs=1e-6)
-    assert found[0].place_mm == pytest.approx((0, 0), abs=1e-3)
-    assert check_rules(swung(), only(min_crossing_angle_deg=33)) == []
-    assert check_rules(Morphology.straight(4), only(min_crossing_angle_deg=90)) == []
-
-
-def test_same_family_crossings_are_placed():
-    found = check_rules(bent(2.5), only(same_family_crossings=0))
-    assert len(found) == 2
-    assert {v.fibres for v in found} == {(1, 2)}
-    assert check_rules(bent(2.5), only(same_family_crossings=2)) == []
-
-
-def test_min_mean_bend_radius_is_placed():
-    at = np.array([0, 0.1, 0.6, 0.9, 1.0, 1.1, 1.4, 1.9, 2])  # level at both ends, where it meets its leads
-    knots = np.column_stack([at, [1, 1, 1.2, 1.8, 1.9, 1.8, 1.2, 1, 1]])
-    pad = Morphology(np.stack([knots, np.column_stack([np.ones(9), at])]), pitch_mm=2.0)
-    found = check_rules(pad, only(min_mean_bend_radius_mm=2.0))
-    assert [v.fibres for v in found] == [(1,)]
-    assert found[0].place_mm == pytest.approx((0, 0.9 * 2), abs=0.01)
+def test_rules_settings_write_no_limit_as_any():
+    for key in ("max_crossings", "max_common_track_mm"):
+        assert getattr(Spec({"rules": {key: "any"}}).section(RulesSettings), key) is None
+        assert RulesSettings.model_validate({key: None}).model_dump()[key] == "any"
 
 
 @pytest.mark.parametrize(("rise", "breaks"), [(0.145, False), (0.155, True)])
@@ -66,38 +40,11 @@ def test_min_mean_bend_radius_passes_kinks_up_to_half_a_radian(rise, breaks):
     at = np.array([0, 0.5, 1 - 1e-7, 1, 1 + 1e-7, 1.5, 2])
     roof = np.column_stack([at, 1 + rise * (1 - np.abs(at - 1))])
     turn = 2 * (2 * np.arctan(4 / 3 * rise) - np.arctan(rise))
-    found = check_rules(
-        Morphology(np.stack([roof, np.column_stack([np.ones(7), at])])), only(min_mean_bend_radius_mm=3.0)
-    )
+    pad = Morphology(np.stack([roof, np.column_stack([np.ones(7), at])]))
+    found = check_rules(pad, only(min_mean_bend_radius_mm=3.0))
     assert (turn > 0.5) == breaks
     assert [v.measured for v in found] == ([pytest.approx(1.5 / turn, rel=1e-3)] if breaks else [])
-
-
-@pytest.mark.parametrize(("fibre", "fibres"), [(0, (1, 2)), (2, (3, 4)), (4, (5, 6)), (6, (7, 8))])
-def test_min_gap_numbers_fibres_of_both_families(fibre, fibres):
-    pad = bent(fibre % 4 + 1.95, fibre=fibre)
-    (found,) = check_rules(pad, only(min_gap_mm=0.8))
-    assert (found.rule, found.fibres) == ("min_gap_mm", fibres)
-    assert found.measured == pytest.approx(0.05 * 11.25, abs=1e-3)
-    between = ((0, (fibre % 4 + 1.975 - 2.5) * 11.25), ((fibre % 4 + 1.975 - 2.5) * 11.25, 0))[fibre // 4]
-    assert found.place_mm == pytest.approx(between, abs=0.3)
-
-
-@pytest.mark.parametrize(("fibre", "cross"), [(0, 0.1), (3, 4.9), (4, 0.1), (7, 4.9)])
-def test_border_of_every_side(fibre, cross):
-    (found,) = check_rules(bent(cross, fibre=fibre), only(border_mm=2.0))
-    assert found.fibres == (fibre + 1,)
-    assert found.measured == pytest.approx(0.1 * 11.25, abs=1e-3)
-    at = ((0, (cross - 2.5) * 11.25), ((cross - 2.5) * 11.25, 0))[fibre // 4]
-    assert found.place_mm == pytest.approx(at, abs=0.05)
-
-
-def test_border_of_a_rectangle_is_beside_the_fibre():
-    pad = Morphology.straight((2, 5), (8.0, 13.0))
-    (width, height), levels = pad.layout.size_mm, [pad.to_mm(knots).round(6) for knots in pad.knots]
-    distances = [height / 2 - abs(line[0, 1]) for line in levels[:2]] + [width / 2 - abs(x[0, 0]) for x in levels[2:]]
-    found = check_rules(pad, only(border_mm=1000.0))
-    assert [v.measured for v in found] == pytest.approx(distances)
+    assert all(v.place_mm == pytest.approx((0, rise * 11.25), abs=1.6) for v in found)
 
 
 def test_max_length_matches_scipy_curve():
@@ -108,18 +55,6 @@ def test_max_length_matches_scipy_curve():
     assert (found.rule, found.fibres, found.place_mm) == ("max_length_mm", (6,), None)
     assert found.measured == pytest.approx(11.25 * np.hypot(np.diff(at), np.diff(curve)).sum(), rel=1e-5)
     assert found.limit == 5 * 11.25 + 0.1
-
-
-def test_min_gap_of_bent_fibres_matches_scipy_curves():
-    """Against SciPy's curves, sampled every micrometre or so."""
-    knots = np.repeat(Morphology.straight(2).knots[:, :1], 4, axis=1)
-    knots[:2, :, 0] = knots[2:, :, 1] = [0, 0.9, 2.1, 3]
-    knots[0, 1:3, 1], knots[1, 1:3, 1] = (1.75, 0.6), (2.3, 0.9)
-    at = np.linspace(0, 3, 6001)
-    first, second = (np.column_stack([at, PchipInterpolator(*knots[f].T)(at)]) * 11.25 for f in (0, 1))
-    least = KDTree(second).query(first)[0].min()
-    (found,) = check_rules(Morphology(knots), only(min_gap_mm=6.0))
-    assert found.measured == pytest.approx(least, abs=3e-3)
 
 
 def slanting(rise=0.12):
@@ -151,34 +86,46 @@ def test_max_common_track_without_a_crossing():
     assert min(np.hypot(*(pad.to_mm(c.position) - place)) for c in crossings(pad)) > found.measured / 2
 
 
-def test_max_common_track_names_each_pair_once():
-    pad = Morphology.random(2, 9, seed=6)
-    found = check_rules(pad, only(max_common_track_mm=2.0))
-    lines = [pad.to_mm(line) for line in flatten(pad, 1e-4)]
-    longest = {}
-    for one, other in ((range(2), range(2, 4)), (range(2, 4), range(2))):
-        shared = common_stretches([lines[i] for i in one], [lines[i] for i in other], 0.4)
-        for i, j, length in zip(shared.line, shared.other, shared.length, strict=True):
-            pair = tuple(sorted((one[i] + 1, other[j] + 1)))
-            longest[pair] = max(longest.get(pair, 2.0), length)
-    assert {v.fibres: v.measured for v in found} == pytest.approx(
-        {pair: length for pair, length in sorted(longest.items()) if length > 2.0}, abs=0.01
-    )
+def test_crossings_are_placed_and_measured():
+    found = check_rules(bent(2.5), only(same_family_crossings=0))
+    assert [v.fibres for v in found] == [(1, 2)] * 2
+    assert check_rules(bent(2.5), only(same_family_crossings=2)) == []
+    (found,) = check_rules(swung(), only(min_crossing_angle_deg=40))
+    assert (found.rule, found.fibres) == ("min_crossing_angle_deg", (1, 2))
+    assert found.measured == pytest.approx(np.degrees(np.arctan(1 / 1.5)), abs=1e-6)
+    assert found.place_mm == pytest.approx((0, 0), abs=1e-3)
+    assert check_rules(swung(), only(min_crossing_angle_deg=33)) == []
+
+
+@pytest.mark.parametrize("fibre", [0, 6])
+def test_min_gap_numbers_and_places_fibres_of_both_families(fibre):
+    level = fibre % 4 + 1
+    (found,) = check_rules(bent(level + 0.95, fibre=fibre), only(min_gap_mm=0.8))
+    assert (found.rule, found.fibres) == ("min_gap_mm", (fibre + 1, fibre + 2))
+    assert found.measured == pytest.approx(0.05 * 11.25, abs=1e-3)
+    across_mm = (level + 0.975 - 2.5) * 11.25
+    assert found.place_mm == pytest.approx((0, across_mm) if fibre < 4 else (across_mm, 0), abs=0.3)
+
+
+@pytest.mark.parametrize(("fibre", "cross"), [(0, 0.1), (3, 4.9), (4, 0.1), (7, 4.9)])
+def test_border_of_every_side(fibre, cross):
+    (found,) = check_rules(bent(cross, fibre=fibre), only(border_mm=2.0))
+    assert (found.fibres, found.measured) == ((fibre + 1,), pytest.approx(0.1 * 11.25, abs=1e-3))
+    across_mm = (cross - 2.5) * 11.25
+    assert found.place_mm == pytest.approx((0, across_mm) if fibre < 4 else (across_mm, 0), abs=0.05)
 
 
 @pytest.mark.parametrize(("rise", "breaks"), [(0.5, False), (0.6, True)])
-@pytest.mark.parametrize("family", [0, 1])
-@pytest.mark.parametrize("end", [0, -1])
+@pytest.mark.parametrize(("family", "end"), [(0, 0), (1, -1)])
 def test_min_mean_bend_radius_passes_lead_kinks_up_to_half_a_radian(rise, breaks, family, end):
     """Of the check and of the penalty; leads go straight on along the fibre's axis."""
     pad, rules = climbing(rise, family, end), only(min_mean_bend_radius_mm=1.0)
     angle = np.arctan(slopes(pad)[family, end])
-    found = check_rules(pad, rules)
     assert (abs(angle) > 0.5) == breaks
     along, across = (axis[0] for axis in fibre_axes(pad)[:2])
     assert (penalties(along, across, PadSettings(grid=1), rules).values["min_mean_bend_radius_mm"] > 0) == breaks
+    found = check_rules(pad, rules)
     assert [v.fibres for v in found] == ([(family + 1,)] if breaks else [])
     if breaks:
         assert found[0].measured == pytest.approx(0.5 / abs(angle), rel=0.02)
-        assert found[0].place_mm is not None
-        assert np.abs(found[0].place_mm).max() == pytest.approx(11.25, abs=0.3)
+        assert np.abs(found[0].place_mm or 0).max() == pytest.approx(11.25, abs=0.3)

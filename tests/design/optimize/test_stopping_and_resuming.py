@@ -1,4 +1,4 @@
-"""Searches that end before they are done, and that go on where they were broken off: here, by process, on a cluster."""
+"""Searches that end before they are done, and that go on where they were broken off, also by process."""
 
 import json
 import math
@@ -9,7 +9,7 @@ import sys
 import threading
 import time
 from concurrent.futures import Executor, Future
-from typing import cast
+from dataclasses import replace
 
 import click
 import numpy as np
@@ -20,7 +20,7 @@ from padforge.cli import cli
 from padforge.common import parallel as computing
 from padforge.common.command_line import run_to_end
 from padforge.common.parallel import Checkpoints
-from padforge.design import PadSettings, RulesSettings, SearchOptions, SearchSettings, search
+from padforge.design import PadSettings, RulesSettings, SearchOptions, SearchSettings, design_run, search
 from padforge.design.optimize import search as stopping
 
 PAD = PadSettings(grid=1)
@@ -33,34 +33,6 @@ class KilledError(Exception):
     """Stands for a kill in mid-search."""
 
 
-@pytest.mark.parametrize("method", ["descent", "genetic"])
-def test_search_broken_off_anywhere_resumes_as_if_unbroken(method, tmp_path):
-    """The report raises, as a kill would end it, again and again; every attempt goes on from the last state."""
-    settings = SMALL.model_copy(update={"method": method, "starts": 4})
-    unbroken, kills = search(PAD, None, settings, FREE), 0
-
-    def attempt():
-        reported = []
-
-        def report(*progress):
-            reported.append(progress)
-            if len(reported) == 2:
-                raise KilledError
-
-        return search(PAD, None, settings, FREE, run=SearchOptions(report, tmp_path / "search", resume=True))
-
-    while kills < 30:
-        try:
-            resumed = attempt()
-            break
-        except KilledError:
-            kills += 1
-    else:
-        pytest.fail("it does not get on")
-    assert kills > 0
-    assert (resumed.morphology, resumed.history) == (unbroken.morphology, unbroken.history)
-
-
 def test_checkpoints_of_other_searches_are_refused_and_stay_until_cleared(tmp_path):
     folder, quick = tmp_path / "search", SMALL.model_copy(update={"starts": 1, "steps": 2})
     run = SearchOptions(keep_in=folder, resume=True)
@@ -70,20 +42,6 @@ def test_checkpoints_of_other_searches_are_refused_and_stay_until_cleared(tmp_pa
         search(PAD, None, quick.model_copy(update={"seed": 5}), FREE, run=run)
     Checkpoints(folder, {}).clear()
     assert not list(tmp_path.iterdir())
-
-
-def test_checkpoints_remove_no_files_of_others(tmp_path):
-    about = '{"format": "somebody/1"}'
-    names = ["search.json", "start_0.npz", "start_0000.npz", "start_0_notes.npz", "other"]
-    for name in names:
-        (tmp_path / name).write_text(about)
-    with pytest.raises(InputError, match=r"search\.json: "):
-        Checkpoints(tmp_path, {}).begin(resume=False)
-    assert sorted(path.name for path in tmp_path.iterdir()) == sorted(names)
-    Checkpoints(tmp_path / "own", {}).save(0, {"done": np.array(True)})
-    (tmp_path / "own" / "start_0_notes.npz").write_text("notes")
-    Checkpoints(tmp_path / "own", {}).begin(resume=False)
-    assert [path.name for path in (tmp_path / "own").iterdir()] == ["start_0_notes.npz"]
 
 
 @pytest.mark.parametrize("method", ["descent", "genetic"])
@@ -105,13 +63,6 @@ def test_search_within_a_time_budget_returns_the_best_so_far(time_budget):
     assert result.seconds < 30
 
 
-def test_little_of_a_time_budget_is_left_for_repair():
-    stop = stopping.Stop(10.0, 200.0)
-    assert stop.end == 210.0
-    assert 10.0 + 0.75 * 200.0 <= stop.deadline < stop.end
-    assert stopping.Stop(10.0, None).deadline == math.inf
-
-
 def test_search_out_of_time_returns_the_start_that_is_best_by_now(tmp_path):
     """Not the one that was best at first; both are read from the states that an earlier run has kept."""
     folder, settings = tmp_path / "search", SMALL.model_copy(update={"steps": 2})
@@ -126,28 +77,24 @@ def test_search_out_of_time_returns_the_start_that_is_best_by_now(tmp_path):
         assert (result.stopped, result.candidate) == ("out of time", f"start {best + 1}")
 
 
+def test_little_of_a_time_budget_is_left_for_repair():
+    stop = stopping.Stop(10.0, 200.0)
+    assert 10.0 + 0.75 * 200.0 <= stop.deadline < stop.end == 210.0
+    assert stopping.Stop(10.0, None).deadline == math.inf
+
+
 class Hung(Executor):
-    """Takes work and never does it."""
+    """Takes work and never does it; Ctrl-C is pressed so many seconds after it has taken the first."""
+
+    def __init__(self, *interrupts_s):
+        self.interrupts_s = list(interrupts_s)
 
     def submit(self, fn, /, *args, **kwargs):
+        while self.interrupts_s:
+            threading.Timer(self.interrupts_s.pop(), os.kill, (os.getpid(), signal.SIGINT)).start()
         future = Future()
         future.set_running_or_notify_cancel()
         return future
-
-
-def test_time_budget_holds_on_an_executor_that_hangs(monkeypatch):
-    monkeypatch.setattr(stopping, "GRACE_S", 0.1)
-    result = search(PAD, None, SMALL, run=SearchOptions(time_budget=0.1, executor=Hung()))
-    assert result.stopped == "out of time"
-    assert len(result.morphology.knots) == 2
-
-
-@POSIX
-def test_second_ctrl_c_abandons_an_executor_that_hangs():
-    timers = [threading.Timer(after, os.kill, (os.getpid(), signal.SIGINT)) for after in (0.2, 0.4)]
-    for timer in timers:
-        timer.start()
-    assert search(PAD, None, SMALL, run=SearchOptions(executor=Hung())).stopped == "interrupted"
 
 
 @POSIX
@@ -168,6 +115,50 @@ def test_command_ignores_a_hangup_under_nohup(monkeypatch):
             signal.signal(number, handler)
 
 
+def test_executor_that_hangs_is_left_at_the_end_of_the_budget_or_on_a_second_ctrl_c(monkeypatch):
+    monkeypatch.setattr(stopping, "GRACE_S", 0.1)
+    result = search(PAD, None, SMALL, run=SearchOptions(time_budget=0.1, executor=Hung()))
+    assert result.stopped == "out of time"
+    assert len(result.morphology.knots) == 2
+    if os.name == "posix":
+        assert search(PAD, None, SMALL, run=SearchOptions(executor=Hung(0.2, 0.4))).stopped == "interrupted"
+
+
+@pytest.mark.parametrize("method", ["descent", "genetic"])
+def test_search_broken_off_anywhere_resumes_as_if_unbroken(method, tmp_path):
+    """The report raises, as a kill would end it, again and again; every attempt goes on from the last state."""
+    settings = SMALL.model_copy(update={"method": method, "steps": 10})
+    unbroken, kills, resumed = search(PAD, None, settings, FREE), 0, None
+
+    def report(*progress):
+        reported.append(progress)
+        if len(reported) == 2:
+            raise KilledError
+
+    while resumed is None:
+        reported = []
+        try:
+            resumed = search(PAD, None, settings, FREE, run=SearchOptions(report, tmp_path / "search", resume=True))
+        except KilledError:
+            kills += 1
+            assert kills < 30, "it does not get on"
+    assert kills > 0
+    assert (resumed.morphology, resumed.history) == (unbroken.morphology, unbroken.history)
+
+
+def test_checkpoints_remove_no_files_of_others(tmp_path):
+    names = ["search.json", "start_0.npz", "start_0_notes.npz", "other"]
+    for name in names:
+        (tmp_path / name).write_text('{"format": "somebody/1"}')
+    with pytest.raises(InputError, match=r"search\.json: "):
+        Checkpoints(tmp_path, {}).begin(resume=False)
+    assert sorted(path.name for path in tmp_path.iterdir()) == sorted(names)
+    Checkpoints(tmp_path / "own", {}).save(0, {"done": np.array(True)})
+    (tmp_path / "own" / "start_0_notes.npz").write_text("notes")
+    Checkpoints(tmp_path / "own", {}).begin(resume=False)
+    assert [path.name for path in (tmp_path / "own").iterdir()] == ["start_0_notes.npz"]
+
+
 SETTINGS = """
 [pad]
 grid = 1
@@ -182,13 +173,6 @@ enforce = false
 """
 
 
-def design(folder, *arguments):
-    """The command in a process of its own."""
-    (folder / "pad.toml").write_text(SETTINGS)
-    command = [sys.executable, "-m", "padforge", "design", "--out", "pad", *arguments]
-    return subprocess.Popen(command, cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-
-
 def design_here(folder, monkeypatch, *arguments):
     """The exit code of the command in this process."""
     (folder / "pad.toml").write_text(SETTINGS)
@@ -197,41 +181,43 @@ def design_here(folder, monkeypatch, *arguments):
     return run_to_end(cli, "padforge", {})
 
 
-def wait_for_state(folder, process, later_than=0):
-    """When a state of the search was last kept, waited for until it is later."""
-    while True:
-        times = [path.stat().st_mtime_ns for path in folder.glob("start_*.npz")]
-        if times and max(times) > later_than:
-            return max(times)
-        assert process.poll() is None, process.communicate()
-        time.sleep(0.01)
-
-
 @pytest.mark.slow
 @POSIX
-def test_design_killed_and_then_interrupted_resumes_to_the_same_file(tmp_path, monkeypatch):
-    """A kill leaves states alone, Ctrl-C the best so far as well; what goes on from both ends as if unbroken."""
+def test_killed_design_resumes_to_the_same_file(tmp_path, monkeypatch):
+    """A kill leaves the states alone, from which the command goes on as if unbroken."""
     unbroken, broken = tmp_path / "unbroken", tmp_path / "broken"
     unbroken.mkdir()
     broken.mkdir()
     assert design_here(unbroken, monkeypatch) == 0
-    pad, process = broken / "pad", design(broken)
-    killed_at = wait_for_state(pad / "search", process)
+    (broken / "pad.toml").write_text(SETTINGS)
+    process = subprocess.Popen([sys.executable, "-m", "padforge", "design", "--out", "pad"], cwd=broken)
+    pad = broken / "pad"
+    while not list((pad / "search").glob("start_*.npz")):
+        assert process.poll() is None
+        time.sleep(0.01)
     process.kill()
     process.communicate(timeout=300)
     assert not (pad / "morphology.json").exists()
-    process = design(broken, "--resume")
-    wait_for_state(pad / "search", process, killed_at)
-    process.send_signal(signal.SIGINT)
-    out, err = process.communicate(timeout=300)
-    assert process.returncode == 130, err
-    assert "interrupted: the best so far" in out
-    assert json.loads((pad / "design.json").read_text())["stopped"] == "interrupted"
-    assert (pad / "search" / "start_0000.npz").exists()
     assert design_here(broken, monkeypatch, "--resume") == 0
     for name in ("morphology.json", "design.svg"):
         assert (pad / name).read_bytes() == (unbroken / "pad" / name).read_bytes()
     assert not (pad / "search").exists()
+
+
+def test_interrupted_design_says_so_and_keeps_its_states(tmp_path, monkeypatch, capsys):
+    """It writes the best so far."""
+
+    def interrupted(*asked, run, **others):
+        def report(*progress):
+            signal.raise_signal(signal.SIGINT)
+
+        return search(*asked, run=replace(run, on_progress=report), **others)
+
+    monkeypatch.setattr(design_run, "search", interrupted)
+    assert design_here(tmp_path, monkeypatch) == 130
+    assert "interrupted: the best so far" in capsys.readouterr().out
+    assert json.loads((tmp_path / "pad" / "design.json").read_text())["stopped"] == "interrupted"
+    assert (tmp_path / "pad" / "search" / "start_0000.npz").exists()
 
 
 @pytest.mark.filterwarnings("ignore")
@@ -239,33 +225,4 @@ def test_absent_scheduler_is_refused_in_one_line(tmp_path, monkeypatch, capsys):
     pytest.importorskip("distributed")
     monkeypatch.setattr(computing, "SCHEDULER_S", 0.2)
     assert design_here(tmp_path, monkeypatch, "--scheduler", "tcp://127.0.0.1:9") == 2
-    err = capsys.readouterr().err
-    assert "--scheduler is tcp://127.0.0.1:9: no Dask scheduler answers there" in err
-    assert "Traceback" not in err
-
-
-@pytest.mark.slow
-@pytest.mark.filterwarnings("ignore")
-def test_search_on_a_cluster_that_loses_a_worker_finds_the_same_pad():
-    """Its only one: another is started in its place, and goes on."""
-    distributed = pytest.importorskip("distributed")
-    here = search(PAD, None, SMALL, FREE)
-    with (
-        distributed.LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address=None) as cluster,
-        distributed.Client(cluster) as client,
-    ):
-        victim = next(iter(client.run(os.getpid).values()))
-        slices = []
-
-        def report(*progress):
-            slices.append(progress)
-            if len(slices) == 2:
-                threading.Thread(target=os.kill, args=(victim, signal.SIGKILL)).start()
-
-        executor = cast(Executor, client.get_executor(pure=False, retries=10))
-        there = search(PAD, None, SMALL, FREE, run=SearchOptions(report, executor=executor))
-        assert len(slices) > 2
-        with pytest.raises(ProcessLookupError):
-            os.kill(victim, 0)
-    assert there.morphology == here.morphology
-    assert there.history == here.history
+    assert "--scheduler is tcp://127.0.0.1:9: no Dask scheduler answers there" in capsys.readouterr().err

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import shapely
-from hypothesis import assume, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.interpolate import PchipInterpolator
 
@@ -14,7 +14,6 @@ from padforge.design.paths.curves import (
     bend_radius,
     beziers,
     common_stretches,
-    extreme_headings,
     fold_gap,
     slope_beziers,
     trace_curve,
@@ -43,7 +42,7 @@ def dense(pad, fibre, per_span=2000):
 
 
 @given(st.lists(st.tuples(st.integers(1, 5), st.integers(0, 2)), min_size=1, max_size=20), st.integers(1, 12))
-@settings(max_examples=25)
+@settings(max_examples=15)
 def test_bend_radius_includes_corners_at_window_ends(steps, quarters):
     """On quarter steps, whose lengths add without rounding, corners lie exactly a window apart again and again."""
     lengths, ways = np.array(steps).T
@@ -58,7 +57,7 @@ def test_bend_radius_includes_corners_at_window_ends(steps, quarters):
 
 
 @given(SEEDS, st.integers(1, 20), st.sampled_from([0.05, 0.3, 2.0]))
-@settings(max_examples=12)
+@settings(max_examples=6)
 def test_bend_radius_matches_exhaustive_windows(seed, knots, window):
     pad = Morphology.random(2, knots, seed)
     points, headings = dense(pad, fibre=1)
@@ -68,20 +67,6 @@ def test_bend_radius_matches_exhaustive_windows(seed, knots, window):
     most = (np.interp(starts + window, arc, turned) - np.interp(starts, arc, turned)).max()
     found = window / bend_radius(*traced(pad, fibre=1, step=2.5e-3), window)[0]
     assert found == pytest.approx(most, abs=1e-3)
-
-
-@given(SEEDS, st.integers(0, 20), st.sampled_from([0.5, 0.02]))
-@settings(max_examples=25)
-def test_trace_curve_returns_points_and_headings_of_the_curve(seed, knots, step):
-    pad = Morphology.random(1, knots, seed)
-    for fibre, axis in ((0, 0), (1, 1)):
-        assume(np.diff(pad.knots[fibre, :, axis]).min() > 1e-3)  # closer ones cost the oracle its own digits
-        points, headings = traced(pad, fibre, step)
-        curve = PchipInterpolator(pad.knots[fibre, :, axis], pad.knots[fibre, :, 1 - axis])
-        np.testing.assert_allclose(points[:, 1 - axis], curve(points[:, axis]), atol=1e-6)
-        np.testing.assert_allclose(headings, np.arctan(curve.derivative()(points[:, axis])), atol=1e-5)
-        assert np.abs(np.diff(headings)).max() <= step
-        assert headings[[0, -1]] == pytest.approx(extreme_headings(slope_beziers(pad)[fibre])[[0, -1]])
 
 
 def folds_tried(line, gap, step):
@@ -96,7 +81,7 @@ def folds_tried(line, gap, step):
 
 
 @given(SEEDS, st.integers(1, 12), st.sampled_from([0.1, 0.4]))
-@settings(max_examples=10)
+@settings(max_examples=6)
 def test_fold_gap_matches_exhaustive_pairs(seed, knots, gap):
     pad = Morphology.random(1, knots, seed)
     line = flatten(pad, 1e-3)[0]
@@ -117,7 +102,7 @@ def test_fold_gap_of_corners_is_their_opening():
         assert (fold_gap(line, 0.5) is not None) == folds
 
 
-@pytest.mark.parametrize(("knots", "seed"), [(3, 0), (9, 1), (21, 2)])
+@pytest.mark.parametrize(("knots", "seed"), [(3, 0), (9, 1)])
 def test_common_stretches_of_tangled_fibres_match_buffers(knots, seed):
     pad = Morphology.random(3, knots, seed)
     lines = [pad.to_mm(line) for line in flatten(pad, 1e-4)]

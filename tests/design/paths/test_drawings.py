@@ -2,6 +2,7 @@
 
 import re
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -79,17 +80,6 @@ def test_import_follows_units_transforms_and_visibility(tmp_path: Path, plain: M
     golden("design/placements.txt", "\n".join(placements))
 
 
-def test_import_joins_pieces(tmp_path: Path) -> None:
-    parts = [
-        '<polyline points="-20,-6 -5,-7"/><line x1="5" y1="-7" x2="-5" y2="-7"/><path d="M5-7 20-6"/>',
-        '<line x1="-20" y1="6" x2="20" y2="6"/>',
-        *(f'<line x1="{x}" y1="18" x2="{x}" y2="-18"/>' for x in (-10, 0, 10)),
-    ]
-    imported = import_plan(svg(tmp_path, *parts), LAYOUT, 0.2)
-    assert imported.fibres[1].max_error_mm < 0.2
-    assert "to" in imported.fibres[1].name
-
-
 def instead(way: str) -> str:
     """Paths of which the upper horizontal is another."""
     return paths(way, *WAYS[1:])
@@ -130,31 +120,39 @@ def test_import_refuses_other_drawings_in_one_line(tmp_path: Path, golden: Golde
     golden("design/import_refusals.txt", "\n".join(messages), forget=["(?<=read [(])maximum recursion.*"])
 
 
-def test_import_refuses_other_files_in_one_line(tmp_path: Path) -> None:
-    for name in ("plan.svg", "plan.dxf"):
-        for content in (b"nonsense", b"<html/>", b"  0\nSECTION\n  2\nHEADER\n"):
-            (tmp_path / name).write_bytes(content)
-            with pytest.raises(InputError, match=name):
-                import_plan(tmp_path / name, LAYOUT, 0.05)
-    with pytest.raises(InputError, match=r"allowed are \.svg and \.dxf"):
-        import_plan(tmp_path / "plan.pdf", LAYOUT, 0.05)
+def test_import_replaces_entities_of_plain_text(tmp_path: Path, plain: Morphology) -> None:
+    path = svg(tmp_path, PATHS)
+    declared = '<!DOCTYPE svg [<!ENTITY ns "http://www.w3.org/2000/svg">]>'
+    path.write_text(declared + path.read_text().replace("http://www.w3.org/2000/svg", "&ns;"))
+    assert np.array_equal(import_plan(path, LAYOUT, 0.4).pad.knots, plain.knots)
 
 
-def dxf(tmp_path: Path, draw) -> Path:
+@pytest.mark.parametrize("gap", [0.0, 1e-4, 0.008])
+def test_import_joins_pieces_that_nearly_touch(tmp_path: Path, gap: float) -> None:
+    parts = [
+        f'<polyline points="-20,-6 -5,-6"/><line x1="5" y1="-6" x2="{-5 + gap}" y2="-6"/>',
+        f'<path d="M{5 - gap} {-6 + gap / 2}H20"/><line x1="-20" y1="6" x2="20" y2="6"/>',
+        *(f'<line x1="{x}" y1="18" x2="{x}" y2="-18"/>' for x in (-10, 0, 10)),
+    ]
+    imported = import_plan(svg(tmp_path, *parts), LAYOUT, 0.05)
+    assert imported.fibres[1].max_error_mm < 0.02
+    assert "to" in imported.fibres[1].name
+
+
+@pytest.fixture
+def document() -> Any:
+    """A DXF of all fibres but the upper horizontal, straight in a block."""
     document = new(units=units.MM)  # pyright: ignore[reportPrivateImportUsage]
-    space = document.modelspace()
-    draw(space)
-    document.saveas(tmp_path / "plan.dxf")
-    return tmp_path / "plan.dxf"
-
-
-def straight_ones(space) -> None:
-    space.add_lwpolyline([(-20, 6), (20, 6)])
+    inner, outer = document.blocks.new("LINES"), document.blocks.new("PAD")
+    inner.add_lwpolyline([(-20, 6), (20, 6)])
     for x in (-10, 0, 10):
-        space.add_line((x, -18), (x, 18))
+        inner.add_line((x, -18), (x, 18))
+    outer.add_blockref("LINES", (1, 2))
+    document.modelspace().add_blockref("PAD", (-1, -2))
+    return document
 
 
-def several(space) -> None:
+def several(space: Any) -> None:
     space.add_line((-20, -6), (-5, -6))
     space.add_arc((0, 0), 61**0.5, 230.19442891, 309.80557109)  # through (-5, -6) and (5, -6)
     space.add_polyline2d([(5, -6), (20, -6)])
@@ -162,67 +160,35 @@ def several(space) -> None:
     space.add_text("no fibre")
 
 
-@pytest.mark.parametrize(
-    ("draw", "middle_mm"),
-    [
-        (several, -(61**0.5)),
-        (lambda space: space.add_lwpolyline([(-20, -6, 0.1), (20, -6, 0)], format="xyb"), -8.0),  # a bulge
-        (lambda space: space.add_spline([(-20, -6), (0, -9), (20, -6)]), -9.0),
-    ],
-    ids=["several", "bulge", "spline"],
-)
-def test_import_reads_all_kinds_of_dxf_entities(tmp_path: Path, draw, middle_mm: float, golden: Golden) -> None:
-    found = import_plan(dxf(tmp_path, lambda space: (straight_ones(space), draw(space))), LAYOUT, 0.9)
-    line = found.pad.to_mm(flatten(found.pad, 1e-4)[0])
-    assert np.interp(0, *line.T) == pytest.approx(middle_mm, abs=0.9)
-    if draw is several:
-        golden("design/dxf_names.txt", "\n".join([found.placement, *(fibre.name for fibre in found.fibres)]))
+def test_import_reads_all_kinds_of_dxf_entities(tmp_path: Path, document: Any, golden: Golden) -> None:
+    space, path = document.modelspace(), tmp_path / "plan.dxf"
+    for draw, middle_mm in (
+        (lambda: space.add_lwpolyline([(-20, -6, 0.1), (20, -6, 0)], format="xyb"), -8.0),  # a bulge
+        (lambda: space.add_spline([(-20, -6), (0, -9), (20, -6)]), -9.0),
+        (lambda: several(space), -(61**0.5)),
+    ):
+        drawn = draw()
+        document.saveas(path)
+        found = import_plan(path, LAYOUT, 0.9)
+        line = found.pad.to_mm(flatten(found.pad, 1e-4)[0])
+        assert np.interp(0, *line.T) == pytest.approx(middle_mm, abs=0.9)
+        if drawn is not None:
+            space.delete_entity(drawn)
+    golden("design/dxf_names.txt", "\n".join([found.placement, *(fibre.name for fibre in found.fibres)]))
 
 
-def test_import_leaves_out_hidden_curves_of_dxf(tmp_path: Path) -> None:
-    document = new(units=units.MM)  # pyright: ignore[reportPrivateImportUsage]
-    space = document.modelspace()
-    straight_ones(space)
+def test_import_leaves_out_hidden_curves_of_dxf(tmp_path: Path, document: Any) -> None:
+    space, path = document.modelspace(), tmp_path / "plan.dxf"
     space.add_line((-20, -6), (20, -6))
     for name in ("fibres off", "fibres frozen"):
         layer = document.layers.add(name)
         layer.off() if "off" in name else layer.freeze()
         space.add_line((-20, 0), (20, 0), dxfattribs={"layer": name})
     space.add_line((-20, 0), (20, 0), dxfattribs={"invisible": 1})
-    document.saveas(tmp_path / "plan.dxf")
-    found = import_plan(tmp_path / "plan.dxf", LAYOUT, 0.05)
-    assert found.placement.endswith("hidden curves, which are left out: 3")
-
-
-def test_import_reads_blocks(tmp_path: Path) -> None:
-    document = new(units=units.MM)  # pyright: ignore[reportPrivateImportUsage]
-    inner, outer = document.blocks.new("LINES"), document.blocks.new("PAD")
-    straight_ones(inner)
-    inner.add_line((-20, -6), (20, -6))
-    outer.add_blockref("LINES", (1, 2))
-    document.modelspace().add_blockref("PAD", (-1, -2))
-    document.saveas(tmp_path / "plan.dxf")
-    assert len(import_plan(tmp_path / "plan.dxf", LAYOUT, 0.05).fibres) == 5
-    document.layers.add("away").off()
-    document.modelspace()[0].dxf.layer = "away"
-    document.saveas(tmp_path / "plan.dxf")
-    with pytest.raises(InputError, match="there is no open curve in it but 5 hidden ones"):
-        import_plan(tmp_path / "plan.dxf", LAYOUT, 0.05)
-
-
-@pytest.mark.parametrize("gap", [1e-4, 1e-3, 0.008])
-def test_import_joins_pieces_that_nearly_touch(tmp_path: Path, gap: float) -> None:
-    parts = [
-        f'<path d="M-20 -6H-5"/><path d="M{-5 + gap} -6H5"/><path d="M{5 - gap} {-6 + gap / 2}H20"/>',
-        '<line x1="-20" y1="6" x2="20" y2="6"/>',
-        *(f'<line x1="{x}" y1="18" x2="{x}" y2="-18"/>' for x in (-10, 0, 10)),
-    ]
-    imported = import_plan(svg(tmp_path, *parts), LAYOUT, 0.05)
-    assert imported.fibres[1].max_error_mm < 0.02
-
-
-def test_import_replaces_entities_of_plain_text(tmp_path: Path, plain: Morphology) -> None:
-    path = svg(tmp_path, PATHS)
-    declared = '<!DOCTYPE svg [<!ENTITY ns "http://www.w3.org/2000/svg">]>'
-    path.write_text(declared + path.read_text().replace("http://www.w3.org/2000/svg", "&ns;"))
-    assert np.array_equal(import_plan(path, LAYOUT, 0.4).pad.knots, plain.knots)
+    document.saveas(path)
+    assert import_plan(path, LAYOUT, 0.05).placement.endswith("hidden curves, which are left out: 3")
+    for entity in space:
+        entity.dxf.layer = "fibres off"
+    document.saveas(path)
+    with pytest.raises(InputError, match="there is no open curve in it but 8 hidden ones"):
+        import_plan(path, LAYOUT, 0.05)

@@ -5,14 +5,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from padforge import InputError
 from padforge.design import Morphology
 from padforge.design.contact import fibre_axes
-from padforge.design.objectives.ambiguity import free_presses
 from padforge.design.objectives.penalties import penalties
 from padforge.design.objectives.rules import check_rules
 from padforge.design.paths.curves import bend_radius, rolled_turns
-from padforge.design.paths.keep_outs import check_fibre_ends, is_outside, keep_outs, pass_keep_outs, straight_paths
+from padforge.design.paths.keep_outs import is_outside, keep_outs, pass_keep_outs, straight_paths
 from padforge.design.settings import Layout, PadSettings, RulesSettings
 from tests.design.objectives.pads import only
 
@@ -26,51 +24,6 @@ def kept_off(*polygons, counts=(3, 6), pitch_mm=(8.0, 15.0)):
     return PadSettings(keep_out_mm=polygons, **Layout.create(counts, pitch_mm).settings)
 
 
-def test_keep_out_distances_and_free_presses_are_exact():
-    """Horizontals of this pad run at y = -15, 0 and 15 mm, verticals 8 mm apart from x = -20 mm."""
-    size = kept_off(square(1.0, 7.0, 4.0))
-    found = check_rules(Morphology.straight(size.layout), only(keep_out_mm=5.9), size)
-    # edges at y = 5 and 9, x = -1 and 3; verticals at -4 and 4
-    assert {v.fibres: v.measured for v in found} == pytest.approx({(2,): 5.0, (6,): 3.0, (7,): 1.0})
-    assert {v.rule for v in found} == {"keep_out_mm"}
-    assert {v.fibres: v.place_mm for v in found}[7,] == pytest.approx((4, 7), abs=2.1)
-    size = kept_off(square(-10.0, 0.0, 4.0))  # one runs through it and one touches it
-    found = {v.fibres: v for v in check_rules(Morphology.straight(size.layout), only(keep_out_mm=0.0), size)}
-    assert {fibres: v.measured for fibres, v in found.items()} == {(2,): 0, (5,): 0}
-    assert found[2,].place_mm == pytest.approx((-10, 0))
-    assert found[5,].place_mm == pytest.approx((-12, 0))
-    assert not check_rules(Morphology.straight(size.layout), only(keep_out_mm=0.0), kept_off(square(-8.0, 7.0, 6.0)))
-    size = kept_off(square(0.0, 0.0, 16.0), ((-20.0, -20.0), (-10.0, -20.0), (-15.0, -10.0)))
-    places = np.random.default_rng(0).uniform(0, size.layout.extent, (500, 2))
-    free = is_outside(places, size)
-    mm = Morphology.straight(size.layout).to_mm(places)
-    assert not free[(np.abs(mm) < 8).all(axis=1)].any()
-    assert free[(mm[:, 0] > 8.1)].all()
-    assert sum(polygon.area for polygon in keep_outs(size)) * size.layout.unit_mm**2 == pytest.approx(16**2 + 50)
-
-
-@pytest.mark.parametrize(
-    ("polygon", "message"),
-    [
-        (((0, 0), (4, 4), (4, 0), (0, 4)), "polygon 1 crosses or touches itself or has no area"),
-        (((0, 0), (4, 4)), "polygon 1 has 2 corners, allowed are 3 to 1000"),
-        (square(100, 0, 4), r"polygon 1 lies beside the pad, which is 56 by 60 mm about \(0, 0\)"),
-        ((-25.0, -15.0, 4.0), r"keep-out 1 is 0.998 mm from an end of fibre 1, at \(-28, -15\) mm, allowed is 1.5"),
-        (square(-25.0, -15.0, 4.0), r"is 1 mm from an end of fibre 1, at \(-28, -15\) mm, allowed is 1.5"),
-        (((-28, -30), (28, -30), (28, 30), (-28, 30)), "keep_out_mm covers all that is pressed"),
-    ],
-)
-def test_keep_outs_without_room_are_refused_in_one_line(polygon, message):
-    def use():
-        size = kept_off(polygon)
-        free_presses(size)
-        check_fibre_ends(size, RulesSettings())
-
-    with pytest.raises(InputError, match=rf"keep_out_mm:? .*{message.removeprefix('keep_out_mm ')}"):
-        use()
-    check_fibre_ends(kept_off(square(-24.0, -15.0, 4.0)), RulesSettings())
-
-
 def penalty(pad, size, cross=None, clearance=3.0):
     travel, own = (axis[0] for axis in fibre_axes(pad)[:2])
     rules = only(keep_out_mm=clearance, max_common_track_mm=None)
@@ -79,9 +32,9 @@ def penalty(pad, size, cross=None, clearance=3.0):
 
 def test_keep_out_penalty_vanishes_with_clearance_and_has_its_gradient():
     size = kept_off(square(2.0, 6.0, 9.0))
-    assert penalty(Morphology.straight(size.layout), size, clearance=1.0).values["keep_out_mm"] > 0
-    free = Morphology.straight(size.layout)
-    assert penalty(free, kept_off(square(0.0, 7.0, 1.8))).values["keep_out_mm"] == 0
+    straight = Morphology.straight(size.layout)
+    assert penalty(straight, size, clearance=1.0).values["keep_out_mm"] > 0
+    assert penalty(straight, kept_off(square(0.0, 7.0, 1.8))).values["keep_out_mm"] == 0
     pad, rng = Morphology.random(size.layout, 4, seed=3), np.random.default_rng(0)
     cross = fibre_axes(pad)[1][0]
     step = 1e-6 * rng.standard_normal(cross.shape)
@@ -98,19 +51,6 @@ def test_straight_paths_pass_keep_outs_within_the_rules():
     assert check_rules(pad, rules, size) == []
     away = np.abs(pad.knots[:3, :, 1] - size.layout.levels[:3, None]).max(axis=1)
     assert (away[1] > 0.3, away[0] == 0) == (True, True)
-    few = Morphology.from_layout(straight_paths(size, rules, 3), size.layout)
-    assert few.knots.shape == (9, 5, 2)
-
-
-def test_fibres_and_presses_keep_clear_of_the_head_of_a_screw():
-    size, rules = kept_off((2.0, 1.0, 3.0, 8.0)), RulesSettings()
-    assert {v.rule for v in check_rules(Morphology.straight(size.layout), rules, size)} == {"keep_out_mm"}
-    pad = Morphology.from_layout(straight_paths(size, rules, 21), size.layout)
-    assert check_rules(pad, rules, size) == []
-    angles = np.linspace(0, 2 * np.pi, 50)[:, None]
-    ring = (np.array([2.0, 1.0]) + np.hstack([np.cos(angles), np.sin(angles)]) * [[4.02]]) / size.layout.unit_mm
-    assert is_outside(ring + np.array(size.layout.extent) / 2, size).all()
-    assert not is_outside(0.99 * ring + np.array(size.layout.extent) / 2 + 0.01 * ring.mean(axis=0), size).any()
 
 
 @given(st.integers(0, 99), st.floats(-8, 8), st.floats(-8, 8), st.sampled_from([6.0, 25.0]))
@@ -145,21 +85,6 @@ def test_bend_radius_on_a_cylinder_matches_curves_in_space():
     assert place == pytest.approx((0, 0), abs=0.05)
 
 
-def test_min_bend_radius_of_a_bent_pad():
-    rules, pad = only(min_mean_bend_radius_mm=10.0), Morphology.straight(Layout.create((3, 2), (8.0, 15.0)))
-    assert check_rules(pad, rules, PadSettings(bent_radius_mm=10.5)) == []
-    found = check_rules(pad, rules, PadSettings(bent_radius_mm=9.0))
-    assert [(v.fibres, v.measured) for v in found] == [((f,), pytest.approx(9)) for f in (1, 2, 3)]
-    travel, cross = (axis[0] for axis in fibre_axes(pad)[:2])
-    for radius, expected in ((9.0, 10 / 9 - 1), (10.5, 0.0)):
-        size = PadSettings(bent_radius_mm=radius).for_layout(pad.layout)
-        # the penalty takes every fibre to run around the cylinder
-        expected *= float((travel[:, -1] / travel[:, -1].mean()).mean())
-        for all_bends, rel in ((False, 0.0), (True, 0.01)):  # which windows end on the pad is known to a sample
-            found = penalties(travel, cross, size, rules, all_bends=all_bends).values["min_mean_bend_radius_mm"]
-            assert found == pytest.approx(expected, rel=rel, abs=1e-9)
-
-
 def test_fibres_are_back_at_their_levels_after_a_keep_out_by_the_wall():
     """Beside the wall there is less room to turn aside than behind the keep-out to turn back."""
     size = kept_off(square(-18.0, 4.0, 10.0), counts=(2, 6))
@@ -168,3 +93,42 @@ def test_fibres_are_back_at_their_levels_after_a_keep_out_by_the_wall():
     assert (along[:, 1] - along[:, 0] < along[:, 3] - along[:, 2]).all()
     np.testing.assert_allclose(across[:, [0, 3]], size.layout.levels[:2, None] * [1, 1], atol=1e-3)
     assert np.abs(across[:, 1:3] - size.layout.levels[:2, None]).max() > 0.2
+
+
+def test_min_bend_radius_of_a_bent_pad_is_that_of_fibres_around_it():
+    rules, pad = only(min_mean_bend_radius_mm=10.0), Morphology.straight(Layout.create((3, 2), (8.0, 15.0)))
+    assert check_rules(pad, rules, PadSettings(bent_radius_mm=10.5)) == []
+    found = check_rules(pad, rules, PadSettings(bent_radius_mm=9.0))
+    assert [(v.fibres, v.measured) for v in found] == [((f,), pytest.approx(9)) for f in (1, 2, 3)]
+
+
+def test_fibres_and_presses_keep_clear_of_the_head_of_a_screw():
+    size, rules = kept_off((2.0, 1.0, 3.0, 8.0)), RulesSettings()
+    assert {v.rule for v in check_rules(Morphology.straight(size.layout), rules, size)} == {"keep_out_mm"}
+    pad = Morphology.from_layout(straight_paths(size, rules, 21), size.layout)
+    assert check_rules(pad, rules, size) == []
+    angles = np.linspace(0, 2 * np.pi, 50)[:, None]
+    for radius_mm, outside in ((4.02, True), (3.98, False)):
+        ring_mm = np.array([2.0, 1.0]) + radius_mm * np.hstack([np.cos(angles), np.sin(angles)])
+        assert (is_outside(pad.to_grid(ring_mm), size) == outside).all()
+
+
+def test_keep_out_distances_and_free_presses_are_exact():
+    """Horizontals of this pad run at y = -15, 0 and 15 mm, verticals 8 mm apart from x = -20 mm."""
+    size = kept_off(square(1.0, 7.0, 4.0))
+    found = check_rules(Morphology.straight(size.layout), only(keep_out_mm=5.9), size)
+    # edges at y = 5 and 9, x = -1 and 3; verticals at -4 and 4
+    assert {v.fibres: v.measured for v in found} == pytest.approx({(2,): 5.0, (6,): 3.0, (7,): 1.0})
+    assert {v.rule for v in found} == {"keep_out_mm"}
+    assert {v.fibres: v.place_mm for v in found}[7,] == pytest.approx((4, 7), abs=2.1)
+    size = kept_off(square(-10.0, 0.0, 4.0))  # one runs through it and one touches it
+    found = {v.fibres: v for v in check_rules(Morphology.straight(size.layout), only(keep_out_mm=0.0), size)}
+    assert {fibres: v.measured for fibres, v in found.items()} == {(2,): 0, (5,): 0}
+    assert found[2,].place_mm == pytest.approx((-10, 0))
+    assert not check_rules(Morphology.straight(size.layout), only(keep_out_mm=0.0), kept_off(square(-8.0, 7.0, 6.0)))
+    size = kept_off(square(0.0, 0.0, 16.0), ((-20.0, -20.0), (-10.0, -20.0), (-15.0, -10.0)))
+    places = np.random.default_rng(0).uniform(0, size.layout.extent, (500, 2))
+    free, mm = is_outside(places, size), Morphology.straight(size.layout).to_mm(places)
+    assert not free[(np.abs(mm) < 8).all(axis=1)].any()
+    assert free[(mm[:, 0] > 8.1)].all()
+    assert sum(polygon.area for polygon in keep_outs(size)) * size.layout.unit_mm**2 == pytest.approx(16**2 + 50)

@@ -1,0 +1,193 @@
+"""What functions and commands of design refuse, in one line each."""
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from functools import reduce
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from click.testing import CliRunner
+
+from padforge import design
+from padforge.design import Contact, Morphology, PadSettings, SearchSettings, Twin, cli, signals
+from padforge.design.layer import solve_press
+from padforge.design.objectives.ambiguity import free_presses
+from padforge.design.paths.import_plan import import_plan
+from padforge.design.paths.keep_outs import check_fibre_ends
+from padforge.design.published.objective import published_terms
+from padforge.design.settings import Layout
+from padforge.design.twin import PARTS, TwinChannel, TwinPart, TwinResidual
+from tests.helpers.golden import Golden
+from tests.helpers.refusals import refusal_table
+
+CAUSE, NUMPY = r"(?<=read \(|file \(|twin \(|logy \().*(?=\))", ("operands.*", "could not convert.*")
+"""Words of Python and of other libraries."""
+
+PAD = Morphology.straight(2)
+KNOTS = Morphology.random(2, 1, seed=0).knots
+UNSORTED = np.array([[[0, 1.0], [1, 0.2], [1 + 2.0**-52, 1.8], [2, 1.0]]] * 2)
+UNSORTED[1] = UNSORTED[1, :, ::-1]
+
+
+def knots_of(change: Callable[[Any], Any]) -> Callable[[], Morphology]:
+    """A pad whose knots are changed."""
+    return lambda: Morphology(change(KNOTS))
+
+
+def keep_out(*polygon: Any) -> Callable[[], None]:
+    """A pad of 56 by 60 mm with a keep-out, and presses on it."""
+
+    def use() -> None:
+        size = PadSettings(keep_out_mm=(polygon,), **Layout.create((3, 6), (8.0, 15.0)).settings)
+        free_presses(size)
+        check_fibre_ends(size, design.RulesSettings())
+
+    return use
+
+
+def square(x: float, y: float) -> tuple[tuple[float, float], ...]:
+    """The corners of one of 4 mm."""
+    return (x - 2, y - 2), (x + 2, y - 2), (x + 2, y + 2), (x - 2, y + 2)
+
+
+def depths(depths_mm: object) -> Callable[[], object]:
+    """Signals of two presses by their depths."""
+    return lambda: design.indented_signals(PAD, [[1, 1], [2, 2]], depths_mm, Contact())  # pyright: ignore[reportArgumentType]
+
+
+VALUES: dict[str, Callable[[], object]] = {
+    "knots that are NaN": knots_of(lambda k: k * np.nan),
+    "knots beyond the far side": knots_of(lambda k: k + 0.1),
+    "knots beyond the near side": knots_of(lambda k: k - 0.1),
+    "knots that do not ascend": knots_of(lambda k: np.concatenate([k[:3], k[3:, [0, 2, 1]]])),
+    "a fibre that begins inside": knots_of(lambda k: np.where(np.arange(3)[:, None] == 0, k + 0.1, k)),
+    "a fibre whose ends differ": knots_of(lambda k: k - 0.1 * (np.arange(24).reshape(4, 3, 2) == 5)),
+    "a pitch": lambda: Morphology.straight(2, 1e9),
+    "tiles": lambda: Morphology.straight(4).tiled(10**4),
+    "knots of no pad": lambda: signals(np.zeros((3, 2, 2)), [[1, 1]]),
+    "knots of signals that are NaN": lambda: signals(np.full((4, 2, 2), np.nan), [[1, 1]]),
+    "knots of signals that do not ascend": lambda: signals(UNSORTED, [[1, 1]]),
+    "presses that are NaN": lambda: signals(PAD, [[np.nan, 1]]),
+    "presses of three numbers": lambda: signals(PAD, [[1, 2, 3]]),
+    "sampled presses that are NaN": lambda: design.signals_quantized(PAD, [[np.nan, 1]]),
+    "sparse presses that are NaN": lambda: design.signals_sparse(PAD, [[np.nan, 1]]),
+    "a precision": lambda: signals(PAD, [[1, 1]], Contact(), precision=1e-7),
+    "depths of a profile": lambda: design.indented_signals(PAD, [[1, 1]], 0.1, Contact(model="profile")),
+    "depths of a shape": lambda: design.indented_signals(PAD, [[1, 1]], 0.1, Contact(radius=0.6)),
+    "a depth beyond the contact's": depths([0.1, 5.1]),
+    "a depth below 0": depths([0.1, -0.1]),
+    "depths of another number": depths([0.1]),
+    "a tool too wide for the layer": lambda: solve_press("flat", 1000.0, 0.05, 0.1),
+    "a keep-out that crosses itself": keep_out((0, 0), (4, 4), (4, 0), (0, 4)),
+    "a keep-out of two corners": keep_out((0, 0), (4, 4)),
+    "a keep-out beside the pad": keep_out(*square(100, 0)),
+    "a screw by an end": keep_out(-25.0, -15.0, 4.0),
+    "a keep-out by an end": keep_out(*square(-25.0, -15.0)),
+    "a keep-out of all": keep_out((-28, -30), (28, -30), (28, 30), (-28, 30)),
+    "a sensed area": lambda: design.score(Morphology.straight(3), size=PadSettings(sensed_mm=(46, 20))),
+    "too many fibres to compare": lambda: design.score(Morphology.random(16, 3000, seed=0), max_failures=0),
+    "no noise": lambda: design.score(PAD, noise=0.0),
+    "an entropy": lambda: published_terms(PAD, entropy="all"),  # pyright: ignore[reportArgumentType]
+    "training presses": lambda: design.localisation_error(PAD, presses=1000),
+    "failed fibres": lambda: design.localisation_error(PAD, n_failed=(-1,)),
+    "an origin of other fibres": lambda: design.search(PadSettings(grid=2), origin=Morphology.straight(3)),
+    "a population": lambda: design.search(settings=SearchSettings(method="genetic", population=100_000)),
+    "a time budget": lambda: design.SearchOptions(time_budget=-1),
+}
+
+
+def test_refusals_of_values(golden: Golden) -> None:
+    golden("design/refusals.txt", refusal_table(VALUES))
+    keep_out(*square(-24.0, -15.0))()  # just far enough from the end
+
+
+def test_refusals_of_twins(golden: Golden, twin: Path, tmp_path: Path) -> None:
+    whole, path = Twin.load(twin), tmp_path / "twin.json"
+
+    def changed(**values: Any) -> Callable[[], Twin]:
+        return lambda: replace(whole, **values)
+
+    def with_value(value: Any, *way: str) -> Callable[[], Twin]:
+        def load() -> Twin:
+            document = json.loads(twin.read_text())
+            reduce(dict.__getitem__, way[:-1], document)[way[-1]] = value
+            path.write_text(json.dumps(document))
+            return Twin.load(path)
+
+        return load
+
+    part, small = (TwinPart(whole.distance_mm, whole.weight, np.zeros(count)) for count in (3, 2))
+    rows: dict[str, Callable[[], object]] = {
+        "a channel of no fibre": changed(channels=(TwinChannel(0, 9, 0.1, 0.0, 0.9),)),
+        "two channels of a fibre": changed(channels=tuple(TwinChannel(c, 0, 0.1, 0.0, 0.9) for c in (0, 1))),
+        "a shorter weight": changed(weight=whole.weight[:-1]),
+        "fewer lines": changed(as_built_mm=(None,)),
+        "sensitivities of no line": changed(sensitivity=(None,) * 4),
+        "no sensed area": changed(sensed_mm=(20.0, 0.0)),
+        "one part": changed(parts={"onset": part}),
+        "gains of too few channels": changed(parts=dict.fromkeys(PARTS, small)),
+        "a residual without parts": changed(residual=TwinResidual((0.0, 0.0), 1.0, np.zeros((4, 4, 2, 2)))),
+        "presses of three numbers": lambda: whole.as_built_stretch([[1.0, 2.0, 3.0]]),
+        "presses that are NaN": lambda: whole.as_built_stretch([[np.nan, 0.0]]),
+        "no such part": lambda: whole.as_built_stretch([[0.0, 0.0]], "of"),
+        "a file of another kind": with_value("padforge-design/1", "format"),
+        "a file of other channels": with_value([{"gain": 1}], "channels"),
+        "a file of a scale": with_value(-1, "frame", "scale"),
+        "a file of a noise": with_value("much", "noise"),
+    }
+    golden("design/refusals_of_twins.txt", refusal_table(rows).replace(str(path), "twin.json"), forget=[CAUSE])
+
+
+RECTANGLE = Morphology.random(Layout.create((1, 2), (8.0, 15.0)), 2, seed=0).to_dict()
+FILES = {
+    "pad.json": [
+        *("", "[]", '{"format": "padforge-morphology/1"}'),
+        *(RECTANGLE | {"fibres": value} for value in ([2, 1], 3, ["1", "2"], [0, 0])),
+        *(RECTANGLE | {"pitch_mm": value} for value in ([8.0, -1], [8.0])),
+        *(RECTANGLE | {"knots": value} for value in ([], "many", Morphology.straight(2).to_dict()["knots"])),
+    ],
+    "plan.svg": ["nonsense", "<html/>"],
+    "plan.dxf": ["nonsense", "  0\nSECTION\n  2\nHEADER\n"],
+    "plan.pdf": [""],
+}
+
+
+def test_refusals_of_files(golden: Golden, here: Path) -> None:
+    rows: dict[str, Callable[[], object]] = {}
+    for name, contents in FILES.items():
+        for number, content in enumerate(contents):
+            path = here / str(number) / name
+            path.parent.mkdir(exist_ok=True)
+            path.write_text(content if isinstance(content, str) else json.dumps(content))
+            read = Morphology.load if name == "pad.json" else lambda path: import_plan(path, Layout.create(2), 0.05)
+            rows[f"{number}/{name}"] = lambda read=read, path=path: read(path)
+    golden("design/refusals_of_files.txt", refusal_table(rows), forget=[CAUSE, *NUMPY])
+
+
+SEARCH = "[search]\nknots = 2\nstarts = 1\nsteps = 3\n"
+COMMANDS = [
+    (["import", "plan.svg"], "[rules]\nlost = 1\n"),
+    (["show", "pad/morphology.json", "--out", "a.pdf"], ""),
+    (["--twin", "twin.json"], SEARCH + "[contact]\nradius = 0.9\n"),
+    (["--twin", "twin.json"], SEARCH + "[pad]\ngrid = 4\n"),
+    (["--twin", "none.json"], SEARCH),
+    (["edit", "missing.json"], ""),
+    (["edit", "pad.json", "--out", "pad.mat"], ""),
+    (["edit", "pad.json", "--out", "pad.json/x.json"], ""),
+]
+
+
+def test_commands_refuse_before_they_write(golden: Golden, here: Path, twin: Path) -> None:
+    Path("plan.svg").touch()
+    Path("twin.json").write_bytes(twin.read_bytes())
+    PAD.save("pad.json")
+
+    def run(arguments: list[str], spec: str) -> object:
+        Path("pad.toml").write_text(spec)
+        return CliRunner().invoke(cli.design, arguments, catch_exceptions=False)
+
+    rows = {f"{' '.join(each[0])} {number}": lambda each=each: run(*each) for number, each in enumerate(COMMANDS)}
+    golden("design/refusals_of_commands.txt", refusal_table(rows), forget=[CAUSE])
+    assert sorted(path.name for path in here.iterdir()) == ["pad.json", "pad.toml", "plan.svg", "twin.json"]
