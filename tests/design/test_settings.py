@@ -190,10 +190,11 @@ def test_measured_profile_is_a_gaussian():
 
 
 def test_settings_accept_numpy_numbers():
-    for model, arrays, plain in (
+    cases: tuple[tuple[Any, dict[str, Any], dict[str, Any]], ...] = (
         (PadSettings, {"grid": np.int64(3), "keep_out_mm": [np.array(HOLE)]}, {"grid": 3, "keep_out_mm": [HOLE]}),
         (SearchSettings, {"contacts": ({"radius": np.float32(0.5)},)}, {"contacts": (Contact(radius=0.5),)}),
-    ):
+    )
+    for model, arrays, plain in cases:
         assert model(**arrays) == Spec({}).section(model, **arrays) == model(**plain)
         assert model(**arrays).model_dump_json() == model(**plain).model_dump_json()
 

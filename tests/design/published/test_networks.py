@@ -1,6 +1,7 @@
 """Evaluation by simulation: the published order of the pads, and fresh test presses."""
 
 import os
+from typing import Any
 
 import numpy as np
 import pytest
@@ -45,7 +46,8 @@ def test_localisation_error_of_the_published_pad_is_below_the_square_grid(publis
 
 
 def test_localisation_error_depends_on_its_seed_and_not_on_cores(monkeypatch):
-    pad, asked = Morphology.random(2, 3, seed=1), {"presses": 100, "test": 100, "hidden": 8, "subsets": 3}
+    pad = Morphology.random(2, 3, seed=1)
+    asked: dict[str, Any] = {"presses": 100, "test": 100, "hidden": 8, "subsets": 3}
     side_by_side, other = (localisation_error(pad, n_failed=(0, 1), seed=seed, **asked) for seed in (0, 1))
     monkeypatch.setattr(os, "cpu_count", lambda: 1)
     assert localisation_error(pad, n_failed=(0, 1), **asked) == side_by_side != other
