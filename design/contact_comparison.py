@@ -10,8 +10,10 @@ from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from threadpoolctl import threadpool_limits
+
 from padforge.common.files import provenance, write_json
-from padforge.common.parallel import one_thread, run_tasks
+from padforge.common.parallel import run_tasks
 from padforge.common.profiling import stage
 from padforge.design.contact_set import judged_contacts
 from padforge.design.morphology import Morphology
@@ -38,7 +40,7 @@ def errors_by_contact(
 ) -> list[ContactErrors]:
     """Compute the expected errors of pads of one layout under every contact, contact by contact, by the same draws."""
     names = list(product(contacts, pads))
-    with one_thread():
+    with threadpool_limits(1, "blas"):  # around those of the tasks, which would lift them for one another
         tasks = (((c, p), partial(expected_errors, pads[p], contacts[c], search, size)) for c, p in names)
         errors = dict(run_tasks(tasks))
     return [ContactErrors(c, p, tuple(pads[p].unit_mm * error for error in errors[c, p])) for c, p in names]

@@ -26,11 +26,14 @@ def loaded_by(*codes: str) -> list[set[str]]:
 def test_package_help_and_stages_import_only_what_they_need(tmp_path: Path) -> None:
     """What one may load, none before it has loaded."""
     pad, build = "p = design.Morphology.straight(1)", f"build(p, {str(tmp_path)!r}, ['stl', 'svg'])"
-    package, helped, stage, built = loaded_by(
+    compare = "from padforge.design.contact_comparison import errors_by_contact"
+    settings = "design.PadSettings(grid=1), design.SearchSettings(max_failures=0)"
+    package, helped, stage, built, compared = loaded_by(
         "import padforge",
         "sys.argv = ['padforge', '--help']; from padforge.cli import main; main()",
         "import padforge.fabricate.cli",
         f"from padforge import build, design; {pad}; design.signals(p, [[1, 1]]); {build}",
+        f"{compare}; errors_by_contact({{'': p}}, {{'': design.Contact()}}, {settings})",
     )
     assert not {name for name in package if name.startswith("padforge.")}
     assert not package & {"numpy", "click", "pydantic"}
@@ -41,6 +44,8 @@ def test_package_help_and_stages_import_only_what_they_need(tmp_path: Path) -> N
     assert not stage & (cad | {"trimesh", "manifold3d", "numpy", "pydantic"})
     assert built >= {"numba", "manifold3d"}
     assert not built & (cad - {"matplotlib"})
+    assert "padforge.design.objectives.bayes_error" in compared
+    assert "torch" not in compared
 
 
 def test_bench_of_a_wheel_is_refused_in_one_line() -> None:
