@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.integrate import quad
 
-from padforge.design.contact import FIBRE_BLUR_MM, contact_press, describe_large_strain
+from padforge.design.contact import FIBRE_BLUR_MM, contact_press, describe_large_strain, profile_weights
 from padforge.design.layer import MAX_CONTACT, solve_press
 from padforge.design.settings import Contact
 from tests.helpers.axisymmetric import press
@@ -33,7 +33,7 @@ def test_dome_on_thick_layer_is_hertz(radius, depth):
     np.testing.assert_allclose(solved.deflection(r), outside, atol=0.02 * depth)
 
 
-@pytest.mark.parametrize("share", [0.3, 0.95])  # contact radius over that of the ball
+@pytest.mark.parametrize("share", [0.3, 0.7, 0.95])  # contact radius over that of the ball
 def test_ball_on_thick_layer_is_sneddon(share):
     radius, a = 5.0, 5.0 * share
     solved = solve_press("ball", radius, a * math.atanh(share), 200 * radius)
@@ -51,15 +51,25 @@ def test_flat_on_thick_layer_is_sneddon():
     np.testing.assert_allclose(solved.deflection(r), 2 * depth / np.pi * np.arcsin(radius / r), atol=0.02 * depth)
 
 
+@pytest.mark.parametrize("thickness", [20.0, 1000.0])
 @pytest.mark.parametrize("below", [0.25, 1.05])
-def test_strains_near_the_face_of_a_thick_layer_are_those_of_a_half_space(below):
-    solved = solve_press("dome", 0.84, 0.5, 1000.0)
+def test_strains_near_the_face_of_a_thick_layer_are_those_of_a_half_space(thickness, below):
+    solved = solve_press("dome", 0.84, 0.5, thickness)
     a, depth = math.sqrt(0.84 * 0.5), 0.5
     # int k^2 exp(-k z) cos(k s) dk in closed form
     strain = quad(
         lambda s: (depth - s**2 / 0.84) * 4 * below**2 * (below**2 - 3 * s**2) / (below**2 + s**2) ** 3 / np.pi, 0, a
     )[0]
-    assert solved.strains([0.0], 1000.0 - below).compressive[0] == pytest.approx(strain, rel=0.05)
+    assert solved.strains([0.0], thickness - below).compressive[0] == pytest.approx(strain, rel=0.05)
+
+
+@pytest.mark.parametrize("ratio", [0.1, 1.0, 10.0, 100.0])
+def test_contact_radius_of_a_bonded_layer_follows_chi(ratio):
+    thickness = 3.0
+    chi = 1 / 4 + 3 / 4 / (1 + 1.3 * ratio)
+    depth = chi * (ratio * thickness) ** 2 / 20
+    solved = solve_press("dome", 20.0, depth, thickness)
+    assert 20.0 * depth / solved.contact_radius_mm**2 == pytest.approx(chi, rel=0.05)
 
 
 def test_thin_bonded_layer_is_a_lubrication_film():
@@ -88,41 +98,63 @@ def test_face_follows_the_tool_inside_and_stays_clear_of_it_outside(tool, base):
     assert (solved.deflection(outside) > tool_depth(tool, 8.4, 3.0, outside)).all()
 
 
-def test_strains_above_1_are_said_with_their_size(golden: Golden) -> None:
-    """The largest lies in the silicone below the fibres, for a flat end at the edge of the contact."""
-    assert describe_large_strain(Contact()) == describe_large_strain(Contact(model="profile")) == ""
-    bonded, flat = Contact(base="bonded"), Contact(tool="flat")
-    for contact, height_mm in ((bonded, 3.75), (flat, 5.75)):
-        golden(f"design/large_strain_{contact.tool}.txt", describe_large_strain(contact))
-        strains = contact_press(contact).strains(np.linspace(0, 20, 500), height_mm, FIBRE_BLUR_MM)
-        told = float(describe_large_strain(contact).partition("up to ")[2].partition(",")[0])
-        assert told == pytest.approx(strains.compressive.max(), abs=0.07)
+@pytest.mark.parametrize("base", ["bonded", "slipping"])
+def test_silicone_keeps_its_volume(base):
+    solved = solve_press("dome", 8.4, 4.0, 6.0, base)
+    heights, weights = np.polynomial.legendre.leggauss(20)
+    radii = np.array([3.0, 8.0, 14.0])
+    outward = weights @ np.array([solved.strains(radii, 3 + 3 * height).hoop for height in heights]) * radii
+    for radius, through in zip(radii, outward, strict=True):
+        r = radius * (1 + heights) / 2
+        displaced = radius / 2 * weights @ (solved.deflection(r) * r)
+        assert radius * 3 * through == pytest.approx(displaced, abs=0.01 * 4.0 * 8.0)
+
+
+@pytest.mark.parametrize("base", ["bonded", "slipping"])
+def test_strains_are_differences_of_displacements(base):
+    solved = solve_press("ball", 8.4, 3.0, 6.0, base)
+    r, step = np.linspace(0.5, 15, 20), 1e-4
+    left, right = (x * solved.strains(x, 4.5).hoop for x in (r - step, r + step))
+    strains = solved.strains(r, 4.5)
+    np.testing.assert_allclose((right - left) / (2 * step), strains.radial, atol=1e-6)
+    np.testing.assert_allclose(strains.compressive, strains.radial + strains.hoop, atol=1e-12)
+    heights, weights = np.polynomial.legendre.leggauss(20)
+    squeezed = sum(w * solved.strains(r, 3 + 3 * h).compressive for h, w in zip(heights, weights, strict=True))
+    np.testing.assert_allclose(3 * squeezed, solved.deflection(r), atol=0.01 * 3.0)
 
 
 @pytest.mark.parametrize(
     ("tool", "thickness", "depth", "base"),
-    [("dome", 6, 5, "bonded"), ("ball", 8, 4, "slipping"), ("flat", 6, 2, "bonded")],
+    [
+        ("dome", 6, 5, "bonded"),
+        ("ball", 8, 4, "slipping"),
+        ("flat", 6, 2, "bonded"),
+    ],
 )
 def test_layer_is_that_of_finite_elements(tool, thickness, depth, base):
-    """An edge of pressure without bound, of a flat end, is what elements see least."""
     solved = solve_press(tool, 8.4, depth, thickness, base)
-    a, count = solved.contact_radius_mm, 12  # elements over the contact
-    edges = list(np.linspace(0, 1.5 * a, 3 * count // 2 + 1))
-    while edges[-1] < a + (6 if base == "bonded" else 60) * thickness:
-        edges.append(edges[-1] + 1.3 * (edges[-1] - edges[-2]))
-    heights = np.linspace(0, thickness, max(4, count * thickness // 8) + 1)
-    found = press(lambda r: tool_depth(tool, 8.4, depth, r), np.array(edges), heights, bonded=base == "bonded")
-    assert solved.force_n(4e3) == pytest.approx(found.force, rel=0.015 if tool == "flat" else 0.004)
-    assert found.contact_radius == pytest.approx(a, rel=1e-9)
-    row = 3 * len(found.z) // 4
-    beside = np.abs(found.r - a) > 0.25 * a
-    strains = solved.strains(found.r, found.z[row])
+    a, results = solved.contact_radius_mm, []
+    for count in (8, 16):  # elements over the contact
+        edges = list(np.linspace(0, 1.5 * a, 3 * count // 2 + 1))
+        while edges[-1] < a + (6 if base == "bonded" else 60) * thickness:
+            edges.append(edges[-1] + 1.3 * (edges[-1] - edges[-2]))
+        heights = np.linspace(0, thickness, max(4, count * thickness // 8) + 1)
+        results.append(
+            press(lambda r: tool_depth(tool, 8.4, depth, r), np.array(edges), heights, bonded=base == "bonded")
+        )
+    coarse, fine = results
+    # an edge of pressure without bound, of a flat end, is what elements see least
+    assert fine.force == pytest.approx(coarse.force, rel=0.01)
+    assert solved.force_n(4e3) == pytest.approx(fine.force, rel=0.01 if tool == "flat" else 0.003)
+    assert fine.contact_radius == pytest.approx(a, rel=1e-9)
+    row = 3 * len(fine.z) // 4
+    beside = np.abs(fine.r - a) > 0.25 * a
+    strains = solved.strains(fine.r, fine.z[row])
     greatest = np.abs(strains.compressive).max()
-    squeezed = np.gradient(found.down, found.z, axis=1)[:, row]
+    squeezed = np.gradient(fine.down, fine.z, axis=1)[:, row]
     np.testing.assert_allclose(squeezed[beside], strains.compressive[beside], atol=0.03 * greatest)
-    hoop = found.outward[1:, row] / found.r[1:]
+    hoop = fine.outward[1:, row] / fine.r[1:]
     np.testing.assert_allclose(hoop[beside[1:]], strains.hoop[1:][beside[1:]], atol=0.03 * greatest)
-    np.testing.assert_allclose(strains.compressive, strains.radial + strains.hoop, atol=1e-12)
 
 
 def test_finger_on_thick_layer_is_a_dome_with_half_the_force():
@@ -131,24 +163,63 @@ def test_finger_on_thick_layer_is_a_dome_with_half_the_force():
     assert finger.force_n() == pytest.approx(dome.force_n() / 2, rel=0.01)
 
 
+@pytest.mark.parametrize("tool", ["dome", "ball", "flat", "finger"])
+def test_half_of_every_length_has_the_same_strains_at_half_the_distance(tool):
+    whole, half = solve_press(tool, 8.4, 4.0, 6.0), solve_press(tool, 4.2, 2.0, 3.0)
+    assert half.contact_radius_mm == pytest.approx(whole.contact_radius_mm / 2, rel=1e-9)
+    assert half.force_n() == pytest.approx(whole.force_n() / 4, rel=1e-9)
+    r = np.linspace(0, 20, 50)
+    np.testing.assert_allclose(half.strains(r / 2, 2.5, 0.1), whole.strains(r, 5.0, 0.2), atol=1e-9)
+
+
 @pytest.mark.parametrize(
     ("tool", "radius", "depth", "thickness"),
     [
+        ("dome", 1000, 0.09, 0.4),
         ("dome", 0.1, 99, 1000),
         ("ball", 1, 5, 6),  # deeper than its radius
+        ("flat", 0.1, 5, 1000),
         ("finger", 1000, 0.05, 0.1),
     ],
 )
-def test_extreme_presses_are_solved(tool, radius, depth, thickness):
-    solved = solve_press(tool, radius, depth, thickness, "slipping")
-    r = solved.contact_radius_mm * np.array([0, 0.3, 0.9, 1.1])
+@pytest.mark.parametrize("base", ["bonded", "slipping"])
+def test_extreme_presses_are_solved(tool, radius, depth, thickness, base):
+    solved = solve_press(tool, radius, depth, thickness, base)
+    a = solved.contact_radius_mm
+    r = a * np.array([0, 0.3, 0.9, 1.1])
+    assert 0 < a <= 2.001 * math.sqrt(radius * depth) or tool == "flat"
     assert solved.force_n() > 0
     assert np.isfinite(solved.strains(r, 0.5 * thickness)).all()
     face = solved.deflection(r)
     assert np.isfinite(face).all()
     if tool != "finger":
-        np.testing.assert_allclose(face[:3], tool_depth(tool, radius, depth, r[:3]), atol=0.05 * depth)
+        shape = tool_depth(tool, radius, depth, r[:3])
+        np.testing.assert_allclose(face[:3], shape, atol=0.05 * depth)
 
 
 def test_widest_contact_of_a_layer_is_solved():
     assert solve_press("flat", MAX_CONTACT, 0.1, 1.0).contact_radius_mm == MAX_CONTACT
+
+
+def test_strains_above_1_are_said_with_their_size(golden: Golden) -> None:
+    """The largest lies in the silicone below the fibres, for a flat end at the edge of the contact."""
+    for contact in (Contact(), Contact(tool="flat", depth_mm=1), Contact(model="profile"), Contact(radius=0.6)):
+        assert describe_large_strain(contact) == ""
+    bonded, flat = Contact(base="bonded"), Contact(tool="flat")
+    for contact, height_mm in ((bonded, 3.75), (flat, 5.75)):
+        golden(f"design/large_strain_{contact.tool}.txt", describe_large_strain(contact))
+        strains = contact_press(contact).strains(np.linspace(0, 20, 500), height_mm, FIBRE_BLUR_MM)
+        told = float(describe_large_strain(contact).partition("up to ")[2].partition(",")[0])
+        assert told == pytest.approx(strains.compressive.max(), abs=0.07)
+
+
+@pytest.mark.parametrize("base", ["bonded", "slipping"])
+def test_pads_of_any_great_thickness_weigh_fibres_alike(base):
+    def weigh(thickness: float) -> tuple[tuple[np.ndarray, ...], ...]:
+        contact = Contact(thickness_mm=thickness, base=base, tool_radius_mm=2, depth_mm=0.5)
+        return profile_weights(contact)
+
+    thick, thicker = weigh(100), weigh(1000)
+    for (distance, plain, directed), (other, *weights) in zip(thick, thicker, strict=True):
+        for weight, second in zip((plain, directed), weights, strict=True):
+            np.testing.assert_allclose(weight, np.interp(distance, other, second), atol=0.05 * plain.max())

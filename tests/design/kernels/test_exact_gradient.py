@@ -2,12 +2,14 @@
 
 import numpy as np
 import pytest
+from hypothesis import assume, given, settings
 
 from padforge.design import Contact, Morphology, signals
 from padforge.design.contact import fibre_axes
 from padforge.design.morphology import fibre_ends
 from padforge.design.settings import DEFAULT_PITCH_MM, PUBLISHED_CONTACT, Layout
 from padforge.design.signal_gradients import FibreCurves
+from tests.design.wild_pads import SEEDS, wild_contacts, wild_pads
 
 PROFILE = ((0.0, 1.0), (3.4, 0.9), (6.8, 0.5), (10.1, 0.15), (13.5, -0.04), (18.0, 0.0))
 CONTACTS = [
@@ -62,13 +64,34 @@ def test_signal_gradient_passes_the_taylor_test(contact):
 
 @pytest.mark.parametrize("contact", [CONTACTS[0], CONTACTS[-1]], ids=["polygon", "profile"])
 @pytest.mark.parametrize("counts", [(2, 3), (0, 2)])
-def test_signals_of_a_search_match_exact_ones_on_rectangles(contact, counts):
+def test_signals_and_gradients_match_exact_ones_on_rectangles(contact, counts):
     pad, rng = Morphology.random(Layout.create(counts, (5.0, 20.0)), 3, seed=1), np.random.default_rng(1)
     presses = rng.uniform(0, pad.layout.extent, (20, 2))
     travel, cross, ends, _ = fibre_axes(pad)
-    exact = signals(pad, presses, contact)
-    found = FibreCurves(travel[0], cross[0], ends, pad.unit_mm).signals(presses, contact)[0]
+
+    def moved(across):
+        return FibreCurves(travel[0], across, ends, pad.unit_mm)
+
+    across, exact = cross[0], signals(pad, presses, contact)
+    found = moved(across).signals(presses, contact)[0]
     np.testing.assert_allclose(found.T, exact, rtol=1e-3, atol=2e-3 * abs(exact).max())
+    upstream, move = rng.normal(size=exact.T.shape), rng.normal(size=across.shape)
+    move[:, [0, -1]] = 0
+    by_across = gradient_of(moved(across), presses, contact, upstream)[1]
+    ahead, behind = (
+        (upstream * moved(across + step * move).signals(presses, contact)[0]).sum() for step in (1e-6, -1e-6)
+    )
+    assert (by_across * move).sum() == pytest.approx((ahead - behind) / 2e-6, rel=2e-3, abs=2e-3)
+
+
+@given(wild_pads((1, 2), (1, 5)), wild_contacts, SEEDS)
+@settings(max_examples=20)
+def test_signal_gradients_on_wild_pads_are_finite(pad, contact, seed):
+    travel, cross, ends, _ = fibre_axes(pad)
+    assume(np.diff(travel).min() > 1e-6)
+    presses = np.random.default_rng(seed).uniform(0, pad.grid + 1, (3, 2))
+    fibres = FibreCurves(travel[0], cross[0], ends, pad.unit_mm)
+    assert np.isfinite(gradient_of(fibres, presses, contact, np.ones((len(pad.knots), 3)))).all()
 
 
 def test_gradient_at_grazing_fibres_is_limited():
@@ -82,3 +105,7 @@ def test_gradient_at_grazing_fibres_is_limited():
     ):
         by_across = gradient_of(straight_curves(2), np.array([[1.5, 1 - height]]), contact, first)[1]
         assert by_across[0].sum() == pytest.approx(expected, rel=1e-4)
+    grazing = np.array([[2.0, 2.0 - 0.6], [2.0, 2.0 - 0.6 + 1e-12]])
+    by_across = gradient_of(straight_curves(3), grazing, Contact(sides=None), np.ones((6, 2)))[1]
+    assert np.isfinite(by_across).all()
+    assert not by_across[[2, 3, 5]].any()

@@ -33,10 +33,11 @@ def test_readings_linear_in_the_position_are_located_by_their_noise():
     assert error == pytest.approx(noise * np.sqrt(np.pi / 2), rel=0.03)
 
 
-def test_posteriors_match_explicit_covariances():
+def test_posteriors_match_explicit_covariances(monkeypatch):
+    monkeypatch.setattr(module, "BLOCK", 4)  # so that the readings are of several blocks
     rng, scatter, working = np.random.default_rng(1), Scatter(0.1, 0.3, 0.4), np.array([True, False, True])
     responses = np.sin(PLACES @ rng.standard_normal((2, 3)))
-    readings = scatter.sample(responses[rng.integers(len(PLACES), size=3)], rng)
+    readings = scatter.sample(responses[rng.integers(len(PLACES), size=6)], rng)
     found = bayes_positions(readings, positions(responses, 0.01), scatter, working)
     x = responses[:, working]
     own = np.array([np.diag(0.1**2 + 0.3**2 * 0.6 * row**2 + 0.01) for row in x])
@@ -59,13 +60,21 @@ def test_positions_cover_the_pressed_area_once_and_no_keep_out():
     assert np.ptp(possible.log_prior[near]) == pytest.approx(0)
 
 
+def test_huge_pads_are_sampled():
+    size = PadSettings(grid=96)
+    pad = Morphology.straight(size.layout)
+    possible = possible_positions(pad, PUBLISHED_CONTACT, size, evaluation_windows(size.sensed)[0], 1.0)
+    assert len(possible.places) < module.MAX_FAR + 5000
+
+
 def test_expected_errors_grow_with_failures_and_scatter(monkeypatch):
-    monkeypatch.setattr(module, "PRESSES", 256)
-    size = PadSettings(horizontals=2, verticals=3, pitch_mm=6.0)
+    monkeypatch.setattr(module, "PRESSES", 1024)
+    size = PadSettings(horizontals=2, verticals=5, pitch_mm=6.0)
     pad = Morphology.straight(size.layout)
     quiet, loud = (expected_errors(pad, Contact(), SearchSettings(scatter=share), size) for share in (0.18, 0.4))
     assert quiet == sorted(quiet)
     assert np.all(np.array(loud) > quiet)
+    assert quiet == expected_errors(pad, Contact(), SearchSettings(scatter=0.18), size)
 
 
 @pytest.mark.parametrize("scatter", [Scatter(0.2), Scatter(0.02, 0.3, 0.5)])
