@@ -58,9 +58,9 @@ MAX_TIME_BUDGET_S = 1e9
 MIN_DEPTH_RANGE_MM = 0.2  # range of the central 90 % of depths, at or below which depth does not vary
 PRIOR_COUNT = 2  # weight of the expected error of a member in the calibration of its scale, in presses
 SCALE_SUBSETS = 6  # maximum sets of failed fibres of a size for the calibration of scales
-TRAINING_KEYS = "members", "hidden", "layers", "epochs"
+SIZE_KEYS = "members", "hidden", "layers"
 # Prior for the uncertainty: experience with localizers of other pads, simulated and published, with the defaults of
-# TRAINING_KEYS and 255 to 4000 training presses. It differs by 5 % between pads, and by less between splits.
+# SIZE_KEYS, trained out, and 255 to 4000 training presses. It differs by 5 % between pads, and by less between splits.
 DOUBLE_ERROR_PRESSES = 165.0  # with n training presses, new presses err 1 + this / n times as much as expected
 MEAN_RATIO = 0.67  # mean ratio of distance to expected radius, with that growth included
 FAILURE_RATIO_DECREASE = 0.15  # decrease of that ratio, relative, per share of failed fibres
@@ -250,8 +250,9 @@ def fit_model(
     positions_mm = data.positions_mm[calibration]
     measures = {name: values[calibration] for name, values in data.measures.items()}
     defaults = LocalizerSettings()
-    is_default = all(getattr(options, name) == getattr(defaults, name) for name in TRAINING_KEYS)
-    has_prior = is_default and is_ensemble and n_timed and not measures and trained_share >= TRAINED_OUT
+    is_default = all(getattr(options, name) == getattr(defaults, name) for name in SIZE_KEYS)
+    is_trained_out = trained_share * options.epochs >= TRAINED_OUT * defaults.epochs
+    has_prior = is_default and is_ensemble and n_timed and not measures and is_trained_out
     n_trained = len(train) if has_prior else None
     levels = _n_levels(options, model.fibres)
     return calibrate_uncertainty(model, moments, positions_mm, levels, measures, on_progress, n_trained)

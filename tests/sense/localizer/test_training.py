@@ -74,27 +74,36 @@ def test_fit_network_returns_the_average_of_the_last_weights() -> None:
     assert reports == sorted(reports)
     assert (len(reports), reports[-1]) == (training.REPORTS, training.REPORTS)
     assert fit(averaged=False) < 0.05
-    assert [training.one_cycle(share) for share in (0.0, 0.1, 0.2, 0.6, 1.0)] == pytest.approx([0, 0.5, 1, 0.5, 0])
+    assert [training.one_cycle(share) for share in (0.0, 0.05, 0.1, 0.55, 1.0)] == pytest.approx([0, 0.5, 1, 0.5, 0])
 
 
-def test_fit_network_takes_the_steps_of_adamw() -> None:
-    """Also for weights whose gradients come in another order in memory."""
+def test_fit_network_takes_the_steps_of_cautious_adamw() -> None:
+    """Also for weights whose gradients come in another order in memory, and for several of them."""
     goal, share = torch.arange(15.0).reshape(5, 3), torch.linspace(0, 1, 51)[1:].tolist()
 
     def loss(w: torch.Tensor) -> torch.Tensor:
         return torch.einsum("ij,jk->ik", w.mT, torch.eye(3)).sub(goal).square().mean()
 
-    w = torch.ones(3, 5, requires_grad=True)
-    fitted = training.fit_network({"w": w}, lambda: loss(w), 50, 0.1, weight_decay=0.1, averaged=False)
-    expected, (first, second) = np.ones((3, 5)), training.BETAS
-    mean, square = np.zeros((3, 5)), np.zeros((3, 5))
-    for step, each in enumerate(share, 1):  # Loshchilov and Hutter 2019, algorithm 2
-        rate, gradient = 0.1 * training.one_cycle(each), 2 * (expected - goal.numpy().T) / 15
-        mean = first * mean + (1 - first) * gradient
+    w, v = torch.ones(3, 5, requires_grad=True), torch.full((2,), 9.0, requires_grad=True)
+    parameters = {"w": w, "v": v}
+    fitted = training.fit_network(
+        parameters, lambda: loss(w) + v.square().sum(), 50, 0.1, weight_decay=0.1, averaged=False
+    )
+    expected, (first, second) = np.concatenate([np.ones(15), np.full(2, 9.0)]), training.BETAS
+    mean, square, resting = np.zeros(17), np.zeros(17), 0
+    for step, each in enumerate(share, 1):
+        rate = 0.1 * training.one_cycle(each)
+        gradient = np.concatenate([2 * (expected[:15] - goal.numpy().T.ravel()) / 15, 2 * expected[15:]])
+        mean = first * mean + (1 - first) * gradient  # Loshchilov and Hutter 2019, algorithm 2
         square = second * square + (1 - second) * gradient**2
+        moves = mean * gradient > 0  # Liang et al. 2024, algorithm 2
+        resting += (~moves).sum()
         expected -= rate * 0.1 * expected
-        expected -= rate * mean / (1 - first**step) / (np.sqrt(square / (1 - second**step)) + 1e-8)
-    np.testing.assert_allclose(fitted["w"], expected, rtol=1e-4)
+        change = mean / (1 - first**step) / (np.sqrt(square / (1 - second**step)) + 1e-8)
+        expected -= rate * change * moves / max(moves.mean(), 1e-3)
+    assert resting
+    np.testing.assert_allclose(fitted["w"], expected[:15].reshape(3, 5), rtol=1e-4)
+    np.testing.assert_allclose(fitted["v"], expected[15:], rtol=1e-4)
 
 
 @settings(max_examples=20)
