@@ -160,6 +160,16 @@ class RigSettings(Settings):
         return None if self.plan in PLANS else Path(self.plan)
 
     @property
+    def samples_per_reading(self) -> int:
+        """Number of the board's samples that are averaged to a reading, at about `rate_hz`."""
+        return max(1, round(self.board_rate_hz / self.rate_hz))
+
+    @property
+    def half_cycle_s(self) -> float:
+        """Time for which a press is held, and half of the time from press to press."""
+        return self.readings_per_press / 2 * self.samples_per_reading / self.board_rate_hz
+
+    @property
     def press_depths_mm(self) -> tuple[float, ...]:
         """Depths that presses take in turn; that of the default contact where no contact is known (`for_contact`)."""
         return self.depths_mm or (PRESS_DEPTH_MM if self.depth_mm is None else self.depth_mm,)

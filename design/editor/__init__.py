@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from padforge.common.files import check_replaceable, find_dependents, provenance
+from padforge.common.files import check_replaceable, find_dependents, provenance, sha256
 from padforge.common.validation import InputError, check_float, check_int, short_repr
 from padforge.design.morphology import MAX_COORDINATE, Array, Morphology
 from padforge.design.objectives.ambiguity import AMBIGUITY_NOISE, ambiguity_map, free_presses
@@ -57,8 +57,8 @@ class _EditHistory:
 class EditSession:
     """A pad being edited; thread-safe.
 
-    Its file `out` becomes the next free name if another program wrote to it after the session began, or other files
-    were made from the pad saved there.
+    Its file `out` becomes the next free name if another program wrote to it after the session began or last saved, or
+    other files were made from the pad saved there.
     """
 
     def __init__(
@@ -69,7 +69,7 @@ class EditSession:
         Raises:
             InputError: invalid settings, an unreadable pad, or other files were made from the pad at `out`.
         """
-        self.out, self._out_is_ours, self._force, self._publish = out, out.exists(), force, publish
+        self.out, self._force, self._publish = out, force, publish
         self._provenance = provenance("padforge design edit", None, [] if source is None else [source])
         pad = Morphology.straight(spec.section(PadSettings).layout) if source is None else Morphology.load(source)
         self._layout, self._pad_settings = pad.layout, spec.section(PadSettings, **pad.layout.settings)
@@ -77,6 +77,7 @@ class EditSession:
         self._max_failures = spec.section(SearchSettings).max_failures
         self._provenance["settings"] = {"pad": self._pad_settings.model_dump(mode="json")}
         check_replaceable(out, self._provenance, force=force)
+        self._known = sha256(out) if out.is_file() else ""  # digest of the file that a save may replace
         if source is None:
             share = np.linspace(0, 1, STRAIGHT_KNOTS + 2)[:, None]
             paths = tuple(line[0] + share * (line[-1] - line[0]) for line in pad.knots)
@@ -113,7 +114,12 @@ class EditSession:
         Returns:
             The new view; InputError for an invalid edit, which changes nothing.
         """
-        edit: dict[str, Any] = json.loads(body)
+        try:
+            edit = json.loads(body)
+        except ValueError:
+            edit = None
+        if not isinstance(edit, dict):
+            raise InputError(f"got {short_repr(body)} as an edit, expected a JSON object")
         with self._lock:
             history, gesture, kind = self._history, edit.get("gesture", ""), edit.get("do")
             if kind in ("undo", "redo"):
@@ -139,11 +145,13 @@ class EditSession:
     def save(self, body: bytes) -> Mapping[str, Any]:
         """Write the pad to `out`, atomically, and return the new view; `body` is ignored."""
         with self._lock:
-            replaces = self._out_is_ours and (self._force or not self.unsaved or not find_dependents(self.out))
-            if self.out.is_file() and not replaces:
-                self.out = free_name(self.out)
+            if self.out.is_file():
+                is_known = sha256(self.out) == self._known
+                if not is_known or not (self._force or not self.unsaved or not find_dependents(self.out)):
+                    self.out = free_name(self.out)
             self._to_morphology(self._provenance).save(self.out)
-            self._out_is_ours, self._saved, self._saved_message = True, self._history.paths, f"saved to {self.out}"
+            self._known, self._saved = sha256(self.out), self._history.paths
+            self._saved_message = f"saved to {self.out}"
             return self._update(0, 1)
 
     def _position(self, edit: Mapping[str, Any]) -> list[float]:

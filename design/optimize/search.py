@@ -396,7 +396,10 @@ def settings_for_twin(spec: "Spec", path: Path, pad: Morphology | None = None) -
 
 def _scatter_settings(twin: Twin, layout: Layout) -> dict[str, float]:
     """Return the scatter of a held press as keys of `[search]`, relative to the full scale of straight fibres."""
-    gains_v, noises_v = np.array([(abs(fibre.gain_v), fibre.noise_v) for fibre in twin.channels if fibre.gain_v]).T
+    channels = [(abs(fibre.gain_v), fibre.noise_v) for fibre in twin.channels if fibre.gain_v]
+    if not channels:
+        raise InputError("the twin has no channel that responds, so that its noise is unknown")
+    gains_v, noises_v = np.array(channels).T
     scale = straight_full_scale(layout, twin.contact(), "beyond")
     noise = float(np.clip(twin.scatter.floor * np.median(noises_v) / (np.median(gains_v) * scale), 1e-3, 10))
     return {"noise": noise, "scatter": twin.scatter.share, "scatter_common": twin.scatter.common}
@@ -437,9 +440,11 @@ def search_for_twin(
         return default
     twin = search(pad, contact, settings, rules, origin=origin, run=_part_options(run, "twin"))
     one_start = settings.model_copy(update={"starts": 1, "knots": max(settings.knots, default_settings.knots)})
-    refined = search(pad, contact, one_start, rules, origin=default.morphology, run=_part_options(run, "from default"))
+    results = {"default": default, "twin": twin}
+    if twin.stopped != "interrupted":
+        options = _part_options(run, "from default")
+        results["from default"] = search(pad, contact, one_start, rules, origin=default.morphology, run=options)
     problem = build_problem(pad, contact, settings, rules)
-    results = {"default": default, "twin": twin, "from default": refined}
     pads = {"default": default.morphology, "straight fibres": Morphology.straight(pad.layout)}
     pads |= {name: result.morphology for name, result in results.items()}
     buildable = {name: fibres for name, fibres in pads.items() if not problem.violations(fibres)}

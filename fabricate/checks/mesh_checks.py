@@ -296,7 +296,7 @@ def _find_narrowest(sections: Sequence[tuple[BaseGeometry, BaseGeometry | None]]
 
 def _check_wall_thickness(cast: Sequence[Slab], printer: PrinterSettings, size: float) -> Finding:
     """Check that the walls around the casting are two lines thick just below the rim, where they are thinnest."""
-    limit = _WALL_LINES * printer.nozzle_mm
+    limit = _WALL_LINES * printer.line_mm
     if not cast:
         return Finding("wall_thickness", "pass", size, limit, "it has no walls around a casting")
     rim = cast[-1]

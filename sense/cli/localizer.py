@@ -290,7 +290,6 @@ def recalibrate(
     """
     from padforge.common.files import atomic_files, check_replaceable, check_writable, write_json
     from padforge.design.morphology import Morphology
-    from padforge.sense.formats.import_export import open_recording
     from padforge.sense.health.fault_detector import HEALTH_FILES, FaultDetector, has_health
     from padforge.sense.localizer import recalibration
     from padforge.sense.localizer.model import LocalizerModel
@@ -299,7 +298,7 @@ def recalibrate(
     if out is None and target.resolve() == model.resolve():
         raise InputError(f"{target}: holds the old model; name a folder for the new one with --out")
     check_writable(target)
-    old, opened = LocalizerModel.load(model), open_recording(recording)
+    old, opened = LocalizerModel.load(model), read_recording(recording)
     detector = FaultDetector.load(model) if has_health(model) else None
     with common.progress_bar("recalibrating") as report:
         pad = None if morphology is None else Morphology.load(morphology)
@@ -342,7 +341,6 @@ def fibre_loss(
     worst set of each size, and without the fibres of --failed.
     """
     from padforge.common.files import check_writable
-    from padforge.sense.formats.import_export import open_recording
     from padforge.sense.localizer.model import LocalizerModel
     from padforge.sense.settings import LocalizerSettings
     from padforge.sense.studies.fibre_loss import draw_fibre_loss, fibre_loss_lines, fibre_loss_study
@@ -353,7 +351,7 @@ def fibre_loss(
     check_writable(target)
     localizer = LocalizerModel.load(model) if model else None
     settings = common.load_spec(options.pop("spec")).section(LocalizerSettings, seed=options.pop("seed"))
-    opened = open_recording(recording)
+    opened = read_recording(recording)
     options |= {"failed": fibre_indices(failed, opened.fibres)}
     with common.progress_bar("networks") as show:
         result = fibre_loss_study(opened, localizer, options=settings, on_progress=show, **options)
@@ -385,13 +383,12 @@ def learning_curve(recording: Path, seed: int | None, spec: Path | None, out: Pa
     Writes learning_curve.json and learning_curve.png.
     """
     from padforge.common.files import check_writable
-    from padforge.sense.formats.import_export import open_recording
     from padforge.sense.settings import LocalizerSettings
     from padforge.sense.studies import learning_curve as study
 
     target = out or common.pad_folder(recording)
     check_writable(target)
-    options, opened = common.load_spec(spec).section(LocalizerSettings, seed=seed), open_recording(recording)
+    options, opened = common.load_spec(spec).section(LocalizerSettings, seed=seed), read_recording(recording)
     with common.progress_bar("training") as show:
         result = study.learning_curve(opened, options, on_progress=show)
     _write_study(target / "learning_curve", result.to_dict(), partial(study.draw_learning_curve, result))

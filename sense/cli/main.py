@@ -152,7 +152,7 @@ def export(recording: Path, file: Path, kind: str | None, model: Path | None) ->
 
 
 def _annotate(model: Path, recording: "Recording") -> "ModelAnnotations":
-    """Return the predicted positions and faults; a faulty fibre is masked from the press of its detection on."""
+    """Return the predicted positions and faults; a faulty fibre is masked from its first bad press on."""
     import numpy as np
 
     from padforge.sense.formats.annotations import FaultAnnotation, ModelAnnotations

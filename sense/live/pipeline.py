@@ -220,6 +220,7 @@ class Live:
         self.faults: list[FibreFault] = []
         self._misfits: deque[Array] = deque(maxlen=MIN_PRESSES)  # of the latest presses, see `find_misfits`
         self.is_other_pad = False
+        self._unreported: list[FibreFault] = []  # detected while the pad was taken for another one
 
     @property
     def pressed(self) -> bool:
@@ -394,13 +395,14 @@ class Live:
         return [OtherPad(press.number)] * (self.is_other_pad and not was_other_pad)
 
     def _check_fibres(self, press: BufferedPress, end: int) -> list[FibreFault]:
-        """Return the faults detected in a complete press; none for another pad."""
+        """Return the faults detected up to a complete press, once; none while the pad is taken for another one."""
         if self._monitor is None:
             return []
         readings, down_command, up_command, previous_end = press.excerpt(self._buffer, end)
         first = max(down_command + REST[0], previous_end)
-        faults = self._monitor.update(readings[first:], down_command - first, up_command - first)
+        self._unreported += self._monitor.update(readings[first:], down_command - first, up_command - first)
         if self.is_other_pad:
             return []
+        faults, self._unreported = self._unreported, []
         self.faults += faults
         return faults

@@ -112,16 +112,16 @@ def cast_thickness_mm(folder: Path) -> float | None:
 def locate_on_bed(rig: RigSettings, folder: Path) -> RigSettings:
     """Return settings completed with the pose of the pad on a printer's bed, and the workspace above it.
 
-    The pose is that of the holder in `folder`. In x and y the workspace is the pad, as far as the nozzle reaches; in z
-    it ends `max_depth_mm` below the pad's surface, or at the top of the holder's walls if that is higher. Values of
-    `[rig]` take precedence; missing values raise RigFault("refused").
+    The pose is that of the holder in `folder`, turned by `pad_angle_deg`. In x and y the workspace is the pad, as far
+    as the nozzle reaches; in z it ends `max_depth_mm` below the pad's surface, or at the top of the holder's walls if
+    that is higher. Values of `[rig]` take precedence; missing values raise RigFault("refused").
     """
     check_probe(rig)
-    if None not in (rig.pad_mm, rig.contact_mm, rig.box_mm):
-        return rig
     path = folder / FABRICATION_FILE
     stored = read_json(path, FABRICATION_FORMAT).get("frame") if path.is_file() else None
     if not isinstance(stored, Mapping):
+        if None not in (rig.pad_mm, rig.contact_mm, rig.box_mm):
+            return rig
         reason = f"{path} is of a pad without a holder" if path.is_file() else f"there is no {path}"
         message = f"[rig] pad_mm, contact_mm or box_mm is unknown, and {reason}"
         raise RigFault("refused", message, "measure them, or make the pad's holder: [mould] holder = true")

@@ -124,9 +124,8 @@ class PressLoop:
     ) -> None:
         self._arm, self._board, self._recorder, self._rig, self._dry = arm, board, recorder, rig, dry
         self._frame, self._limits = RobotFrame.from_settings(rig), Limits.from_settings(rig)
-        ratio = max(1, round(rig.board_rate_hz / rig.rate_hz))
-        self._half_s = rig.readings_per_press / 2 * ratio / rig.board_rate_hz  # half the cycle of a press
-        self._averager = Averager(ratio, recorder.fibres)
+        self._half_s = rig.half_cycle_s
+        self._averager = Averager(rig.samples_per_reading, recorder.fibres)
         self._recent: deque[float] = deque(maxlen=4096)  # times of the latest readings
         self._disk, self._n_readings = DiskThread(), recorder.n_readings
         self._interrupts = Interrupts()

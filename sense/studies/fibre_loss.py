@@ -151,7 +151,7 @@ def _retrain(
     on_progress: OnProgress,
 ) -> dict[Failed, Localization]:
     """Predict the test presses by a network of each set of failed fibres."""
-    options = options.model_copy(update={"method": "published", "features": "published"})
+    options = options.model_copy(update={"method": "published"})
     tasks = [Task("", partial(train_without, failed, recording, training, test, options)) for failed in subsets]
     states: list[Any] = compute_states(tasks, on_progress)
     return {failed: Localization(**state) for failed, state in zip(subsets, states, strict=True)}

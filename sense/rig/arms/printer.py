@@ -336,7 +336,7 @@ class Printer:
         depth_mm = rig.clearance_mm + max(rig.press_depths_mm)
         down = StraightMove((0, 0, depth_mm), (0, 0, 0), rig.press_mm_s, rig.acceleration_mm_s2)
         down_s = down.limit_axes(max_mm_s, max_mm_s2).duration_s
-        if down_s >= (half_s := rig.readings_per_press / 2 / rig.rate_hz):
+        if down_s >= (half_s := rig.half_cycle_s):
             raise RigFault(
                 "refused",
                 f"the printer's way down of {depth_mm:g} mm takes {down_s:.1f} s, allowed is less than {half_s:.2g} s,"

@@ -110,6 +110,7 @@ class CsvBoard(SerialBoard):
             raise RigFault("refused", message, f"set board_rate_hz = {rate_hz:.3g}")
         self._clock = SampleClock(1 / rate_hz, _RATE_TOLERANCE)
         self._n_lines = self._last = 0
+        self._lines: list[list[float]] = []  # received since the last line of samples
         self._reader = BlockReader(self._port, lambda: self._receive_blocks(stream), rate_hz)
         self._reader.start_settled()
         level_v = float(np.median(np.abs(table[:, self._columns]))) * self._count_v
@@ -132,8 +133,11 @@ class CsvBoard(SerialBoard):
 
     def _receive_blocks(self, stream: SerialStream) -> tuple[float, list[list[list[float]]]]:
         now_s, data = stream.receive()
-        lines = self._decode(data)
-        return now_s, [lines] if any(len(numbers) == self._width for numbers in lines) else []
+        self._lines += self._decode(data)
+        if not any(len(numbers) == self._width for numbers in self._lines):  # damaged ones count with the next sample
+            return now_s, []
+        block, self._lines = self._lines, []
+        return now_s, [block]
 
 
 def _measure_rate(arrivals_s: Array) -> float:

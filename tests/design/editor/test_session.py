@@ -60,7 +60,17 @@ def test_gestures_are_undone_together(tmp_path):
 
 MOVE = b'{"do": "move", "fibre": 1, "knot": 1, "x_mm": %s, "y_mm": 0, "gesture": %s}'
 INVALID = (
-    *(b"{}", b'{"do": "shell"}', b'{"do": ["move"]}', b'{"do": "move"}', b'{"do": "remove", "fibre": 1}'),
+    *(
+        b"[1]",
+        b"3",
+        b"{",
+        b"\xff",
+        b"{}",
+        b'{"do": "shell"}',
+        b'{"do": ["move"]}',
+        b'{"do": "move"}',
+        b'{"do": "remove", "fibre": 1}',
+    ),
     *(b'{"do": "remove", "fibre": 1, "knot": %d}' % knot for knot in (0, 6)),
     *(b'{"do": "add", "fibre": %s}' % fibre for fibre in (b"0", b"5", b"1.5")),
     *(MOVE % (x, b'""') for x in (b"NaN", b"1e7", b'"0"')),
@@ -76,6 +86,21 @@ def test_save_does_not_replace_file_of_other_session(tmp_path):
     assert [editor.out.name for editor in (first, second)] == ["out.json", "out-2.json"]
     pads = [Morphology.load(editor.out) for editor in (first, second)]
     assert [pad.to_mm(pad.knots[0])[1, 1] for pad in pads] == pytest.approx([3.0, 2.0])
+
+
+def test_save_does_not_replace_what_another_program_wrote_since(tmp_path):
+    """Into the file that lay there from the beginning, and into the one saved last."""
+    Morphology.straight(1).save(tmp_path / "out.json")
+    editor, _ = session(tmp_path, grid=1)
+    for number, name in ((1, "out-2.json"), (2, "out-2-2.json")):
+        foreign = Morphology.random(1, 3, number)
+        foreign.save(editor.out)
+        other = editor.out
+        move(editor, 1, 1, 0.0, float(number))
+        editor.save(b"{}")
+        assert (editor.out.name, Morphology.load(other)) == (name, foreign)
+        editor.save(b"{}")
+        assert editor.out.name == name
 
 
 def test_save_does_not_replace_pad_with_mould(tmp_path):

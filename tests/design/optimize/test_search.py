@@ -3,6 +3,7 @@
 import pickle
 import re
 from concurrent.futures import Executor, Future
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -199,6 +200,18 @@ def test_choose_takes_no_pad_that_is_worse_than_plain_ones(twin, expected):
 def test_choose_takes_the_least_bad_where_each_is_worse_somewhere():
     errors = {"default": np.array([2.0, 1.0]), "straight fibres": np.array([1.0, 2.0]), "twin": np.array([1.3, 1.3])}
     assert choose(errors) == "twin"
+
+
+def test_search_for_twin_begins_no_search_after_an_interrupt(monkeypatch):
+    found, searches = search(PadSettings(grid=1), None, QUICK, RulesSettings()), []
+
+    def interrupted(*asked, run, **others):
+        searches.append(run)
+        return replace(found, stopped="interrupted" if len(searches) == 2 else "")
+
+    monkeypatch.setattr("padforge.design.optimize.search.search", interrupted)
+    result = search_for_twin(PadSettings(grid=1), Contact(), QUICK, RulesSettings(), QUICK)
+    assert (len(searches), result.stopped) == (2, "interrupted")
 
 
 @pytest.mark.parametrize(

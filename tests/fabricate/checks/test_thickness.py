@@ -113,6 +113,14 @@ class TestWidth:
         assert all(SIZE / 2 < x < SIZE / 2 + wall for x, _ in findings["wall_thickness"].positions_mm)
         assert bool(findings["wall_thickness"].positions_mm) == (status != "pass")
 
+    @pytest.mark.parametrize(("wall", "status"), [(0.3, "fail"), (0.6, "warn"), (0.9, "pass")])
+    def test_wall_thickness_of_a_resin_printer(self, wall, status):
+        """Lines of two pixels of 0.2 mm."""
+        cut = Manifold.cube((5, 40, 20), True).translate((SIZE / 2 + wall + 2.5, 0, 5))
+        printer = PrinterSettings(nozzle_mm=0.2, resin=True)
+        finding = check_body(tray(*CROSS, draft_deg=0) - cut, printer=printer)["wall_thickness"]
+        assert (finding.status, finding.limit) == (status, 0.8)
+
     def test_wall_thickness_of_a_leaning_wall(self):
         """A wall 0.5 mm thick at the rim, and thicker by half a millimetre a millimetre below it."""
         side, top, over = 20.0, FLOOR + DEPTH, 1.0

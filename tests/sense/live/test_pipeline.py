@@ -4,6 +4,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import cache
 from itertools import product
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -51,6 +52,8 @@ class ScriptedDetector:
 
 class ScriptedMonitor:
     """A fault monitor that stores its input, and detects that fibre 1 does not respond at press 5."""
+
+    model = SimpleNamespace(dead=())
 
     def __init__(self) -> None:
         self.updates: list[tuple[np.ndarray, int, int]] = []
@@ -300,6 +303,20 @@ def test_view_follows_the_pad(recording, hasty, monkeypatch) -> None:
     (press,) = live.view()["presses"]
     assert press["moment_text"] == f"{press['since_s']:.2f} s after the lift"
     assert press["text"].endswith(f" mm at 90 % ({press['moment_text']})")
+
+
+def test_faults_wait_while_the_pad_is_taken_for_another(recording, hasty, monkeypatch) -> None:
+    """They are reported once with the next press of this pad, from which their fibre is masked."""
+    part, monitor, verdicts = first_presses(recording, 9), ScriptedMonitor(), iter([0, 0, 0, 0, 1, 1, 1, 0, 0])
+    monkeypatch.setattr("padforge.sense.live.pipeline.FaultMonitor", lambda model: monitor)
+    monkeypatch.setattr("padforge.sense.live.pipeline.is_other_pad", lambda *asked: bool(next(verdicts)))
+    monkeypatch.setattr("padforge.sense.live.pipeline.PressDetector", ScriptedDetector(part))
+    live = Live(hasty, rate_hz=part.rate_hz, health=hasty)
+    events = live.feed(part.times_s, part.readings)
+    (fault,) = (index for index, event in enumerate(events) if isinstance(event, FibreFault))
+    before = events[fault - 1]
+    assert isinstance(before, Estimate)
+    assert (before.press, before.final, len(live.faults)) == (7, True, 1)
 
 
 def test_view_has_presses_with_their_words_and_faults(recording, hasty, golden: Golden, monkeypatch) -> None:

@@ -108,6 +108,16 @@ def test_locate_on_bed_prefers_what_rig_sets(folder, with_frame):
     assert locate_on_bed(PRINTER, with_frame(mirrored=False)).mirrored is False
 
 
+def test_locate_on_bed_takes_the_side_and_the_angle_of_a_holder_that_stands_elsewhere(with_frame, tmp_path):
+    """Also where all else is stated; without a holder, what is stated is the pose."""
+    stated = {"pad_mm": (50.0, 60.0), "contact_mm": 9.0, "box_mm": (0.0, 100.0, 0.0, 100.0, 5.0, 50.0)}
+    rig = PRINTER.model_copy(update=stated | {"pad_angle_deg": 5.0})
+    assert locate_on_bed(rig, tmp_path / "none") is rig
+    located = locate_on_bed(rig, with_frame(angle_deg=90.0))
+    assert (located.mirrored, located.pad_angle_deg) == (True, 95.0)
+    assert {name: getattr(located, name) for name in stated} == stated
+
+
 @pytest.mark.parametrize(("position", "depth"), [((0.0, 0.0), 5.1), ((17.0, 0.0), 5.0), ((0.0, -17.0), 1.0)])
 def test_locate_on_bed_keeps_the_tip_off_the_holder_and_the_bed(folder, position, depth):
     with pytest.raises(RigFault, match="no move"):

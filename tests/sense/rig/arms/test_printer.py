@@ -181,6 +181,11 @@ def test_move_that_was_given_up_is_never_made(asked_s: float):
     [
         ({"position": (0.0, 0.0, 0.0)}, {}, "has not been homed"),
         ({"max_mm_s": (500.0, 500.0, 3.0)}, {}, r"way down of 5 mm takes 1\.7 s, allowed is less than 1\.5 s"),
+        (  # 13.3 readings a second of a board of 18 samples are 18
+            {"max_mm_s": (500.0, 500.0, 4.0)},
+            {"board_rate_hz": 18.0},
+            r"takes 1\.3 s, allowed is less than 1\.1 s",
+        ),
         (
             {"max_mm_s": (500.0, 500.0, 3.0)},
             {"clearance_mm": 1.0, "depths_mm": (1.0, 4.0)},  # the deepest press counts

@@ -5,6 +5,7 @@ import threading
 import tty
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import Any
 
 import numpy as np
 import pytest
@@ -78,6 +79,26 @@ def test_csv_board_finds_columns_and_rate(monkeypatch: pytest.MonkeyPatch) -> No
                 CsvBoard(port, 115200, 50).connect()
         finally:
             board.close()
+
+
+class Port:
+    """A port at which texts arrive one by one, and then nothing."""
+
+    def __init__(self, *texts: bytes) -> None:
+        self._texts = list(texts)
+
+    def receive(self) -> tuple[float, bytes]:
+        return clock.now(), self._texts.pop(0) if self._texts else b""
+
+
+def test_csv_board_counts_damaged_lines_that_arrive_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    board = CsvBoard("port", 115200, RATE_HZ)
+    monkeypatch.setattr(board, "_tail", b"", raising=False)
+    monkeypatch.setattr(board, "_lines", [], raising=False)
+    monkeypatch.setattr(board, "_width", 2, raising=False)
+    port: Any = Port(b"1,2\n", b"1,\n", b"3", b",2\n1;x\n5,6\n", b"7,8\n")
+    blocks = [board._receive_blocks(port)[1] for _ in range(5)]  # noqa: SLF001
+    assert blocks == [[[[1, 2]]], [], [], [[[1], [3, 2], [], [5, 6]]], [[[7, 8]]]]
 
 
 def test_line_board_shows_a_line_without_header(monkeypatch: pytest.MonkeyPatch) -> None:
