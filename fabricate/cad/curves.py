@@ -180,7 +180,7 @@ def fit_spline(points: Array, tangents: Sequence[Array], fit_mm: float) -> BSpli
     def fit(knots: Array, rows: NDArray[np.intp] | slice) -> tuple[BSpline, NDArray[np.bool_]]:
         """Fit a spline to some samples; return it, and which of all samples are within the tolerance."""
         padded = np.concatenate([[knots[0]] * 3, knots, [knots[-1]] * 3])
-        basis = BSpline.design_matrix(s, padded, 3).toarray()
+        basis = BSpline.construct_fast(padded, np.eye(len(padded) - 4), 3)(s)
         poles = _fit_poles(knots, basis[rows], samples[rows], tangents)
         error = basis @ poles - samples
         across = np.abs((error * normals).sum(axis=1))
