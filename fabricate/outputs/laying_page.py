@@ -23,6 +23,7 @@ SURPLUS_PERCENT = 10  # silicone that stays in the cup and on the stick
 WASTE_PERCENT = 20  # fibre that breaks or is cut too short
 PRINT_MM_S = 50.0  # mean speed along lines of filament, a rule of thumb
 RESIN_LAYER_S = 12.0  # time for a layer of resin, a rule of thumb
+STIR_MIN, DEGAS_MIN = 3.0, 3.0  # as the makers of silicones advise
 LAY_MIN_PER_M = 60.0  # time to lay and seal a metre of fibre by hand, an estimate
 LAY_MIN_PER_CROSSING = 2.0  # additional time for every crossing, an estimate
 PRINT_SETTINGS_HEAD = ("PrusaSlicer", "OrcaSlicer, Bambu Studio", "Cura", "because")
@@ -364,8 +365,14 @@ def _cast_lines(document: Document) -> Iterator[str]:
     elif mould["lid"]:
         pour += " Lay the lid on: air and surplus leave by its vents."
     around = " and around every pillar" if document["settings"]["pad"]["keep_out_mm"] else ""
-    yield f"1. Stir part A and part B together. The pot life is {pot_life}: finish pouring within it."
-    yield "2. Degas the mix in a vacuum until its bubbles have burst."
+    yield (
+        f"1. Stir part A and part B together for {STIR_MIN:g} minutes, with the sides of the cup. The pot life is"
+        f" {pot_life}: finish pouring within it."
+    )
+    yield (
+        "2. Degas the mix in a vacuum until it has risen, to three or four times its height, and fallen again:"
+        f" {DEGAS_MIN:g} minutes or so."
+    )
     yield f"3. {pour}"
     yield f"4. Leave it for {cure} at room temperature."
     yield f"5. Free the casting all along the walls{around}, then pull it out from a corner."
@@ -402,11 +409,16 @@ def _lay_lines(document: Document) -> Iterator[str]:
     yield f"1. Turn the casting over, as drawn above: the tracks lie on top.{legible}"
     yield (
         "2. Cut the fibres and lay them in steps, the deepest first. Press each down to the bottom of its track, with"
-        f" {mould['lead_mm']:g} mm out at both ends.{handling}"
+        f" {mould['lead_mm']:g} mm out at both ends.{handling} Measure its resistance: one that is broken is laid again"
+        " now."
     )
     yield (
         f"3. After each step, fill the tracks over the fibres with {adhesive['name']}. Keep the tracks that cross above"
         " clear. Let it cure before the next step."
+    )
+    yield (
+        "4. Measure the resistance of every fibre again, write it down, and measure between all fibres: no two may be in"
+        " contact. Then crimp a wire to each end, and pull gently: the resistance must not change."
     )
     yield ""
     rows = []
