@@ -27,6 +27,11 @@ def test_lines_may_differ_in_the_last_decimal_alone(now: str, same: bool) -> Non
     assert (settle([now], KEPT[:1], 1e-6) == KEPT[:1]) is same
 
 
+def test_numbers_of_few_digits_must_be_the_same() -> None:
+    assert settle(["0.2 mm of 6.2"], ["0.1 mm of 6.2"], 1e-6) == ["0.2 mm of 6.2"]
+    assert settle(["0.1 mm of 6.2"], ["0.1 mm of 6.1"], 1e-6) == ["0.1 mm of 6.1"]
+
+
 @given(st.floats(-2e-6, 2e-6))
 def test_long_numbers_may_differ_by_a_share(difference: float) -> None:
     now = f"share {0.5012345678 * (1 + difference):.10f}"

@@ -23,6 +23,7 @@ FOLDER = Path(__file__).parents[1] / "golden"
 NUMBER = re.compile(r"(?<![\w.])[-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?(?![\w.]*\d)", re.IGNORECASE)
 DIGEST = re.compile(r"\b[0-9a-f]{64}\b")
 TIME = re.compile(r"\b\d{4}-\d\d-\d\d[T ]\d\d:\d\d:\d\d(?:\.\d+)?(?:Z|[+-]\d\d:\d\d)?")
+ROUNDING = 0.02  # relative difference that rounding may make: 0.1 is not 0.2
 MANY_DIGITS = 8  # from here on the last digits are those of a processor
 
 
@@ -40,8 +41,8 @@ class Golden:
     def __call__(self, name: str, output: Any, *, forget: Iterable[str] = (), rtol: float = 1e-6) -> None:
         """Compare an output with the one that is kept.
 
-        Words must be the same. Numbers may differ by one in the last decimal that is printed, or by `rtol`; whole
-        numbers by `rtol` alone. Digests, times of the day and the test's folder are left out.
+        Words must be the same. Numbers may differ by one in the last decimal that is printed, if that is at most
+        `ROUNDING` of them, or by `rtol`; whole numbers by `rtol` alone. Digests, times of the day and the test's folder are left out.
 
         Args:
             name: of the file in `tests/golden`, as "design/score.txt".
@@ -94,7 +95,7 @@ def _same_number(a: str, b: str, rtol: float) -> bool:
         return difference <= max(rtol * largest, 1e-12)
     exponent = int(re.split("[eE]", a)[1]) if "e" in a.lower() else 0
     last = 1.001 * 10.0 ** (exponent - decimals[0]) if decimals[0] else 0.0
-    return decimals[0] == decimals[1] and difference <= max(rtol * largest, last)
+    return decimals[0] == decimals[1] and difference <= max(rtol * largest, min(last, ROUNDING * largest))
 
 
 def _plain(value: Any) -> Any:
