@@ -175,9 +175,9 @@ a network would learn their differences late."""
 COMMON_DIRECTIONS = 16  # directions that are scaled down at most, those in which inputs vary most
 COMMON_BATCHES = 16  # batches on which these directions are fitted
 INPUT_NOISE = 0.02  # standard deviation of noise on scaled features, which are about 1
-AUGMENTATION = 2.2
-"""Standard deviation of augmented positions, in distances between neighbouring presses: 2 mm with 3000 presses on a pad
-of 45 mm, and 7 mm with 240, between which there is more to interpolate."""
+AUGMENTATION = 1.6
+"""Standard deviation of augmented positions, in distances between neighbouring presses: 1.3 mm with 3000 presses on a
+pad of 45 mm, and 5 mm with 240, between which there is more to interpolate."""
 POSITION_AUGMENTATION = 0.26  # the same where depths vary, scaled, for a press of the middle depth
 DEPTH_AUGMENTATION = 0.3  # standard deviation of augmented depths, scaled, for a press of the middle depth
 MIN_BATCHES = 9  # minimum steps of an epoch
