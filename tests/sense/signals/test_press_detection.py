@@ -292,7 +292,7 @@ def test_detect_presses_of_scenes_is_reproducible(seed: tuple[int, float, int]) 
     assert (len(touched), int(touched.sum()), int(released.sum())) == SCENES[seed]
 
 
-def test_align_to_detected_moves_presses_by_a_few_readings(recording: Recording) -> None:
+def test_align_to_detected_moves_presses_by_a_few_readings_and_keeps_those_not_detected(recording: Recording) -> None:
     commanded = recording.down_command, recording.up_command
     down_command, up_command = align_to_detected(recording.readings, recording.times_s, *commanded)
     for aligned, command in zip((down_command, up_command), commanded, strict=True):
@@ -301,8 +301,6 @@ def test_align_to_detected_moves_presses_by_a_few_readings(recording: Recording)
     assert (up_command > down_command).all()
     assert (down_command[1:] >= up_command[:-1]).all()
 
-
-def test_align_to_detected_keeps_presses_that_are_not_detected(recording: Recording) -> None:
     def align(first: int, last: int) -> tuple[np.ndarray, np.ndarray]:
         readings = recording.readings.copy()
         readings[first:last] = readings[first - 1]
