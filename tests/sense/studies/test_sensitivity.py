@@ -46,7 +46,6 @@ def test_tools_and_depths_are_half_and_one_and_a_half_times_those_of_the_contact
         sensitivity_study(PADS, contact=Contact(model="profile"))
 
 
-@pytest.mark.slow
 def test_study_finds_that_larger_objects_are_localized_better(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for name, value in (("SIDE", 16), ("TEST", 200), ("HIDDEN", 12)):
         monkeypatch.setattr(sensitivity, name, value)
