@@ -13,6 +13,8 @@ from padforge.sense.twin.identification import Identification
 from padforge.sense.twin.wiring import Wiring, images
 from tests.sense.conftest import few_candidates, identify_simulated
 
+from .conftest import few_compared
+
 
 @pytest.fixture
 def result(identification: Identification) -> Identification:
@@ -88,6 +90,7 @@ def test_a_second_wiring_is_told_of_unless_it_plans_each_fibre_where_it_was(resu
 
 @pytest.mark.slow
 @few_candidates()
+@few_compared()
 def test_another_pad_is_doubted_and_the_recorded_one_is_not() -> None:
     rig = RigSettings(presses=160, seed=1)
     built = Morphology.random(2, knots=3, seed=1)
@@ -99,6 +102,7 @@ def test_another_pad_is_doubted_and_the_recorded_one_is_not() -> None:
 
 @pytest.mark.slow
 @few_candidates()
+@few_compared()
 def test_a_pad_of_straight_fibres_is_not_doubted() -> None:
     pad = Morphology.straight(3)
     result = identify_simulated(pad, pad, RigSettings(presses=160, seed=7))
@@ -108,6 +112,7 @@ def test_a_pad_of_straight_fibres_is_not_doubted() -> None:
 
 @pytest.mark.slow
 @few_candidates()
+@few_compared()
 def test_a_fibre_moved_by_a_pitch_is_doubted() -> None:
     told = Morphology.random(2, knots=3, seed=1)
     result = identify_simulated(moved(told, 2, 1.0), told, RigSettings(presses=160, seed=60))

@@ -1,8 +1,6 @@
 """Identification of pads whose truth is known, and recordings that do not suffice."""
 
 from dataclasses import replace
-from functools import partial
-from unittest.mock import patch
 
 import numpy as np
 import pytest
@@ -19,21 +17,16 @@ from padforge.sense import identify
 from padforge.sense.recording.recording import Recording
 from padforge.sense.settings import RigSettings
 from padforge.sense.simulation.simulated_recording import simulate
-from padforge.sense.twin import identification
 from padforge.sense.twin.identification import Identification, identify_pad
 from tests.helpers.rigs import ideal_rig
 from tests.sense.conftest import few_candidates
 
-from .conftest import PLAN
+from .conftest import PLAN, few_compared
 
 
 @pytest.fixture(scope="module")
 def recording(printed: Twin) -> Recording:
     return simulate(printed, ideal_rig(presses=300, seed=3))
-
-
-few_compared = partial(patch.multiple, identification, N_COMPARED=120, N_CONTACT=24)
-"""Candidates are compared by fewer presses, and the contact, which is measured elsewhere, fitted to few."""
 
 
 @pytest.fixture(scope="module")
@@ -92,13 +85,14 @@ def test_identify_measures_the_contact_of_a_pad_that_lies_as_planned() -> None:
 
 
 @pytest.mark.slow
-@patch.object(identification, "N_CONTACT", 24)
+@few_compared()
 def test_identify_recovers_the_printed_pad_among_all_candidates(recording: Recording, printed: Twin) -> None:
     assert_recovered(identify_pad(recording, PLAN, seed=1), printed)
 
 
 @pytest.mark.slow
 @few_candidates()
+@few_compared()
 def test_identify_reports_alternatives_of_a_symmetric_pad_and_is_reproducible_without_a_layer() -> None:
     pad = Morphology.straight(2)
     printed = printed_pad(pad, np.random.default_rng(0), lateral_offset_mm=0.2, n_dead=0)
