@@ -63,21 +63,18 @@ def test_other_gains_are_detected(model: HealthModel, localizer: LocalizerModel,
     assert detect(localizer, model, changed(later, list(range(6)), gain)) == [("gain", tuple(range(6)))]
 
 
-def test_same_pad_later_has_no_shift(model: HealthModel, localizer: LocalizerModel, later: Recording) -> None:
+def test_same_pad_later_and_gains_of_few_presses_have_no_shift(
+    model: HealthModel, localizer: LocalizerModel, pad: Recording, later: Recording
+) -> None:
+    few = part_of(pad, TRAINED, TRAINED + MIN_PRESSES - 1, int(pad.down_command[TRAINED + MIN_PRESSES - 1]))
+    assert detect(localizer, model, changed(few, list(range(6)), 0.5)) == []
     assert detect(localizer, model, later) == []
     gappy = np.array(later.readings)
     gappy[:2000, 3] = gappy[1000:1100] = np.nan
     assert detect(localizer, model, replace(later, readings=gappy)) == []
 
 
-def test_gains_of_few_presses_are_no_shift(model: HealthModel, localizer: LocalizerModel, pad: Recording) -> None:
-    few = part_of(pad, TRAINED, TRAINED + MIN_PRESSES - 1, int(pad.down_command[TRAINED + MIN_PRESSES - 1]))
-    assert detect(localizer, model, changed(few, list(range(6)), 0.5)) == []
-
-
-def test_included_rests_are_usual(
-    model: HealthModel, localizer: LocalizerModel, later: Recording, tmp_path: Path
-) -> None:
+def test_included_rests_are_usual(model: HealthModel, localizer: LocalizerModel, later: Recording) -> None:
     detector = FaultDetector()
     detector.model_ = detector.live_model_ = model
     recording = changed(later, [1], offset_v=0.33)

@@ -7,14 +7,7 @@ import numpy as np
 import pytest
 
 from padforge.common.validation import InputError
-from padforge.sense import (
-    FaultDetector,
-    FaultMonitor,
-    FibreFault,
-    HealthModel,
-    Recording,
-    open_recording,
-)
+from padforge.sense import FaultDetector, FaultMonitor, FibreFault, HealthModel, Recording, open_recording
 from padforge.sense.health import fault_detector
 from padforge.sense.health.domain_shift import DomainShift
 from padforge.sense.health.fault_detector import TEXTS, fault_lines, mask_faults
@@ -69,12 +62,8 @@ def test_most_fibres_at_fault_are_a_misfit_and_not_masked(pad: Recording, model:
     assert {fault.kind for fault in faults} - {"stuck", "open"} == {"misfit"}
     assert not mask_faults(faults, PRESSES - TRAINED, 6)[-1, 3]
     assert mask_faults(faults, PRESSES - TRAINED, 6)[:, bad].all()
-
-
-def test_monitor_masks_none_of_a_misfit(pad: Recording, model: HealthModel) -> None:
+    readings[:, 3] = pad.readings[:, 3]
     monitor, kinds, most = FaultMonitor(model), list[str](), 0
-    readings = pad.readings.copy()
-    readings[:, [0, 1, 2, 4]] = 3.3 - readings[:, [0, 1, 2, 4]]
     for press in range(TRAINED, TRAINED + 60):
         first = pad.down_command[press] - 10
         part = readings[first : pad.down_command[press + 1]]
@@ -95,13 +84,10 @@ def test_constant_beyond_the_rests_is_open(pad: Recording, model: HealthModel, d
 
 
 def test_healthy_pad_gives_no_alarm(pad: Recording, model: HealthModel) -> None:
+    """Also if its last release is not recorded, or some readings of it."""
     assert detect_later(model, pad.readings, pad) == []
-
-
-@pytest.mark.parametrize("after", [0, 3])
-def test_unrecorded_last_release_gives_no_alarm(pad: Recording, model: HealthModel, after: int) -> None:
-    """A simulated recording ends when the probe is sent up; others some readings later."""
-    assert detect(model, part_of(pad, TRAINED, TRAINED + 30, int(pad.up_command[TRAINED + 29]) + after)) == []
+    for after in (0, 3):
+        assert detect(model, part_of(pad, TRAINED, TRAINED + 30, int(pad.up_command[TRAINED + 29]) + after)) == []
 
 
 def test_monitor_detects_the_same_press_by_press(pad: Recording, model: HealthModel) -> None:
@@ -186,7 +172,7 @@ def test_published_recording_with_and_without_planted_faults(published: Path) ->
         assert 20 <= first.press <= 20 + within
 
 
-def test_dead_channels_are_ignored(pad: Recording) -> None:
+def test_dead_channels_are_ignored_and_few_presses_never_detect_a_reduced_gain(pad: Recording) -> None:
     readings = pad.readings.copy()
     readings[:, 0] = 3.3
     readings[:, 3] = np.minimum(readings[:, 3], np.quantile(readings[:, 3], 0.2))
@@ -194,6 +180,9 @@ def test_dead_channels_are_ignored(pad: Recording) -> None:
     assert model.dead == FaultMonitor(model).failed == (0, 3)
     assert detect_later(model, readings, pad) == []
     assert detect_later(model, plant(pad, "noisy", readings=readings), pad)[0].fibres == (1,)
+    assert not detect(model, part_of(pad, 0, FEW, int(pad.down_command[FEW]), readings))
+    faults = detect_later(model, plant(pad, "reduced_gain", readings=readings), pad, FEW)
+    assert "reduced_gain" not in {fault.kind for fault in faults}
 
 
 @pytest.mark.slow

@@ -9,13 +9,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from padforge.sense.localizer.bayes import (
-    COARSENING,
-    N_SUMMARY,
-    PRIOR_WEIGHT,
-    BayesianLocalizer,
-    fit_stages,
-)
+from padforge.sense.localizer.bayes import COARSENING, N_SUMMARY, PRIOR_WEIGHT, BayesianLocalizer, fit_stages
 from padforge.sense.localizer.features import N_FEATURES
 from padforge.sense.localizer.moments import BAYES_STAGES, LATEST_WINDOWS, N_TIMED, bayes_stage
 

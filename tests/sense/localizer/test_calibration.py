@@ -2,20 +2,18 @@
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 from unittest import mock
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from sklearn.base import clone
-from sklearn.model_selection import cross_val_score
 
 from padforge.common.progress import OnProgress, ignore_progress
 from padforge.common.validation import InputError
 from padforge.design import Morphology
-from padforge.sense import Evaluation, Localizer, Recording, calibrate, evaluate, import_mat
+from padforge.sense import Evaluation, Recording, calibrate, evaluate, import_mat
 from padforge.sense.health.fault_detector import FibreFault, mask_faults
 from padforge.sense.localizer import training
 from padforge.sense.localizer.calibration import (
@@ -25,11 +23,9 @@ from padforge.sense.localizer.calibration import (
     trainable_targets,
 )
 from padforge.sense.localizer.evaluation import calibration_lines, distances
-from padforge.sense.localizer.features import compute_features
 from padforge.sense.localizer.model import LocalizerModel
-from padforge.sense.localizer.moments import N_PRESS_WINDOWS, N_TIMED, PRESS_WINDOWS, complete_at
+from padforge.sense.localizer.moments import N_PRESS_WINDOWS, N_TIMED, complete_at
 from padforge.sense.localizer.network import predict_members
-from padforge.sense.settings import LocalizerSettings
 from padforge.sense.settings import LocalizerSettings as Options
 from tests.sense.conftest import few_moments, first_presses
 
@@ -109,16 +105,6 @@ def test_calibrate_published_takes_no_failures(recording: Recording, tmp_path: P
     assert np.array_equal(again.positions_mm, localizer.predict(recording).positions_mm)
     with pytest.raises(InputError, match="method published knows no fibre loss"):
         localizer.predict(recording, [1])
-
-
-def test_calibrate_leaves_out_unknown_positions(brief: Recording) -> None:
-    places = np.array(brief.presses_mm)
-    places[::4] = np.nan
-    part = replace(brief, presses_mm=places)
-    localizer, evaluation = calibrate_shortly(part)
-    assert all(press % 4 for press in localizer.test)
-    assert evaluation.training_presses == 30 - evaluation.test_presses
-    assert np.isfinite(localizer.predict(part).positions_mm).all()
 
 
 @pytest.mark.slow
@@ -240,8 +226,10 @@ def test_calibrate_gives_radii_for_every_moment(recording: Recording, localizer:
     assert (found.r90_mm > localizer.scaler.scale_mm).all()
 
 
-@pytest.mark.slow
-def test_calibrate_keeps_a_time_budget(recording: Recording) -> None:
+def test_calibrate_keeps_a_time_budget_and_says_when_a_localizer_is_not_trained_out(
+    recording: Recording, localizer: LocalizerModel
+) -> None:
+    assert localizer.trained_share == 1
     seen: list[tuple[int, int]] = []
     options = SHORT.model_copy(update={"epochs": 10**5})
 
@@ -250,26 +238,13 @@ def test_calibrate_keeps_a_time_budget(recording: Recording) -> None:
             seen.append((done, total))
 
     with few_moments(), mock.patch.object(training, "MIN_STEPS", 1):
-        localizer, evaluation = calibrate(recording, options, time_budget=1, by_moment=False, on_progress=show)
-    assert localizer.bayes
-    networks = len(localizer.residual_network["first.w"])
-    networks += sum(len(weights["first.w"]) for weights in localizer.networks.values())
+        model, evaluation = calibrate(recording, options, time_budget=0.5, by_moment=False, on_progress=show)
+    assert model.bayes
+    networks = len(model.residual_network["first.w"])
+    networks += sum(len(weights["first.w"]) for weights in model.networks.values())
     assert seen == sorted(seen)
     assert seen[-1][0] == seen[-1][1] <= networks
     assert evaluation.errors[0]["mean_mm"] < 9
-
-
-def test_calibrate_refuses_a_time_budget_that_cannot_train(brief: Recording) -> None:
-    said = r"got 0 s for the training, in which a network took 1 steps; expected at least 36, about \d+ s$"
-    with pytest.raises(InputError, match=said):
-        calibrate(brief, SHORT.model_copy(update={"epochs": 99}), time_budget=0)
-
-
-def test_calibrate_says_when_a_localizer_is_not_trained_out(brief: Recording, localizer: LocalizerModel) -> None:
-    assert localizer.trained_share == 1
-    options = SHORT.model_copy(update={"epochs": 10**5})
-    with few_moments(), mock.patch.object(training, "MIN_STEPS", 1):
-        model, evaluation = calibrate(brief, options, time_budget=0.2, by_moment=False)
     assert 0 < model.trained_share < 0.5
     assert evaluation.trained_share == model.trained_share
     assert (evaluation.by_moment, evaluation.focus) == ([], {})
@@ -278,7 +253,16 @@ def test_calibrate_says_when_a_localizer_is_not_trained_out(brief: Recording, lo
     assert not any("not trained out" in line for line in calibration_lines(evaluation.to_dict() | {"trained_share": 1}))
 
 
-def test_calibrate_shows_the_progress_of_all_its_parts(brief: Recording) -> None:
+def test_calibrate_refuses_a_time_budget_that_cannot_train(brief: Recording) -> None:
+    said = r"got 0 s for the training, in which a network took 1 steps; expected at least 36, about \d+ s$"
+    with pytest.raises(InputError, match=said):
+        calibrate(brief, SHORT.model_copy(update={"epochs": 99}), time_budget=0)
+
+
+def test_calibrate_shows_the_progress_of_all_its_parts_and_leaves_out_unknown_positions(brief: Recording) -> None:
+    places = np.array(brief.presses_mm)
+    places[::4] = np.nan
+    part = replace(brief, presses_mm=places)
     steps: dict[str, list[int]] = {}
     totals: dict[str, int] = {}
 
@@ -286,79 +270,16 @@ def test_calibrate_shows_the_progress_of_all_its_parts(brief: Recording) -> None
         steps.setdefault(what, []).append(done)
         totals[what] = total
 
-    calibrate_shortly(brief, members=2, on_progress=show)
+    localizer, evaluation = calibrate_shortly(part, members=2, on_progress=show)
+    assert all(press % 4 for press in localizer.test)
+    assert evaluation.training_presses == 30 - evaluation.test_presses
+    assert np.isfinite(localizer.predict(part).positions_mm).all()
     before, after = ("features", "response model", "Bayesian localizer"), ("expected errors", "radii")
     assert list(steps) == [*before, "", *after, "sets of failed fibres", "moments of a press"]
     for what in ("Bayesian localizer", *after, "sets of failed fibres", "moments of a press"):
         assert steps[what] == list(range(totals[what])), what
     assert steps[""] == sorted(steps[""])
     assert (steps[""][0], steps[""][-1]) == (0, totals[""])
-
-
-TINY: dict[str, Any] = {"hidden": 16, "layers": 1, "epochs": 3, "batch": 64}
-
-
-@pytest.fixture(scope="module")
-def arrays(recording: Recording) -> tuple[np.ndarray, np.ndarray]:
-    features = compute_features(recording.readings, recording.down_command, recording.up_command)
-    return features.windows[:, :, : len(PRESS_WINDOWS)], recording.presses_mm
-
-
-def test_localizer_scores_in_cross_validation(arrays: tuple[np.ndarray, np.ndarray], tmp_path: Path) -> None:
-    x, y = arrays
-    localizer = Localizer(max_failures=1, random_state=3, **TINY)
-    [score] = cross_val_score(localizer, x, y, cv=[(np.arange(200), np.arange(200, 300))])
-    assert -np.hypot(*(y - np.median(y, axis=0)).T).mean() < score < 0
-    fitted = localizer.fit(x[:200], y[:200])
-    errors = np.hypot(*(fitted.predict(x[200:]).positions_mm - y[200:]).T)
-    assert score == fitted.score(x[200:], y[200:]) == pytest.approx(-errors.mean())
-    assert np.median(fitted.predict(x[200:], failed=[1]).r90_mm) > np.median(fitted.predict(x[200:]).r90_mm)
-    missing = x[200:].copy()
-    missing[:, 1] = np.nan
-    assert np.array_equal(fitted.predict(missing).positions_mm, fitted.predict(x[200:], [1]).positions_mm)
-    fitted.save(tmp_path)
-    assert np.array_equal(Localizer.load(tmp_path).predict(x).positions_mm, fitted.predict(x).positions_mm)
-    assert cast("Localizer", clone(fitted)).get_params() == fitted.get_params()
-
-
-@few_moments()
-def test_localizer_fits_evaluates_and_keeps_a_recording(brief: Recording, tmp_path: Path) -> None:
-    localizer = Localizer(2, split="chronological", **TINY).fit(brief)
-    evaluation = localizer.evaluate(brief)
-    assert evaluation.errors == localizer.calibration_.errors
-    assert localizer.evaluate(brief, max_failures=0).errors == evaluation.errors[:1]
-    table = evaluation.to_frame()
-    assert table["n_failed"].tolist() == [0, 1, 2]
-    assert table["mean_mm"].tolist() == [row["mean_mm"] for row in evaluation.errors]
-    assert localizer.score(brief) < 0
-    localizer.save(tmp_path)
-    again = Localizer.load(tmp_path)
-    assert np.array_equal(again.predict(brief, [0]).r90_mm, localizer.predict(brief, [0]).r90_mm)
-    params = again.get_params()
-    assert [params[name] for name in ("max_failures", "split")] == [2, "chronological"]
-
-
-def test_localizer_params_are_settings() -> None:
-    settings = LocalizerSettings(members=3, seed=7, method="published")
-    localizer = Localizer.from_settings(settings)
-    assert localizer.get_params() == {**settings.model_dump(exclude={"seed"}), "random_state": 7}
-    assert localizer.set_params(hidden=9).get_params()["hidden"] == 9
-    with pytest.raises(InputError, match="no option depth"):
-        Localizer(depth=3)
-
-
-def test_localizer_refuses_unfit_input(brief: Recording, arrays: tuple[np.ndarray, np.ndarray]) -> None:
-    x, y = arrays
-    with pytest.raises(InputError, match="not fitted"):
-        Localizer().predict(brief)
-    for bad, target, message in ((x[:9], y, "X has 9 presses and y 300"), (brief, y, "y is given beside a recording")):
-        with pytest.raises(InputError, match=message):
-            Localizer(**TINY).fit(bad, target)
-    fitted = Localizer(members=1, **TINY).fit(x[:40], y[:40])
-    with pytest.raises(InputError, match="fitted to arrays"):
-        fitted.predict(brief)
-    with pytest.raises(InputError, match=r"expected a recording, or \(Q, C, F\)"):
-        fitted.predict(x[:, :, :2])
 
 
 @pytest.mark.slow

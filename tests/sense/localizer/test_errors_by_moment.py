@@ -16,10 +16,12 @@ from padforge.sense.simulation.strokes import simulate_strokes
 PAD = Morphology.random(2, knots=3, seed=5)  # of the recording
 
 
-def test_the_error_falls_while_a_press_is_read(calibrated: tuple[LocalizerModel, Evaluation]) -> None:
-    _, evaluation = calibrated
-    rows = evaluation.by_moment
-    levels = len(evaluation.errors)
+def test_the_error_falls_while_a_press_is_read(
+    calibrated: tuple[LocalizerModel, Evaluation], recording: Recording
+) -> None:
+    """Rows are those of predictions until a moment, and the touch in focus is one of the test."""
+    model, evaluation = calibrated
+    rows, levels = evaluation.by_moment, len(evaluation.errors)
     assert len(rows) == len(MOMENTS) * levels
     intact = [row for row in rows if row["n_failed"] == 0]
     assert [(row["since"], row["readings"]) for row in intact] == [(each.since, each.readings) for each in MOMENTS]
@@ -27,37 +29,19 @@ def test_the_error_falls_while_a_press_is_read(calibrated: tuple[LocalizerModel,
     assert means[0] > means[3] > evaluation.errors[0]["mean_mm"]
     assert abs(means[-1] / evaluation.errors[0]["mean_mm"] - 1) < 0.25
     assert all(row["within_r90"] > 0.7 for row in rows)
-
-
-def test_a_touch_in_focus_is_one_of_the_test(
-    calibrated: tuple[LocalizerModel, Evaluation], recording: Recording
-) -> None:
-    model, evaluation = calibrated
+    test, up = list(model.test), recording.up_command
+    touched = first_readings(recording.readings, recording.times_s, recording.down_command, up)
+    for number in (2, 9, -1):
+        last = model.predict(recording, until=MOMENTS[number].until(touched, up)).positions_mm
+        errors_mm = distances(last, recording.presses_mm)[test]
+        assert means[number] == pytest.approx(errors_mm.mean(), rel=1e-5)  # of single precision
     focus = evaluation.focus
-    assert focus["press"] in model.test
+    assert focus["press"] in test
     assert focus["pressed_mm"] == recording.presses_mm[focus["press"]].tolist()
     radii = [moment["r90_mm"] for moment in focus["moments"]]
     assert radii[0] > radii[-1]
-    last = model.predict(recording, until=recording.up_command + MOMENTS[-1].readings).positions_mm
     assert focus["moments"][-1]["predicted_mm"] == pytest.approx(last[focus["press"]].tolist())
-    errors_mm = distances(last, recording.presses_mm)[list(model.test)]
-    assert np.sort(errors_mm)[len(errors_mm) // 2] == pytest.approx(errors_mm[model.test.index(focus["press"])])
-
-
-def test_rows_are_those_of_predictions_until_a_moment(
-    calibrated: tuple[LocalizerModel, Evaluation], recording: Recording
-) -> None:
-    model, evaluation = calibrated
-    test, positions_mm = np.array(model.test), recording.presses_mm
-    commands = recording.down_command, recording.up_command
-    touched = first_readings(recording.readings, recording.times_s, *commands)
-    for moment in (MOMENTS[2], MOMENTS[9]):
-        predicted = model.predict(recording, until=moment.until(touched, recording.up_command))
-        mean = distances(predicted.positions_mm[test], positions_mm[test]).mean()
-        row = next(
-            row for row in evaluation.by_moment if (row["since"], row["readings"]) == (moment.since, moment.readings)
-        )
-        assert row["mean_mm"] == pytest.approx(mean, rel=1e-5)  # of single precision
+    assert np.sort(errors_mm)[len(errors_mm) // 2] == pytest.approx(errors_mm[test.index(focus["press"])])
 
 
 def test_first_readings_are_those_of_the_detector_or_the_usual_ones(recording: Recording) -> None:

@@ -8,8 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from padforge.sense.localizer.features import N_HISTORY, PressFeatures, compute_features, interpolate_gaps
+from padforge.sense.localizer.model import LocalizerModel
 from padforge.sense.localizer.moments import LATEST_WINDOWS, N_TIMED, PRESS_WINDOWS, RELEASE_WINDOWS
-from padforge.sense.localizer.scaler import MAX_INPUT, FeatureScaler
+from padforge.sense.localizer.scaler import MAX_INPUT, FeatureScaler, TargetScaler
 
 PRESSES, FIBRES, WINDOWS = 5, 3, 4
 N_WINDOWS = N_TIMED + len(LATEST_WINDOWS)
@@ -191,3 +192,13 @@ def test_scaler_keeps_silent_fibres_finite(kind: str) -> None:
     assert np.isfinite(scaling.transform(inputs).inputs).all()
     assert np.isfinite(table).all()
     assert (scaling.scale_v[1] == 1).all()
+
+
+def test_scaled_depths_run_from_minus_1_to_1(deep_localizer: LocalizerModel) -> None:
+    scaler = TargetScaler.fit("depth_mm", np.array([1.0, 2.0, 5.0]))
+    assert (scaler.origin, scaler.scale) == (3.0, 2.0)
+    assert scaler.transform(np.array([1.0, 3.0, 5.0])).tolist() == [-1, 0, 1]
+    assert scaler.inverse_transform(np.array([-1.0, 0.5])).tolist() == [1, 4]
+    depth = deep_localizer.scaler.measures[0]
+    # a scaled depth of 1 responds as much more than one of 0 as it is deeper
+    assert 1 + deep_localizer.scaler.depth_gain == pytest.approx((depth.origin + depth.scale) / depth.origin)

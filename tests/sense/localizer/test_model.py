@@ -9,13 +9,7 @@ import pytest
 
 from padforge.common.validation import InputError
 from padforge.sense import Recording
-from padforge.sense.localizer.model import (
-    UNIFORM,
-    Localization,
-    LocalizerModel,
-    MeasureEstimate,
-    write_localization,
-)
+from padforge.sense.localizer.model import UNIFORM, Localization, LocalizerModel, MeasureEstimate, write_localization
 
 
 def test_predict_ignores_failed_fibres(localizer: LocalizerModel, recording: Recording) -> None:
@@ -86,16 +80,28 @@ def test_predict_takes_presses_at_several_moments(localizer: LocalizerModel, rec
     np.testing.assert_allclose(alike.positions_mm, localizer.predict(recording).positions_mm, atol=1e-4)
 
 
-def test_predict_refuses_unknown_fibres_and_other_pads(localizer: LocalizerModel, recording: Recording) -> None:
+def test_predict_refuses_unknown_fibres_other_pads_and_few_readings(
+    localizer: LocalizerModel, recording: Recording
+) -> None:
+    """It takes three quarters of the readings a second, and more."""
     presses = localizer.scaled_features(recording)
     for failed, message in (([4], "failed is .4., expected indices of fibres, 0 to 3"), (range(4), "all 4 fibres")):
         with pytest.raises(InputError, match=message):
             localizer.predict_features(presses, failed)
-    with pytest.raises(InputError, match="3 fibres, the localizer was learnt from 4"):
-        localizer.scaled_features(replace(recording, readings=recording.readings[:, :3]))
+    for changes, message in (
+        ({"readings": recording.readings[:, :3]}, "3 fibres, the localizer was learnt from 4"),
+        ({"times_s": recording.times_s / 0.74}, "readings a second, the localizer needs"),
+    ):
+        with pytest.raises(InputError, match=message):
+            localizer.scaled_features(replace(recording, **changes))
+    for ratio in (0.76, 1.24, 7.0):
+        presses = localizer.scaled_features(replace(recording, times_s=recording.times_s / ratio))
+        assert np.isfinite(localizer.predict_features(presses).positions_mm).all()
 
 
-def test_predict_compares_the_names_of_fibres(localizer: LocalizerModel, recording: Recording) -> None:
+def test_predict_compares_the_names_of_fibres_and_the_plans_of_pads(
+    localizer: LocalizerModel, recording: Recording
+) -> None:
     learnt = replace(localizer, fibre_names=("c1", "c2", "c3", "c4"))
 
     def named(*names: str) -> Recording:
@@ -107,9 +113,6 @@ def test_predict_compares_the_names_of_fibres(localizer: LocalizerModel, recordi
     with pytest.raises(InputError, match=message):
         learnt.predict(named("c1", "c3", "c2", "c4"))
     localizer.check_recording(named("c1", "c3", "c2", "c4"))  # it knows no names
-
-
-def test_predict_compares_the_plans_of_pads(localizer: LocalizerModel, recording: Recording) -> None:
     assert localizer.pad_sha256 == recording.pad_digest != ""
     plan = recording.source["morphology"]
     knots = [[[value + 1e-9 for value in row] for row in fibre] for fibre in plan["knots"]]
@@ -120,14 +123,6 @@ def test_predict_compares_the_plans_of_pads(localizer: LocalizerModel, recording
     for use in (localizer.predict, localizer.check_recording):
         with pytest.raises(InputError, match=message):
             use(other)
-
-
-def test_predict_takes_three_quarters_of_the_readings_a_second(localizer: LocalizerModel, recording: Recording) -> None:
-    for ratio in (0.76, 1.24, 7.0):
-        presses = localizer.scaled_features(replace(recording, times_s=recording.times_s / ratio))
-        assert np.isfinite(localizer.predict_features(presses).positions_mm).all()
-    with pytest.raises(InputError, match="readings a second, the localizer needs"):
-        localizer.scaled_features(replace(recording, times_s=recording.times_s / 0.74))
 
 
 def test_predict_gives_intervals_of_depth_and_force(deep_localizer: LocalizerModel, deep_recording: Recording) -> None:
@@ -167,19 +162,6 @@ def test_write_localization_writes_one_line_a_press(tmp_path: Path) -> None:
         write_localization(plain, tmp_path)
 
 
-@pytest.mark.parametrize(
-    ("key", "value"), [("rate_hz", "13"), ("interval_factors", [[[-1.0]]]), ("test", [-1]), ("more", 1)]
-)
-def test_load_names_a_wrong_value_of_the_document(
-    localizer: LocalizerModel, tmp_path: Path, key: str, value: object
-) -> None:
-    localizer.save(tmp_path)
-    path = tmp_path / "localizer.json"
-    path.write_text(json.dumps(json.loads(path.read_text()) | {key: value}))
-    with pytest.raises(InputError, match=rf"localizer\.json: {key}"):
-        LocalizerModel.load(tmp_path)
-
-
 @pytest.mark.parametrize("fixture", ["localizer", "deep_localizer"])
 def test_save_keeps_every_bit(
     fixture: str, deep_recording: Recording, tmp_path: Path, request: pytest.FixtureRequest
@@ -199,22 +181,23 @@ def test_save_keeps_every_bit(
         assert (tmp_path / "again" / name).read_bytes() == (tmp_path / name).read_bytes()
 
 
-def test_load_refuses_another_format(localizer: LocalizerModel, tmp_path: Path) -> None:
+def test_load_refuses_changed_and_torn_files(localizer: LocalizerModel, tmp_path: Path) -> None:
     localizer.save(tmp_path)
-    text = (tmp_path / "localizer.json").read_text()
-    (tmp_path / "localizer.json").write_text(text.replace("padforge-localizer/1", "padforge-localizer/0"))
-    with pytest.raises(InputError, match="padforge-localizer/0"):
-        LocalizerModel.load(tmp_path)
-
-
-@pytest.mark.parametrize(
-    ("name", "message"), [("localizer.json", "not a JSON file|JSON"), ("localizer.safetensors", "not the weights")]
-)
-def test_load_refuses_torn_files(localizer: LocalizerModel, tmp_path: Path, name: str, message: str) -> None:
-    localizer.save(tmp_path)
-    (tmp_path / name).write_bytes((tmp_path / name).read_bytes()[:-9])
-    with pytest.raises(InputError, match=message):
-        LocalizerModel.load(tmp_path)
+    files = {path.suffix: path for path in tmp_path.iterdir()}
+    whole = {suffix: path.read_bytes() for suffix, path in files.items()}
+    document = json.loads(whole[".json"])
+    wrong = (("rate_hz", "13"), ("interval_factors", [[[-1.0]]]), ("test", [-1]), ("more", 1))
+    changed = [(json.dumps(document | {key: value}), rf"localizer\.json: {key}") for key, value in wrong]
+    changed += [(json.dumps(document | {"format": "padforge-localizer/0"}), "padforge-localizer/0")]
+    for suffix, content, message in (
+        *((".json", text.encode(), message) for text, message in changed),
+        (".json", whole[".json"][:-9], "not a JSON file|JSON"),
+        (".safetensors", whole[".safetensors"][:-9], "not the weights"),
+    ):
+        files[suffix].write_bytes(content)
+        with pytest.raises(InputError, match=message):
+            LocalizerModel.load(tmp_path)
+        files[suffix].write_bytes(whole[suffix])
 
 
 def test_save_that_fails_changes_nothing(localizer: LocalizerModel, tmp_path: Path) -> None:

@@ -26,11 +26,7 @@ def completed(down: int, up: int, until: int) -> list[bool]:
     return of_touch + [until > up and all(up + n < until for n in range(*window)) for window in RELEASE_WINDOWS]
 
 
-@given(
-    down=st.integers(0, 5000),
-    length=st.integers(1, 60),
-    until=st.integers(-5, 120),
-)
+@given(down=st.integers(0, 5000), length=st.integers(1, 60), until=st.integers(-5, 120))
 def test_complete_windows_counts_readings(down: int, length: int, until: int) -> None:
     up = down + length
     seen = complete_windows(np.array([down]), np.array([up]), np.array([down + until]))

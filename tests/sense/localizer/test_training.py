@@ -237,7 +237,7 @@ def test_forward_bfloat16_is_near_single_precision(
 
 @pytest.mark.slow
 def test_every_way_trains_and_has_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
-    small = {"PRESSES": 150, "TEST": 30, "EPOCHS": (1, 3), "ITERATIONS": (3, 20), "PASSES": (1,), "STEPS": (3,)}
+    small = {"PRESSES": 150, "TEST": 30, "EPOCHS": (3,), "ITERATIONS": (20,), "PASSES": (1,), "STEPS": (3,)}
     for name, value in (small | {"HIDDEN": 6, "FEATURES": ("published", "windows")}).items():
         monkeypatch.setattr(bench, name, value)
     monkeypatch.setattr(harness, "BUDGET_S", 0)
@@ -246,5 +246,5 @@ def test_every_way_trains_and_has_an_error(monkeypatch: pytest.MonkeyPatch) -> N
     harness.measure_round(bench.BENCH, measured, ignore_progress, lambda key: False)
     bench.recorded.cache_clear()
     errors = {key[:3]: row["error"] for key, row in measured.results.items() if row}
-    assert len(errors) == 2 + 4 + 4 + 2 - 2  # LM learns from published inputs alone; two only find one press
+    assert len(errors) == 4 + 3  # LM learns from published inputs alone
     assert all(0 < error < 30 for error in errors.values())  # mm on a pad of 34

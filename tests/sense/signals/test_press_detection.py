@@ -292,7 +292,7 @@ def test_detect_presses_of_scenes_is_reproducible(seed: tuple[int, float, int]) 
     assert (len(touched), int(touched.sum()), int(released.sum())) == SCENES[seed]
 
 
-def test_align_to_detected_moves_presses_by_a_few_readings(recording: Recording) -> None:
+def test_align_to_detected_moves_presses_by_a_few_readings_and_keeps_those_not_detected(recording: Recording) -> None:
     commanded = recording.down_command, recording.up_command
     down_command, up_command = align_to_detected(recording.readings, recording.times_s, *commanded)
     for aligned, command in zip((down_command, up_command), commanded, strict=True):
@@ -301,8 +301,6 @@ def test_align_to_detected_moves_presses_by_a_few_readings(recording: Recording)
     assert (up_command > down_command).all()
     assert (down_command[1:] >= up_command[:-1]).all()
 
-
-def test_align_to_detected_keeps_presses_that_are_not_detected(recording: Recording) -> None:
     def align(first: int, last: int) -> tuple[np.ndarray, np.ndarray]:
         readings = recording.readings.copy()
         readings[first:last] = readings[first - 1]
@@ -315,6 +313,13 @@ def test_align_to_detected_keeps_presses_that_are_not_detected(recording: Record
     down_command, up_command = align(int(up[20]) - 2, int(down[21]) + 10)  # two presses look like one
     assert (down_command[20], up_command[20]) == (down[20], up[20])
     np.testing.assert_array_equal(align(1, len(recording.readings)), (down, up))
+    readings, late = recording.readings.copy(), int(up[30]) + 2  # it is felt once the probe has been sent up
+    readings[down[30] - 2 : late] = readings[down[30] - 3]
+    readings[late : late + 10] = recording.readings[up[30] - 10 : up[30]]
+    touched, _ = detect_presses(readings, recording.times_s)
+    assert ((touched >= up[30]) & (touched < down[31] - MAX_LEAD)).any()
+    down_command, up_command = align_to_detected(readings, recording.times_s, down, up)
+    assert (down_command[30], up_command[30]) == (down[30], up[30])
 
 
 def test_align_to_detected_keeps_a_press_whose_release_shows_in_the_next_one(recording: Recording) -> None:

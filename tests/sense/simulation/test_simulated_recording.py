@@ -89,7 +89,7 @@ def test_simulate_responds_by_depth(contact: Contact, least: float, most: float)
     assert least < swing[1] / swing[0] < most
 
 
-def test_simulate_twin_has_its_wiring_and_gains() -> None:
+def test_simulate_twin_has_its_wiring_gains_and_noise() -> None:
     twin = twin_of(PlanTransform(turn_deg=5, shift_mm=(2, -1), scale=0.9))
     recording = simulate(twin, quiet_rig(presses=200))
     expected = np.zeros((200, 4))
@@ -98,9 +98,7 @@ def test_simulate_twin_has_its_wiring_and_gains() -> None:
     assert result == pytest.approx(expected, abs=4e-3)  # creep of the press before, and steps of the converter
     assert np.corrcoef(result[:, 0], expected[:, 0])[0, 1] > 0.999
     assert result[:, [0, 2, 3]].min(axis=0) == pytest.approx(expected[:, [0, 2, 3]].min(axis=0), rel=0.05)
-
-
-def test_simulate_twin_is_reproducible_and_its_dead_channel_has_noise_alone() -> None:
+    # it is reproducible, and its dead channel has noise alone
     twin, rig = twin_of(noise_v=0.02), quiet_rig(presses=200, noise_mv=2.0)
     recording = simulate(twin, rig)
     assert recording == simulate(twin, rig) != simulate(twin, rig.model_copy(update={"seed": 4}))

@@ -46,13 +46,12 @@ def test_study_compares_both_methods_and_maps_a_chosen_set(localizer: LocalizerM
     assert len(lines) == 6
     row = one.errors[1]
     assert lines[3] == [*ONE.split(), "1", "4", *(f"{row[f'{name}_mm']:.2f}" for name in ("mean", "std", "max"))]
-
-
-def test_study_rejects_fibres_that_cannot_fail(localizer: LocalizerModel, recording: Recording) -> None:
-    with pytest.raises(InputError, match="failed fibre is 4, allowed is a whole number from 0 to 3"):
-        fibre_loss_study(recording, localizer, failed=(4,))
-    with pytest.raises(InputError, match="failed are all 4 fibres, at least one must be left"):
-        fibre_loss_study(recording, localizer, failed=(0, 1, 2, 3))
+    for failed, message in (
+        ((4,), "failed fibre is 4, allowed is a whole number from 0 to 3"),
+        ((0, 1, 2, 3), "failed are all 4 fibres, at least one must be left"),
+    ):
+        with pytest.raises(InputError, match=message):
+            fibre_loss_study(recording, localizer, failed=failed)
 
 
 def test_retraining_ignores_failed_fibres_and_test_positions(recording: Recording) -> None:

@@ -36,25 +36,22 @@ def test_force_study_estimates_depth_and_force_better_than_guessing(
         assert quiet["position_one_depth_mm"] < noisy["position_one_depth_mm"]
 
 
-def test_tools_have_one_size_and_the_layer_of_the_contact() -> None:
+def test_tools_have_one_size_and_the_layer_of_the_contact_and_polygons_one_area() -> None:
     tools = tool_contacts(Contact(tool_radius_mm=6.0, thickness_mm=8.0))
     assert [contact.tool for contact in tools.values()] == list(tools) == ["dome", "ball", "flat", "finger"]
     assert {contact.thickness_mm for contact in tools.values()} == {8.0}
     assert [tools[name].tool_radius_mm for name in ("dome", "ball", "finger")] == [6.0] * 3
     assert 3.0 < tools["flat"].tool_radius_mm < 6.0
+    for sides in FOOTPRINTS.values():
+        radius = circumradius(sides)
+        area = np.pi * radius**2 if sides is None else sides / 2 * radius**2 * np.sin(2 * np.pi / sides)
+        assert area == pytest.approx(np.pi)
 
 
 @pytest.mark.parametrize("study", [force_study, shape_study])
 def test_contact_without_depth_is_refused(study: Callable[..., Study]) -> None:
     with pytest.raises(InputError, match=r"\[contact\] model is shape, allowed is layer"):
         study(PAD, contact=Contact(radius=0.6))
-
-
-@pytest.mark.parametrize("sides", FOOTPRINTS.values())
-def test_circumradius_gives_polygons_of_one_area(sides: int | None) -> None:
-    radius = circumradius(sides)
-    area = np.pi * radius**2 if sides is None else sides / 2 * radius**2 * np.sin(2 * np.pi / sides)
-    assert area == pytest.approx(np.pi)
 
 
 @pytest.mark.slow

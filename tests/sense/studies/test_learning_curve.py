@@ -15,12 +15,7 @@ from hypothesis import strategies as st
 from padforge.common.validation import InputError
 from padforge.sense import Recording
 from padforge.sense.settings import LocalizerSettings as Options
-from padforge.sense.studies.learning_curve import (
-    LearningCurve,
-    fit_power_law,
-    learning_curve,
-    power_law,
-)
+from padforge.sense.studies.learning_curve import LearningCurve, fit_power_law, learning_curve, power_law
 from tests.helpers.door import called
 from tests.helpers.golden import Golden, json_text
 

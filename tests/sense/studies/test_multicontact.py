@@ -23,11 +23,6 @@ PAD = Morphology.random(4, 3, 0)
 MAX_RATIO = 0.7  # largest error of targets without an order, as a share of that of fixed labels
 
 
-@pytest.fixture
-def pairs() -> np.ndarray:
-    return np.random.default_rng(1).uniform(1, 4, (400, 2, 2))
-
-
 @pytest.mark.slow
 def test_study_localizes_pairs_better_without_an_order_and_counts_contacts(tmp_path: Path) -> None:
     sizes = Sizes(1000, 300, hidden=20, members=2, epochs=15)
@@ -42,7 +37,8 @@ def test_study_localizes_pairs_better_without_an_order_and_counts_contacts(tmp_p
     assert rows[COUNTING]["accuracy_percent"] > rows[COUNTING]["majority_percent"] + 30
 
 
-def test_unordered_distances_and_moments_do_not_depend_on_the_order(pairs: np.ndarray) -> None:
+def test_unordered_distances_and_moments_do_not_depend_on_the_order() -> None:
+    pairs = np.random.default_rng(1).uniform(1, 4, (400, 2, 2))
     predicted = np.random.default_rng(2).uniform(1, 4, pairs.shape)
     errors = unordered_distances(predicted, pairs)
     np.testing.assert_allclose(unordered_distances(predicted[:, ::-1], pairs), errors)
@@ -54,8 +50,9 @@ def test_unordered_distances_and_moments_do_not_depend_on_the_order(pairs: np.nd
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_fit_pairs_does_not_depend_on_the_order_except_for_fixed_labels(method: str, pairs: np.ndarray) -> None:
-    pairs, inputs = pairs[:60], signals(PAD, pairs[:60])
+def test_fit_pairs_does_not_depend_on_the_order_except_for_fixed_labels(method: str) -> None:
+    pairs = np.random.default_rng(1).uniform(1, 4, (60, 2, 2))
+    inputs = signals(PAD, pairs)
     shuffled = np.where(np.random.default_rng(3).random((len(pairs), 1, 1)) < 0.5, pairs, pairs[:, ::-1])
     sizes = Sizes(len(pairs), 0, members=2, hidden=4, epochs=3)
     with one_thread():

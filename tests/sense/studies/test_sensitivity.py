@@ -34,24 +34,18 @@ def test_tool_and_depth_of_half_size_err_more_between_fibres(tmp_path: Path, mon
     assert "Errors are in mm." in document["text"][0]
 
 
-def test_depths_beyond_the_thickness_are_left_out() -> None:
+def test_tools_and_depths_are_half_and_one_and_a_half_times_those_of_the_contact() -> None:
+    """Without depths beyond the thickness; a profile has no size to vary."""
+    settings = sensitivity_study(PADS, contact=Contact(tool_radius_mm=4.0, depth_mm=2.0)).settings
+    assert (settings["tool_radius_mm"], settings["depth_mm"]) == ([2, 4, 6], [1, 2, 3])
     deep, shallow = (sensitivity_study(PADS, contact=Contact(depth_mm=depth_mm)) for depth_mm in (5.0, 3.0))
     assert deep.settings["depth_mm"] == [2.5, 5.0]
     assert shallow.settings["depth_mm"] == [1.5, 3.0, 4.5]
     assert len(shallow.tasks) == 9
-
-
-def test_tools_and_depths_are_half_and_one_and_a_half_times_those_of_the_contact() -> None:
-    settings = sensitivity_study(PADS, contact=Contact(tool_radius_mm=4.0, depth_mm=2.0)).settings
-    assert (settings["tool_radius_mm"], settings["depth_mm"]) == ([2, 4, 6], [1, 2, 3])
-
-
-def test_profile_has_no_size_to_vary() -> None:
     with pytest.raises(InputError, match=r"\[contact\] model is profile, allowed are layer and shape"):
         sensitivity_study(PADS, contact=Contact(model="profile"))
 
 
-@pytest.mark.slow
 def test_study_finds_that_larger_objects_are_localized_better(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for name, value in (("SIDE", 16), ("TEST", 200), ("HIDDEN", 12)):
         monkeypatch.setattr(sensitivity, name, value)

@@ -22,7 +22,7 @@ from padforge.sense.localizer.moments import MOMENTS
 from padforge.sense.settings import LocalizerSettings, RigSettings
 from padforge.sense.simulation.pad_model import ADC_STEPS
 from padforge.sense.simulation.simulated_recording import simulate
-from padforge.sense.studies import drift, indentation, robustness, scaling, sensitivity
+from padforge.sense.studies import drift, indentation, scaling
 from padforge.sense.studies.multicontact import multicontact_study
 from padforge.sense.studies.strokes import strokes_study
 from padforge.sense.studies.study import (
@@ -41,18 +41,16 @@ from tests.helpers.door import refused
 PADS = {"square": Morphology.straight(2)}
 TINY = LocalizerSettings(members=1, hidden=8, layers=1, epochs=1, batch=16, max_failures=0)
 SMALLEST: dict[str, Callable[[], Study]] = {
-    "robustness": lambda: robustness.robustness_study(PADS, max_failures=1, presses=16),
     "drift": lambda: drift.drift_study({}, {"real": simulate(PADS["square"], RigSettings(presses=40, seed=3))}),
     "force": lambda: indentation.force_study(PADS, sizes=Sizes(60, 40, hidden=4, epochs=3)),
     "shape": lambda: indentation.shape_study(PADS, sizes=Sizes(100, 60, hidden=4, epochs=3)),
     "multicontact": lambda: multicontact_study(PADS, sizes=Sizes(100, 60, hidden=5, members=2, epochs=3)),
     "strokes": lambda: strokes_study(PADS, presses=40, strokes=3, options=TINY),
     "scaling": lambda: scaling.scaling_study(PADS, grids=(2, 4), side=16),
-    "sensitivity": lambda: sensitivity.sensitivity_study(PADS),
 }
+"""Those of robustness and of sensitivity are as small in the tests of their results."""
 
 SMALLER: dict[object, dict[str, object]] = {
-    robustness: {"HIDDEN": 4, "TEST": 20},
     drift: {
         **{"MEMBERS": 2, "HIDDEN": 4, "EPOCHS": 2, "RIG": RigSettings(drift_mv=300, presses=40)},
         "FILTERS": {each: drift.FILTERS[each] for each in (drift.RAW, drift.AS_PUBLISHED)},
@@ -61,7 +59,6 @@ SMALLER: dict[object, dict[str, object]] = {
     evaluation: {"MOMENTS": MOMENTS[-1:]},
     indentation: {"FORCE_NOISES": (1.0,), "TOOLS": ("dome", "flat"), "SETS": {"tools": ("dome", "flat")}},
     scaling: {"HIDDEN": 12, "TEST": 50, "EPOCHS": 8},
-    sensitivity: {"HIDDEN": 12, "TEST": 50, "SIDE": 8, "MEMBERS": 2, "FACTORS": (0.5, 1.0)},
 }
 
 
@@ -172,7 +169,7 @@ def test_interrupt_ends_a_study_at_once(tmp_path: Path) -> None:
         "from padforge.sense.studies import study\n"
         "compute = study.compute_states\n"
         "def interrupted(*arguments, **options):\n"
-        "    threading.Timer(1.0, os.kill, (os.getpid(), signal.SIGINT)).start()\n"
+        "    threading.Timer(0.5, os.kill, (os.getpid(), signal.SIGINT)).start()\n"
         "    return compute(*arguments, **options)\n"
         "study.compute_states = interrupted\n"
         "from padforge.cli import main\n"
@@ -184,7 +181,7 @@ def test_interrupt_ends_a_study_at_once(tmp_path: Path) -> None:
     assert not out.exists() or not list(out.iterdir())
 
 
-def test_load_pads_by_file_or_name(tmp_path: Path) -> None:
+def test_load_pads_by_file_by_name_or_by_a_search(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     winding = Morphology.random(2, 3, 0)
     path = tmp_path / "mine" / "morphology.json"
     path.parent.mkdir()
@@ -200,9 +197,6 @@ def test_load_pads_by_file_or_name(tmp_path: Path) -> None:
         "random-2": Morphology.random(layout, 2, 4),
         "square@3": Morphology.straight(3, 8.0),
     }
-
-
-def test_load_pads_searches_with_the_given_knots_by_either_method(monkeypatch: pytest.MonkeyPatch) -> None:
     requests = []
 
     def record(pad: PadSettings, contact: Contact, settings: SearchSettings) -> SearchResult:

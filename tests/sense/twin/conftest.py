@@ -1,14 +1,21 @@
 """Printed pads of known truth, and their responses."""
 
+from functools import partial
+from unittest.mock import patch
+
 import numpy as np
 import pytest
 
 from padforge.benchmarks.twin import printed_pad
 from padforge.design import Morphology
 from padforge.design.twin import Twin
+from padforge.sense.twin import identification
 from padforge.sense.twin.responses import Responses
 
 PLAN = Morphology.random(2, knots=3, seed=5)
+
+few_compared = partial(patch.multiple, identification, N_COMPARED=80, N_CONTACT=24)
+"""Candidates are compared by fewer presses, and the contact, which is measured elsewhere, fitted to few."""
 
 
 @pytest.fixture(scope="session")

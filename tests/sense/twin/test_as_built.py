@@ -74,31 +74,25 @@ def test_align_transform_moves_common_offsets_into_the_transform(pad):
     assert pad.align_transform().predict(POSITIONS_MM) == pytest.approx(volts, abs=0.02 * np.ptp(volts))
 
 
-@pytest.fixture
-def fibre() -> dict[str, Any]:
+def test_channel_response_moves_with_the_fibre_grows_with_it_and_ends_with_the_profile():
     rng = np.random.default_rng(1)
     x = np.linspace(0, 4, F + 1)
     line = np.column_stack([x, 0.4 * np.sin(2 * x)])
     step = np.diff(line, axis=0)
     length = np.hypot(*step.T)
-    return {
+    fibre: dict[str, Any] = {
         "fibre": ((line[1:] + line[:-1]) / 2, step / length[:, None], length),
         "lateral_offset": 0.1 * rng.standard_normal((2, J)),
         "log_sensitivity": 0.2 * rng.standard_normal((1, J)),
         "positions": np.column_stack([rng.uniform(0, 4, 9), rng.uniform(-1, 1, 9)]),
         "profile": rng.standard_normal((2, K)),
     }
-
-
-def test_channel_response_moves_with_the_fibre_and_ends_with_the_profile(fibre):
     moved = {**fibre, "lateral_offset": np.tile([[0.3], [-0.2]], J)}
     back = {**fibre, "lateral_offset": np.zeros((2, J)), "positions": fibre["positions"] - [0.3, -0.2]}
     assert channel_response(**moved, step=STEP)[0] == pytest.approx(channel_response(**back, step=STEP)[0], abs=1e-12)
     far = {**back, "positions": np.array([[2.0, 0.4 + 0.5 + (K + 1) * STEP]])}
     assert not any(np.any(part) for part in channel_response(**far, step=STEP))
-
-
-def test_channel_response_grows_with_the_length_of_a_stretched_fibre(fibre):
+    # it grows with the length of a stretched fibre
     path = np.column_stack([(np.arange(F) + 0.5) / F, np.zeros(F)])
     elements = path, np.tile([1.0, 0.0], (F, 1)), np.full(F, 1 / F)
     straight = {**fibre, "fibre": elements, "log_sensitivity": np.zeros((1, J))}

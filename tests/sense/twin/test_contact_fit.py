@@ -20,7 +20,7 @@ def press(contact: Contact, transform: PlanTransform, presses: int) -> Responses
     return Responses(positions_mm, volts, np.random.default_rng(1).uniform(size=volts.shape) < 0.95)
 
 
-@pytest.mark.parametrize("base", ["bonded", pytest.param("slipping", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("base", ["bonded", "slipping"])
 def test_fit_contact_recovers_scale_and_shares(base: Base) -> None:
     stated = Contact(base=base)
     pressed = Contact(base=base, scale=1.15, squeeze=0.7, stretch=1.3)

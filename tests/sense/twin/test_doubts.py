@@ -13,6 +13,8 @@ from padforge.sense.twin.identification import Identification
 from padforge.sense.twin.wiring import Wiring, images
 from tests.sense.conftest import few_candidates, identify_simulated
 
+from .conftest import few_compared
+
 
 @pytest.fixture
 def result(identification: Identification) -> Identification:
@@ -28,12 +30,10 @@ def moved(pad: Morphology, fibre: int, pitches: float) -> Morphology:
     return Morphology.from_layout(knots, pad.layout)
 
 
-def test_nothing_is_doubted_of_a_pad_that_lies_as_planned(result: Identification) -> None:
+def test_a_channel_that_a_smooth_function_of_the_position_explains_better_is_doubted(result: Identification) -> None:
+    """And nothing of a pad that lies as planned; but a fibre far beside its plan."""
     assert result.fit.pad.fibres == (0, 1, 2, 3)
     assert find_doubts(result) == []
-
-
-def test_a_channel_that_a_smooth_function_of_the_position_explains_better_is_doubted(result: Identification) -> None:
     explained = result.explained.copy()
     explained[2] = 0.2
     *_, doubt = find_doubts(replace(result, explained=explained))
@@ -43,9 +43,6 @@ def test_a_channel_that_a_smooth_function_of_the_position_explains_better_is_dou
     assert count == "4 of 4 channels do not fit: is it the recording of this pad?"
     assert len(channels) == 4
     assert find_doubts(replace(result, explained=result.explained_smooth - 0.02)) == []
-
-
-def test_a_fibre_far_beside_its_plan_is_doubted(result: Identification) -> None:
     values = result.fit.pad.values.copy()
     values[channel_indices(1)[OFFSET]] += 0.6  # 6.75 mm along x and y: across a fibre, whichever way it runs
     beside = replace(result, fit=replace(result.fit, pad=replace(result.fit.pad, values=values)))
@@ -65,14 +62,11 @@ def test_a_pad_that_lay_askew_or_at_another_scale_is_doubted(result, turn_deg: f
     assert [said in doubt for doubt in doubts if "would have lain" in doubt] == [True] * bool(said)
 
 
-def test_a_second_wiring_is_told_of_the_channels_that_it_changes(result: Identification) -> None:
+def test_a_second_wiring_is_told_of_unless_it_plans_each_fibre_where_it_was(result: Identification) -> None:
     swapped = Wiring(result.fit.pad.transform, 0.5, (1, 0, 2, 3), 0.9)
     count, *channels = find_doubts(replace(result, alternatives=[swapped]))
     assert count.startswith("1 other pose or wiring explains")
     assert channels == ["channel 1 may read fibre 2 in place of 1", "channel 2 may read fibre 1 in place of 2"]
-
-
-def test_no_second_wiring_is_told_of_that_plans_each_fibre_where_it_was(result: Identification) -> None:
     straight = Morphology.straight(2)
     pad = replace(result.fit.pad, plan=PadPlan.from_morphology(straight), fibres=(0, 1, 2, 3))
     lain = Wiring(pad.transform, 0.5, pad.fibres, 0.9)
@@ -96,6 +90,7 @@ def test_no_second_wiring_is_told_of_that_plans_each_fibre_where_it_was(result: 
 
 @pytest.mark.slow
 @few_candidates()
+@few_compared()
 def test_another_pad_is_doubted_and_the_recorded_one_is_not() -> None:
     rig = RigSettings(presses=160, seed=1)
     built = Morphology.random(2, knots=3, seed=1)
@@ -107,6 +102,7 @@ def test_another_pad_is_doubted_and_the_recorded_one_is_not() -> None:
 
 @pytest.mark.slow
 @few_candidates()
+@few_compared()
 def test_a_pad_of_straight_fibres_is_not_doubted() -> None:
     pad = Morphology.straight(3)
     result = identify_simulated(pad, pad, RigSettings(presses=160, seed=7))
@@ -116,6 +112,7 @@ def test_a_pad_of_straight_fibres_is_not_doubted() -> None:
 
 @pytest.mark.slow
 @few_candidates()
+@few_compared()
 def test_a_fibre_moved_by_a_pitch_is_doubted() -> None:
     told = Morphology.random(2, knots=3, seed=1)
     result = identify_simulated(moved(told, 2, 1.0), told, RigSettings(presses=160, seed=60))

@@ -1,7 +1,6 @@
 """Identification of pads whose truth is known, and recordings that do not suffice."""
 
 from dataclasses import replace
-from unittest.mock import patch
 
 import numpy as np
 import pytest
@@ -18,12 +17,11 @@ from padforge.sense import identify
 from padforge.sense.recording.recording import Recording
 from padforge.sense.settings import RigSettings
 from padforge.sense.simulation.simulated_recording import simulate
-from padforge.sense.twin import identification
 from padforge.sense.twin.identification import Identification, identify_pad
 from tests.helpers.rigs import ideal_rig
 from tests.sense.conftest import few_candidates
 
-from .conftest import PLAN
+from .conftest import PLAN, few_compared
 
 
 @pytest.fixture(scope="module")
@@ -33,10 +31,9 @@ def recording(printed: Twin) -> Recording:
 
 @pytest.fixture(scope="module")
 @few_candidates()
+@few_compared()
 def result(recording: Recording) -> Identification:
-    """Candidates are compared by half of its presses, and the contact, which is measured elsewhere, fitted to few."""
-    with patch.object(identification, "N_COMPARED", 120), patch.object(identification, "N_CONTACT", 60):
-        return identify_pad(recording, PLAN, seed=1)
+    return identify_pad(recording, PLAN, seed=1)
 
 
 def assert_recovered(result: Identification, printed: Twin) -> None:
@@ -74,6 +71,7 @@ def test_twin_responds_as_the_fitted_pad(result: Identification) -> None:
 
 @pytest.mark.slow
 @few_candidates()
+@few_compared(N_CONTACT=120)
 def test_identify_measures_the_contact_of_a_pad_that_lies_as_planned() -> None:
     recording = simulate(PLAN, ideal_rig(presses=200, depth_mm=4.0, seed=2), Contact(depth_mm=4.0))
     result = identify_pad(recording, PLAN, seed=1)
@@ -87,12 +85,14 @@ def test_identify_measures_the_contact_of_a_pad_that_lies_as_planned() -> None:
 
 
 @pytest.mark.slow
+@few_compared()
 def test_identify_recovers_the_printed_pad_among_all_candidates(recording: Recording, printed: Twin) -> None:
     assert_recovered(identify_pad(recording, PLAN, seed=1), printed)
 
 
 @pytest.mark.slow
 @few_candidates()
+@few_compared()
 def test_identify_reports_alternatives_of_a_symmetric_pad_and_is_reproducible_without_a_layer() -> None:
     pad = Morphology.straight(2)
     printed = printed_pad(pad, np.random.default_rng(0), lateral_offset_mm=0.2, n_dead=0)
@@ -108,6 +108,7 @@ def test_identify_reports_alternatives_of_a_symmetric_pad_and_is_reproducible_wi
 
 @pytest.mark.slow
 @few_candidates()
+@few_compared()
 def test_identify_gives_no_fibre_to_channels_without_readings(recording: Recording, printed: Twin) -> None:
     live = next(channel.channel for channel in printed.channels if channel.fibre is not None)
     readings = recording.readings.copy()
@@ -139,6 +140,7 @@ def test_identify_requires_presses_over_half_of_a_rectangle_each_way() -> None:
 
 @pytest.mark.slow
 @few_candidates()
+@few_compared()
 def test_identify_recognizes_a_rectangle_turned_by_a_quarter() -> None:
     plan = Morphology.random((1, 2), 3, 3, (8.0, 12.0))
     printed = printed_pad(plan, np.random.default_rng(1), lateral_offset_mm=0.2, n_dead=0)
@@ -151,6 +153,8 @@ def test_identify_recognizes_a_rectangle_turned_by_a_quarter() -> None:
 
 
 @pytest.mark.slow
+@few_candidates()
+@few_compared()
 def test_twin_predicts_better_than_baselines(monkeypatch: pytest.MonkeyPatch) -> None:
     small = {"PRESSES": (150,), "GRID": 2, "KNOTS": 3, "WORLDS": {"small": ("gaussian", 0.5, 1)}}
     for name, value in small.items():

@@ -23,7 +23,7 @@ def split(recording: Recording) -> SplitPresses:
     return split_presses(recording, np.arange(500) % 7 != 0, hysteresis_s=20.0)
 
 
-def test_parts_are_those_that_were_simulated(recording: Recording, split: SplitPresses) -> None:
+def test_parts_memory_and_touch_are_those_that_were_simulated(recording: Recording, split: SplitPresses) -> None:
     depths_mm = np.full(500, RIG.press_depths_mm)
     changes = resistance_changes(build_pad(PAD, RIG), recording.presses_mm, depths_mm, Contact(), RIG)
     rest_v = np.median(recording.readings[:10], axis=0)
@@ -35,19 +35,11 @@ def test_parts_are_those_that_were_simulated(recording: Recording, split: SplitP
         assert np.mean(found) > share
     slope = np.polyfit((-slope_v * changes.held).ravel(), split.parts.held.volts.ravel(), 1)[0]
     assert slope == pytest.approx(1, abs=0.12)
-
-
-def test_memory_and_touch_are_those_that_were_simulated(split: SplitPresses) -> None:
     assert split.rig["memory"] == pytest.approx(RIG.memory, abs=0.2)
     assert split.rig["memory_mm"] == pytest.approx(RIG.memory_mm, rel=0.35)
     assert split.rig["hysteresis_s"] == pytest.approx(RIG.hysteresis_s, rel=0.5)
     assert split.rig["touch_s"] == pytest.approx(RIG.touch_s, abs=0.015)
-
-
-def test_pressed_responses_scatter_less_without_what_presses_take_away(
-    recording: Recording, split: SplitPresses
-) -> None:
-    """Neighbouring presses differ by half as much as they do with it."""
+    # without what presses take away, neighbouring ones differ by half as much as they do with it
     x, y = recording.presses_mm.T
     order = np.argsort(np.round(x) * 1e3 + y)
     with_it = np.array(
