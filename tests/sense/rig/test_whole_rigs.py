@@ -153,8 +153,7 @@ def quick() -> Iterator[None]:
 
 
 RIGS = {
-    "arm": (ARM, emulate_arm, UR5.from_settings),
-    "line": (ARM.model_copy(update={"channels": (3, 1, 0, 2)}), emulate_arm, UR5.from_settings),
+    "arm": (ARM.model_copy(update={"channels": (3, 1, 0, 2)}), emulate_arm, UR5.from_settings),
     "printer": (PRINTER, rigs.emulate_printer, Printer.from_settings),
 }
 
@@ -239,8 +238,7 @@ FAULTS: dict[str, tuple[Callable[[Rig], object], str, Callable[[Rig], object]]] 
 @pytest.mark.parametrize(
     ("rig", "presses", "names"),
     [
-        ("arm", 10, "protective drop freeze stall unplug emergency restart"),
-        ("line", 8, "reset columns stall unplug"),
+        ("arm", 12, "protective drop freeze stall unplug emergency restart reset columns"),
         ("printer", 9, " ".join(name for name in FAULTS if "printer" in name)),
     ],
     indirect=["rig"],
