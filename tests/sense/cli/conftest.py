@@ -99,7 +99,7 @@ def calibrate_once(monkeypatch: pytest.MonkeyPatch) -> None:
         trained[:] = trained or [calibrate(*arguments, **options)]
         return trained[0]
 
-    monkeypatch.setattr("padforge.sense.localizer.localizer.calibrate", calibrate_at_first)
+    monkeypatch.setattr("padforge.sense.report.calibration.calibrate", calibrate_at_first)
 
 
 @pytest.fixture(scope="session")

@@ -10,6 +10,7 @@ from padforge.sense import Recording
 from padforge.sense.health.fault_detector import HEALTH_FILES
 from tests.sense.cli.conftest import SPEC, files_in
 
+PICTURES = [f"error_{name}.png" for name in ("map", "by_loss", "by_moment")]
 BARE = [word for part in ("health", "figures", "moments") for word in ("--without", part)]
 
 
@@ -32,8 +33,8 @@ def test_calibrate_writes_a_document_that_evaluate_agrees_with(few) -> None:
         assert json.loads(out)["errors"] == document["errors"][:levels]
 
 
-@pytest.mark.usefixtures("blank", "calibrate_once")
-def test_calibrate_replaces_a_model_in_use_only_by_force(few) -> None:
+@pytest.mark.usefixtures("blank")
+def test_calibrate_replaces_a_model_in_use_only_by_force_and_leaves_parts_out(few) -> None:
     before = files_in("model")
     Path("pad.toml").write_text(SPEC.replace("[rig]", "max_failures = 0\n[rig]"))
     assert few("calibrate", "rec", *BARE, "--seed", "5")[0] == 0
@@ -43,17 +44,12 @@ def test_calibrate_replaces_a_model_in_use_only_by_force(few) -> None:
     Path("fibre_loss.json").write_text(json.dumps({"provenance": {"inputs": {"localizer": provenance}}}))
     assert few("calibrate", "rec", *BARE, "--seed", "5")[0] == 0  # the same again
     assert few("calibrate", "rec", *BARE)[0] == 2
-    assert few("calibrate", "rec", *BARE, "--force")[0] == 0
-
-
-def test_calibrate_leaves_parts_out(few) -> None:
-    """And what an earlier calibration left of them, in the folder of which it is."""
-    for name in HEALTH_FILES:
-        Path("model", name).touch()
-    assert {"health.json", "error_map.png"} < files_in("model").keys()
-    code, out, _ = few("calibrate", "rec", "--out", "model", *BARE, "--json")
+    for name in (*HEALTH_FILES, *PICTURES):  # of an earlier calibration, which had all parts
+        Path(name).touch()
+    code, out, _ = few("calibrate", "rec", *BARE, "--force", "--json")
     assert (code, json.loads(out)["by_moment"]) == (0, [])
-    assert files_in("model").keys() == {"localizer.json", "localizer.safetensors", "calibration.json"}
+    left = {"localizer.json", "localizer.safetensors", "calibration.json", "fibre_loss.json", "pad.toml"}
+    assert files_in(".").keys() == left
 
 
 def test_interrupted_calibrate_leaves_no_file(few, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -50,7 +50,7 @@ class Session:
         return "\n".join(self.lines)
 
 
-@pytest.mark.usefixtures("blank", "calibrate_once")
+@pytest.mark.usefixtures("blank")
 def test_session_of_few_presses(few: Run, golden: Golden, monkeypatch: pytest.MonkeyPatch) -> None:
     """A calibration is evaluated, exported and followed; presses in the wrong unit and a misplaced one are doubtful."""
     monkeypatch.setattr(training, "RETRAINING_STEPS", 15)

@@ -3,7 +3,7 @@
 import json
 import os
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -22,12 +22,11 @@ from padforge.sense.formats.ros_recording import import_bag
 from padforge.sense.live import outputs
 from padforge.sense.rig import operation
 from padforge.sense.settings import RigSettings
-from tests.emulators.boards import EmulatedLineBoard, emulated_header
 from tests.emulators.finger import Finger
 from tests.emulators.rigs import emulate_printer, printer_settings
 from tests.helpers.rigs import rig_toml
 from tests.sense.cli.conftest import Run
-from tests.sense.rig.fakes import PAD, RIG, FakeArm, FakeBoard, Time
+from tests.sense.rig.fakes import PAD, RIG, FakeArm, FakeBoard, FingerBoard, Time
 
 EMULATED = pytest.mark.skipif(not hasattr(os, "openpty"), reason="there are no pseudo-terminals here")
 
@@ -241,33 +240,27 @@ def test_doctor_says_how_a_rig_is(bench: Bench, golden) -> None:
     golden("rig/doctor.txt", "\n".join(bench.transcript))
 
 
-@pytest.fixture
-def finger(padforge_sense) -> Iterator[Finger]:
-    """One that presses a pad, whose board pad.toml names, in the folder of the command."""
-    pad, rig = Morphology.straight(2), RigSettings(presses=2, readings_per_press=10)
+def test_record_by_hand(padforge_sense, monkeypatch: pytest.MonkeyPatch) -> None:
+    pad, rig, time = PAD, RigSettings(presses=2, readings_per_press=10, board_rate_hz=40.0), Time(least_s=0.025)
     pad.save("morphology.json")
+    Path("pad.toml").write_text(rig_toml(rig, pad.grid))
     finger = Finger(pad, Contact(), rig, rig.board_rate_hz)
-    with EmulatedLineBoard(finger.volts, emulated_header(rig.board_rate_hz, len(pad.knots))) as board:
-        Path("pad.toml").write_text(rig_toml(rig.model_copy(update={"port": board.port}), pad.grid))
-        yield finger
-
-
-@EMULATED
-@pytest.mark.slow
-def test_record_by_hand(padforge_sense, finger: Finger, monkeypatch: pytest.MonkeyPatch) -> None:
-    """In real time, which the board needs."""
+    board = FingerBoard(finger, time, {"name": "virtual", "channels": len(pad.knots), "rate_hz": rig.board_rate_hz})
+    monkeypatch.setattr(operation, "make_board", lambda rig, inputs: board)
 
     class WatchedPage(outputs.LivePage):
         def show(self, view: Mapping[str, Any]) -> None:
             super().show(view)
             finger.look(view)
+            assert time() < 1000, "the recording comes to no end"
 
         def read_commands(self) -> list[str]:
             return [*super().read_commands(), *finger.commands()]
 
     monkeypatch.setattr(outputs, "LivePage", WatchedPage)
     by_hand = ("record", "--rig", "hand", "--out", "rec")
-    code, out, err = padforge_sense(*by_hand)
+    with time.of_all():
+        code, out, err = padforge_sense(*by_hand)
     assert code == 0, err
     assert "http://127.0.0.1:" in err
     recording = Recording.open("rec")

@@ -1,4 +1,4 @@
-"""Run a module with LeRobot: `python run.py MODULE ARGUMENTS`."""
+"""Run modules with LeRobot, one after the other: `python run.py MODULE ARGUMENTS + MODULE ARGUMENTS`."""
 
 import runpy
 import sys
@@ -12,5 +12,8 @@ except RuntimeError:  # PyPI's Linux wheel needs CUDA for its operators; LeRobot
     for name in ("nms", "qnms"):
         operators.define(f"{name}(Tensor dets, Tensor scores, float iou_threshold) -> Tensor")
 
-sys.argv = sys.argv[1:]
-runpy.run_module(sys.argv[0], run_name="__main__", alter_sys=True)
+words = sys.argv[1:]
+while words:
+    end = words.index("+") if "+" in words else len(words)
+    sys.argv, words = words[:end], words[end + 1 :]
+    runpy.run_module(sys.argv[0], run_name="__main__", alter_sys=True)

@@ -26,7 +26,7 @@ pytestmark = pytest.mark.slow
 
 @pytest.fixture(scope="module")
 def lerobot(pytestconfig: pytest.Config, tmp_path_factory: pytest.TempPathFactory) -> Run:
-    """Run a module with LeRobot, which is installed once for each list of requirements; return its output."""
+    """Run modules with LeRobot, which is installed once for each list of requirements; return their output."""
     requirements, cache = HERE / "requirements.txt", pytestconfig.cache.mkdir("lerobot")  # type: ignore[union-attr]
     texts = (path.read_bytes() for path in [requirements, *sorted(PLUGIN.glob("*.*"))])
     packages = cache / hashlib.sha256(b"".join(texts)).hexdigest()[:12]
@@ -53,53 +53,60 @@ def lerobot(pytestconfig: pytest.Config, tmp_path_factory: pytest.TempPathFactor
     return run
 
 
-def read_dataset(lerobot: Run, folder: Path) -> dict[str, Any]:
-    out = folder.with_suffix(".json")
-    lerobot("read_dataset", folder, out)
-    read = json.loads(out.read_text())
-    read["frames"] = {name: np.array(values) for name, values in read["frames"].items()}
-    return read
+def test_lerobot_records_a_pad_beside_an_arm_and_opens_exported_datasets(
+    lerobot: Run, brief: Recording, model: Path, tmp_path: Path
+) -> None:
+    recording, touches = annotated(brief)
+    export_lerobot(recording, tmp_path / "exported", touches)
+    names = "exported", "recorded"
+    said = lerobot(  # all in one process: its imports take longest
+        "lerobot.scripts.lerobot_record",
+        "--teleop.discover_packages_path=virtual_arm",  # the arm of the tests; the pad is found by its name
+        *("--robot.type=padforge", f"--robot.model={model}", "--robot.robot={type: virtual_arm, start: -3}"),
+        *("--teleop.type=virtual_leader", f"--dataset.root={tmp_path / 'recorded'}"),
+        *("--dataset.repo_id=padforge/test", "--dataset.num_episodes=2"),
+        *("--dataset.single_task=Touch.", "--dataset.fps=20", "--dataset.episode_time_s=2"),
+        *("--dataset.reset_time_s=0", "--dataset.push_to_hub=false", "--play_sounds=false"),
+        *("+", "read_dataset", *(tmp_path / name for name in names)),
+    )
+    exported, recorded = (json.loads((tmp_path / f"{name}.json").read_text()) for name in names)
+    for read in (exported, recorded):
+        read["frames"] = {name: np.array(values) for name, values in read["frames"].items()}
+    check_exported(exported, recording, touches)
+    assert len(recorded["episodes"]) == 2, said
+    check_recorded(recorded)
 
 
-def test_lerobot_opens_exported_datasets(lerobot: Run, brief: Recording, tmp_path: Path) -> None:
+def annotated(brief: Recording) -> tuple[Recording, ModelAnnotations]:
+    """A recording with readings that are missing, and touches mirrored about the middle."""
     readings = brief.readings.copy()
     readings[50:60, 1] = np.nan
     presses = len(brief.presses_mm)
     forces, r90 = np.linspace(1, 5, presses), np.linspace(0.5, 2, presses)
-    recording = replace(brief, readings=readings, forces_n=forces)
     nan = np.full(presses, np.nan)
-    export_lerobot(
-        recording, tmp_path / "set", ModelAnnotations(-brief.presses_mm, np.ones((presses, 2)), r90, nan, nan)
-    )
-    read = read_dataset(lerobot, tmp_path / "set")
-    frames, state = read["frames"], recording.readings.astype(np.float32)
-    ends = np.append((brief.up_command[:-1] + brief.down_command[1:]) // 2, len(readings))
+    touches = ModelAnnotations(-brief.presses_mm, np.ones((presses, 2)), r90, nan, nan)
+    return replace(brief, readings=readings, forces_n=forces), touches
+
+
+def check_exported(read: dict[str, Any], recording: Recording, touches: ModelAnnotations) -> None:
+    frames, state, presses = read["frames"], recording.readings.astype(np.float32), len(recording.presses_mm)
+    ends = np.append((recording.up_command[:-1] + recording.down_command[1:]) // 2, len(state))
     assert read["episodes"] == np.column_stack([np.append(0, ends[:-1]), ends]).tolist()
     assert (read["fps"], read["robot_type"], set(read["tasks"])) == (13, "padforge", {"Press the pad."})
     np.testing.assert_array_equal(frames["observation.state"], state)
     episodes = np.repeat(np.arange(presses), np.diff(ends, prepend=0))
     np.testing.assert_array_equal(frames["episode_index"], episodes)
-    index = np.arange(len(readings))
+    index = np.arange(len(state))
     np.testing.assert_allclose(frames["timestamp"] * 13, index - np.append(0, ends[:-1])[episodes], atol=1e-3)
-    is_over = index >= brief.up_command[episodes]
-    touch = np.column_stack([-brief.presses_mm[episodes], r90[episodes], np.ones(len(index))])
+    is_over = index >= recording.up_command[episodes]
+    touch = np.column_stack([-recording.presses_mm[episodes], touches.r90_mm[episodes], np.ones(len(index))])
     np.testing.assert_allclose(frames["observation.touch"], np.where(is_over[:, None], touch, 0), rtol=1e-6)
     statistics = read["stats"]["observation.state"]
     np.testing.assert_allclose(statistics["mean"], np.nanmean(state, axis=0), rtol=1e-5)
     np.testing.assert_allclose(statistics["max"], np.nanmax(state, axis=0), rtol=1e-6)
 
 
-def test_lerobot_records_a_pad_beside_an_arm(lerobot: Run, model: Path, tmp_path: Path) -> None:
-    said = lerobot(
-        "lerobot.scripts.lerobot_record",
-        "--teleop.discover_packages_path=virtual_arm",  # the arm of the tests; the pad is found by its name
-        *("--robot.type=padforge", f"--robot.model={model}", "--robot.robot={type: virtual_arm, start: -3}"),
-        *("--teleop.type=virtual_leader", f"--dataset.root={tmp_path / 'set'}", "--dataset.repo_id=padforge/test"),
-        *("--dataset.single_task=Touch.", "--dataset.fps=20", "--dataset.episode_time_s=2", "--dataset.num_episodes=2"),
-        *("--dataset.reset_time_s=0", "--dataset.push_to_hub=false", "--play_sounds=false"),
-    )
-    read = read_dataset(lerobot, tmp_path / "set")
-    assert len(read["episodes"]) == 2, said
+def check_recorded(read: dict[str, Any]) -> None:
     names, fibres = read["features"]["observation.state"], [f"pad.fibre_{fibre}_v" for fibre in range(4)]
     touch = [f"pad.{name}" for name in ("pressed", "valid", "x_mm", "y_mm", "r90_mm", "unlike")]
     assert names == ["elbow.pos", "wrist.pos", *fibres, *touch]

@@ -33,21 +33,14 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
 
 
-def test_program_prints_each_press(
-    localizer: LocalizerModel, recording: Recording, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_program_prints_each_press(localizer: LocalizerModel, recording: Recording, capsys) -> None:
     localizer.save("out/example")
     recording.save("out/example/recording", {})
     exec(PROGRAMS[0], {})
     assert check_places(capsys.readouterr().out, recording) == 9
 
 
-def test_program_reads_a_board(
-    localizer: LocalizerModel,
-    recording: Recording,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_program_reads_a_board(localizer: LocalizerModel, recording: Recording, monkeypatch, capsys) -> None:
     """A board that prints 106 lines a second, until it is unplugged."""
     stream = repeated(recording, 8)
     times_s, rows = iter(stream.times_s[:1500].tolist()), iter(stream.readings[:1500])

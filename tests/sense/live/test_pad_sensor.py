@@ -60,9 +60,7 @@ def sensor(model: Path) -> Iterator[PadSensor]:
     sensor.close()
 
 
-def test_sensor_reads_what_the_pipeline_says(
-    boards: list[ReplayedBoard], sensor: PadSensor, few: Recording, localizer: LocalizerModel
-) -> None:
+def test_sensor_reads_what_the_pipeline_says(boards, sensor: PadSensor, few: Recording, localizer) -> None:
     with pytest.raises(InputError, match="the pad is not connected"):
         sensor.read()
     sensor.connect()
@@ -84,9 +82,7 @@ def test_sensor_reads_what_the_pipeline_says(
     assert [sensor.read()[name] for name in ("pressed", "valid", "x_mm", "r90_mm")] == [0, 0, 0, 0]
 
 
-def test_sensor_reads_where_the_press_under_way_is(
-    boards: list[ReplayedBoard], sensor: PadSensor, few: Recording, localizer: LocalizerModel
-) -> None:
+def test_sensor_reads_where_the_press_under_way_is(boards, sensor: PadSensor, few: Recording, localizer) -> None:
     end = boards[0].end = int(few.up_command[1]) - 1
     sensor.connect()
     values, pipeline = sensor.read(), Live(localizer, rate_hz=few.rate_hz)

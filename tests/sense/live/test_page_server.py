@@ -7,14 +7,13 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from http.client import HTTPConnection, HTTPResponse
-from pathlib import Path
 
 import pytest
 
 from padforge.common import server as page_server
 from padforge.common.server import HOST
 from padforge.sense.live.outputs import LivePage
-from tests.helpers.chromium import CHROMIUM, Chromium
+from tests.helpers.chromium import Chromium
 
 HOSTILE = '<img src="x" onerror="document.title=1"> & [bold]'
 VIEW = {
@@ -160,11 +159,9 @@ def test_commands_are_accepted_from_the_page_only(page: LivePage, hand_page: Liv
     assert hand_page.read_commands() == ["skip"]
 
 
-@pytest.fixture
-def browser(tmp_path: Path) -> Iterator[Chromium]:
-    if CHROMIUM is None:
-        pytest.skip("no Chromium is installed")
-    with Chromium(tmp_path, "--disable-gpu") as browser:
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Chromium]:
+    with Chromium(tmp_path_factory.mktemp("profile"), "--disable-gpu") as browser:
         yield browser
 
 

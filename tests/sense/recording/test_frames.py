@@ -120,7 +120,7 @@ def test_live_averages_a_faster_stream(localizer: LocalizerModel, recording: Rec
     def estimates(times: int) -> list[Estimate]:
         stream = repeated(recording, times)
         live = Live(localizer, rate_hz=stream.rate_hz)
-        end = int(stream.down_command[12])
+        end = int(stream.down_command[6])
         return [e for e in live.feed(stream.times_s[:end], stream.readings[:end]) if isinstance(e, Estimate)]
 
     once, often = estimates(1), estimates(6)

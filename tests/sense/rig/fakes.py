@@ -15,6 +15,7 @@ from padforge.sense.rig import clock
 from padforge.sense.rig.config import RobotFrame
 from padforge.sense.rig.devices import ArmState, BoardSamples, Pose, RigFault
 from padforge.sense.settings import RigSettings
+from tests.emulators.finger import Finger
 
 PAD = Morphology.straight(2)
 FIBRES = 4
@@ -153,6 +154,27 @@ class FakeBoard:
 
     def close(self) -> None:
         pass
+
+
+class FingerBoard:
+    """Reads what a finger does to the pad; its identity says at what rate."""
+
+    def __init__(self, finger: Finger, time: Time, identity: dict[str, Any]) -> None:
+        self._finger, self._time, self._identity = finger, time, identity
+
+    def connect(self) -> dict[str, Any]:
+        self._began_s, self._count = self._time(), 0
+        return self._identity
+
+    def read(self) -> BoardSamples:
+        rate_hz = self._identity["rate_hz"]
+        count = int((self._time() - self._began_s) * rate_hz)
+        times_s = self._began_s + np.arange(self._count + 1, count + 1) / rate_hz
+        self._count = count
+        return BoardSamples(times_s, self._finger.volts(times_s), np.zeros(len(times_s), np.int64))
+
+    def close(self) -> None:
+        """Nothing is open."""
 
 
 def fault_of(action: Callable[[], object], cause: str, match: str = ".") -> float:

@@ -7,6 +7,7 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -26,7 +27,6 @@ from padforge.sense.rig.by_hand import (
     UNTOUCHED,
     PressSequence,
     PressValidator,
-    open_recorder_by_hand,
     pad_view,
     plan_targets,
     press_responses,
@@ -34,15 +34,13 @@ from padforge.sense.rig.by_hand import (
     view_lines,
 )
 from padforge.sense.rig.config import RigConfig
-from padforge.sense.rig.devices import BoardSamples, RigFault
+from padforge.sense.rig.devices import RigFault
 from padforge.sense.settings import RigSettings
 from padforge.sense.signals.press_detection import PressDetector, PressEvent
 from tests.emulators.finger import SCATTER_MM, Finger
 from tests.helpers.page_names import names_in_view
 from tests.sense.conftest import QUICK, few_moments
-from tests.sense.rig.fakes import Time
-
-IDENTITY = {"name": "board", "channels": 4, "rate_hz": 1000.0}
+from tests.sense.rig.fakes import FingerBoard, Time
 
 
 def config_of(**settings: object) -> RigConfig:
@@ -83,54 +81,9 @@ def test_pad_view_shows_where_to_press(golden) -> None:
     np.testing.assert_allclose([path[0] for path in view["paths"]], pad.to_mm(pad.knots[:, 0]), atol=0.051)
 
 
-@pytest.fixture
-def config(tmp_path: Path) -> RigConfig:
-    """A recording whose first two presses are made, and one at an unknown place."""
-    config = RigConfig(Morphology.straight(2), Contact(), RigSettings(presses=5), tmp_path / "run", "test", [])
-    recorder, targets, remaining = open_recorder_by_hand(config, IDENTITY, resume=False)
-    np.testing.assert_array_equal(remaining, targets)
-    with recorder:
-        recorder.append(np.arange(20.0), np.ones((20, 4)))
-        for press, place in enumerate((targets[0], (np.nan, np.nan), targets[1])):
-            recorder.begin(place, 2 + 5 * press)
-            recorder.finish(5 + 5 * press)
-    return config
-
-
-def test_open_recorder_by_hand_resumes_the_stored_plan(config: RigConfig) -> None:
-    source = json.loads((config.out / "start.json").read_text())["source"]
-    assert (source["kind"], source["devices"]["board"]) == ("hand", IDENTITY)
-    assert source["plan"]["columns"] == ["x_mm", "y_mm"]
-    assert len(source["plan"]["presses"]) == 5
-    recorder, targets, remaining = open_recorder_by_hand(config, IDENTITY, resume=True)
-    with recorder:
-        assert targets.tolist() == source["plan"]["presses"]
-        np.testing.assert_array_equal(remaining, targets[2:])
-        assert recorder.n_readings == 20
-
-
 HAND_PAD = Morphology.random(3, knots=3, seed=5)
 HAND_RIG = RigSettings(presses=6, readings_per_press=16, board_rate_hz=40.0)
-
-
-class FingerBoard:
-    """Reads what the finger does to the pad."""
-
-    def __init__(self, finger: Finger, clock: Time) -> None:
-        self._finger, self._clock = finger, clock
-
-    def connect(self) -> dict[str, Any]:
-        self._began_s, self._count = self._clock(), 0
-        return {"name": "virtual", "channels": 2 * HAND_PAD.grid, "rate_hz": HAND_RIG.board_rate_hz}
-
-    def read(self) -> BoardSamples:
-        count = int((self._clock() - self._began_s) * HAND_RIG.board_rate_hz)
-        times_s = self._began_s + np.arange(self._count + 1, count + 1) / HAND_RIG.board_rate_hz
-        self._count = count
-        return BoardSamples(times_s, self._finger.volts(times_s), np.zeros(len(times_s), np.int64))
-
-    def close(self) -> None:
-        """Nothing is open."""
+IDENTITY = {"name": "virtual", "channels": 2 * HAND_PAD.grid, "rate_hz": HAND_RIG.board_rate_hz}
 
 
 class Hands:
@@ -160,7 +113,7 @@ class Hands:
             watch(view)
 
         with self.clock.of_all():
-            board = FingerBoard(self.finger, self.clock)
+            board = FingerBoard(self.finger, self.clock, IDENTITY)
             return record_by_hand(self.config, board, show, lambda: [*commands(), *self.finger.commands()], resume)
 
     def strokes_of(self, recording: Recording) -> list[Any]:
@@ -201,7 +154,7 @@ def distances_mm(recording: Recording, strokes: np.ndarray) -> list[float]:
 @pytest.fixture(scope="module")
 def clumsy(tmp_path_factory: pytest.TempPathFactory) -> tuple[Hands, Recording]:
     """A recording in which three presses of ten go wrong."""
-    hand = Hands(tmp_path_factory.mktemp("hand"), mishaps=0.3, presses=30)
+    hand = Hands(tmp_path_factory.mktemp("hand"), mishaps=0.3, presses=40)
     return hand, hand.record()
 
 
@@ -236,7 +189,7 @@ def test_swings_are_towards_the_response(clumsy: tuple[Hands, Recording]) -> Non
     swings = np.array([fibre["swing"] for fibre in view["fibres"]])
     assert np.corrcoef(swings, response)[0, 1] > 0.95
     assert 0.1 < np.abs(swings).max() < 2
-    assert hand.views[-1]["done"] == hand.views[-1]["total"] == 30
+    assert hand.views[-1]["done"] == hand.views[-1]["total"] == 40
     assert names_in_view("hand.html") <= (pad_view(HAND_PAD, "hand") | hand.views[-1]).keys()
 
 
@@ -287,6 +240,9 @@ def test_session_tells_what_to_do_and_keeps_what_was_done(hands, golden) -> None
     shown = [first[phase] for phase in ("settle", "press", "hold", "lift", "wait", "done")]
     golden("rig/hand_views.json", [*shown, next(view for view in hand.views if view["rejected"])])
     golden("rig/hand_journal.ndjson", (hand.out / "journal.ndjson").read_text())
+    source = json.loads((hand.out / "start.json").read_text())["source"]
+    assert (source["kind"], source["devices"]["board"]) == ("hand", IDENTITY)
+    assert source["plan"] == {"columns": ["x_mm", "y_mm"], "presses": hand.targets.tolist()}
     assert accepted_mm(recording).tolist() == np.delete(hand.targets, 3, axis=0).tolist()
     hand.record(resume=True)  # what was skipped is asked for again
     np.testing.assert_array_equal(np.sort(accepted_mm(Recording.open(hand.out)), axis=0), np.sort(hand.targets, axis=0))
@@ -452,10 +408,8 @@ def test_validator_follows_the_drift_of_the_baseline(validator: PressValidator) 
     assert validator.is_touched(BASELINE) is None
 
 
-@pytest.mark.slow
-def test_calibrate_learns_from_a_recording_by_hand(hands) -> None:
-    hand = hands(mishaps=0.2, presses=40)
-    recording = hand.record()
+def test_calibrate_learns_from_a_recording_by_hand(clumsy: tuple[Hands, Recording]) -> None:
+    hand, recording = clumsy
     with few_moments():
         _, evaluation = calibrate(recording, QUICK.model_copy(update={"members": 1, "epochs": 6}))
     scale_mm = np.linalg.norm(hand.targets - hand.targets.mean(axis=0), axis=1).mean()
@@ -464,20 +418,10 @@ def test_calibrate_learns_from_a_recording_by_hand(hands) -> None:
 
 def test_presses_are_held_for_half_a_cycle_at_the_rate_of_the_board(monkeypatch: pytest.MonkeyPatch, tmp_path) -> None:
     """A board of 1000 Hz gives 500 readings a second where 400 are asked for: every second sample."""
-    holds_s: list[float] = []
-
-    class EndedError(Exception):
-        """The session is not run."""
-
-    def begin(recorder: object, fibres: int, targets_mm: np.ndarray, hold_s: float, n_done: int) -> None:
-        holds_s.append(hold_s)
-        raise EndedError
-
-    class Connected:
-        connect = staticmethod(lambda: IDENTITY | {"channels": 8})
-
-    monkeypatch.setattr(by_hand, "HandSession", begin)
+    session, board = Mock(side_effect=EOFError), Mock()  # the session is not run
+    board.connect.return_value = {"name": "board", "channels": 8, "rate_hz": 1000.0}
+    monkeypatch.setattr(by_hand, "HandSession", session)
     config = replace(config_of(presses=3, rate_hz=400.0, readings_per_press=40), out=tmp_path / "out")
-    with pytest.raises(EndedError):
-        record_by_hand(config, Connected(), lambda view: None, list)  # type: ignore[arg-type]
-    assert holds_s == [20 / 500]
+    with pytest.raises(EOFError):
+        record_by_hand(config, board, lambda view: None, list)
+    assert session.call_args.args[3] == 20 / 500

@@ -130,8 +130,10 @@ def test_move_refuses_impossible_pose(robot: EmulatedUR5, arm: UR5) -> None:
 
 def refused_until_cured(arm: UR5, spoil: Callable[[], object], cause: str, cure: Callable[[], object]) -> None:
     spoil()
-    assert fault_of(arm.connect, seconds=1.5) == cause
-    cure()
+    try:
+        assert fault_of(arm.connect, seconds=1.5) == cause
+    finally:  # others use the arm, too
+        cure()
 
 
 def test_connect_refuses_unavailable_arm(robots: Any, host: str) -> None:

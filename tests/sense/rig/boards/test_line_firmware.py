@@ -1,17 +1,14 @@
 """The sketch itself, compile_sketch for this computer with a stand-in for the chip; the program's decoder reads it."""
 
+from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from padforge.sense.rig.boards import line_board
-from padforge.sense.rig.boards.line_board import (
-    LineAssembler,
-    LineDecoder,
-    LineHeader,
-    LineSample,
-)
+from padforge.sense.rig.boards.line_board import LineAssembler, LineDecoder, LineHeader, LineSample
 from padforge.sense.rig.devices import BoardSamples
 from tests.emulators.boards import format_header, format_sample
 from tests.sense.rig.boards.firmware import compile_sketch, run_sketch
@@ -30,8 +27,14 @@ BOOT_US, PERIOD_US = 4_294_900_000, 2000
 
 
 @pytest.fixture(scope="module")
-def program(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return compile_sketch("line", FIRMWARE, tmp_path_factory.mktemp("firmware"), "ESP32")
+def programs(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
+    """By the name of a board; each is compiled once."""
+    return cache(lambda board: compile_sketch("line", FIRMWARE, tmp_path_factory.mktemp("firmware"), board))
+
+
+@pytest.fixture
+def program(programs: Callable[[str], Path]) -> Path:
+    return programs("ESP32")
 
 
 def read(program: Path, *script: str) -> tuple[list[LineHeader | LineSample], bytes]:
@@ -49,12 +52,9 @@ def assemble(header: LineHeader, samples: list[LineSample]) -> BoardSamples:
     return LineAssembler(header, range(header.channels)).assemble([(1.0, samples)])
 
 
-@pytest.mark.parametrize(
-    "board", ["ESP32", *(pytest.param(name, marks=pytest.mark.slow) for name in ("ARDUINO_SAM_DUE", "TEENSY"))]
-)
-def test_firmware_sends_header_at_start_and_on_request(board: str, program: Path, tmp_path: Path) -> None:
-    runs = program if board == "ESP32" else compile_sketch("line", FIRMWARE, tmp_path, board)
-    items, _ = read(runs, "run 5000", "host x", "host ?", "run 5000")
+@pytest.mark.parametrize("board", ["ESP32", "ARDUINO_SAM_DUE", pytest.param("TEENSY", marks=pytest.mark.slow)])
+def test_firmware_sends_header_at_start_and_on_request(board: str, programs: Callable[[str], Path]) -> None:
+    items, _ = read(programs(board), "run 5000", "host x", "host ?", "run 5000")
     n_samples = 6 if board == "ARDUINO_SAM_DUE" else 3  # within 5 ms, and as the host says x
     assert [place for place, item in enumerate(items) if isinstance(item, LineHeader)] == [0, 1 + n_samples]
     assert items[0] == items[1 + n_samples] == HEADERS[board]
@@ -73,10 +73,10 @@ def test_firmware_samples_every_input_once_a_period(program: Path) -> None:
     assert lines == [format_sample(item.time_us, item.counts, True) for item in samples]
 
 
-def test_due_averages_conversions_of_every_input(tmp_path: Path) -> None:
+def test_due_averages_conversions_of_every_input(programs: Callable[[str], Path]) -> None:
     """Eight, after one that is dropped; the mean of 12 bits is told in 16."""
     header = HEADERS["ARDUINO_SAM_DUE"]
-    items, _ = read(compile_sketch("line", FIRMWARE, tmp_path, "ARDUINO_SAM_DUE"), "run 200000")
+    items, _ = read(programs("ARDUINO_SAM_DUE"), "run 200000")
     samples = select_samples(items)
     assert len(samples) == 200
     conversions = (256 * np.arange(12)[:, None] + np.arange(8 * 200)) % 4096

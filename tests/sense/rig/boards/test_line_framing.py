@@ -132,21 +132,12 @@ def test_assemble_follows_inexact_rate_and_late_lines(share: float) -> None:
     assert np.array_equal(np.cumsum(1 + samples.missing) - 1, slots - slots[0])
 
 
-@pytest.mark.parametrize(
-    ("before_us", "after", "match"),
-    [
-        (10**6, np.arange(1, 20) * 1000, "a line came -[0-9]+ us after another by the board's clock, not 1000; it was"),
-        (2**31 + 10**7, np.arange(1, 20) * 1000, "it was reset"),
-        (10**6, 2e6 + np.arange(1, 20), "a line came [1-8] us after another .* are its times ms"),
-        (10**6, 2e6 + np.arange(1, 200) * 700, "us after another by the board's clock, not 1000"),
-    ],
-    ids=["reset", "reset after half the range", "milliseconds", "too fast"],
-)
-def test_assemble_raises_for_repeatedly_impossible_times(before_us: int, after: np.ndarray, match: str) -> None:
+def test_assemble_notices_a_reset_after_half_the_range() -> None:
+    """Other times that cannot be are in the table of refusals."""
     assembler = LineAssembler(THREE, (0, 1, 2))
-    read(before_us + np.arange(1001) * 1000, assembler)
-    with pytest.raises(RigFault, match=match) as caught:
-        read(after, assembler)
+    read(2**31 + 10**7 + np.arange(1001) * 1000, assembler)
+    with pytest.raises(RigFault, match="it was reset") as caught:
+        read(np.arange(1, 20) * 1000, assembler)
     assert caught.value.cause == "data"
 
 
