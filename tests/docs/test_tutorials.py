@@ -30,7 +30,6 @@ import pytest
 
 from padforge.design.objectives import bayes_error
 from padforge.design.optimize import problem
-from padforge.fabricate.outputs import pictures
 from padforge.sense.health import trace_model
 from tests.docs.pages import BLOCK, ROOT, command_lines, relative
 from tests.helpers.door import Ended, called
@@ -245,7 +244,6 @@ def run_padforge(words: list[str], folder: Path) -> Ended:
         patch.object(trace_model, "MAX_STEPS", trace_model.MAX_STEPS // SHORTER),
         patch.dict(problem.STEPS, {contact: steps // share for contact, steps in problem.STEPS.items()}),
         patch.object(bayes_error, "PRESSES", bayes_error.PRESSES // share),
-        patch.object(pictures, "PIXELS", 100),  # which take most of the time of pictures of moulds
     ):
         return called(*words, cwd=folder)
 
