@@ -144,4 +144,5 @@ def test_profile_option_prints_to_stderr(tmp_path, monkeypatch):
     assert json.loads(ended.out)["format"] == "padforge-design/1"
     told = dict(line.split(maxsplit=1) for line in ended.err.splitlines() if line.startswith("  "))
     assert told["starts"] == "0 of 1"
+    assert all(name in told["imports"] for name in ("build123d", "manifold3d", "pymoo", "h5py", "torch", "trimesh"))
     assert "numba" not in told["imports"].split(" (not ")[0]
