@@ -1,7 +1,6 @@
 """Checkpoints of a search: resuming, damage, and removal."""
 
 import os
-from itertools import count
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +8,7 @@ import pytest
 
 from padforge.common.parallel import Checkpoints
 from padforge.common.validation import InputError
-from tests.helpers.kills import killed
+from tests.helpers.kills import after_kills
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="kills and locks as POSIX has them")
 
@@ -27,15 +26,10 @@ def work(folder: Path) -> None:
 @pytest.mark.slow
 def test_checkpoints_resume_after_a_kill_at_any_operation(tmp_path: Path) -> None:
     left = set()
-    for number in count():
-        folder = tmp_path / str(number) / "search"
-        folder.parent.mkdir()
-        ended = not killed(lambda folder=folder: work(folder), number, folder.parent)
-        left |= {path.name.partition("-")[0] for path in folder.glob("*")}
-        work(folder)
-        assert not list(folder.parent.iterdir())
-        if ended:
-            break
+    for folder in after_kills(lambda folder: work(folder / "search"), Path.mkdir, tmp_path):
+        left |= {path.name.partition("-")[0] for path in (folder / "search").glob("*")}
+        work(folder / "search")
+        assert not list(folder.iterdir())
     assert left >= {".unfinished", "search.json", "start_0000.npz"}
 
 

@@ -3,7 +3,6 @@
 import logging
 import os
 import shutil
-import subprocess
 import sys
 import tempfile
 import time
@@ -59,13 +58,6 @@ def test_compilation_is_announced_unless_it_is_short_or_cached(
     monkeypatch.setattr(compilation, "PATIENCE_S", 0.0)
     assert notes(1) == []  # read from disk
     assert set(notes(1.5)) == {"compiling kernels"}  # another type is compiled
-
-
-def test_programs_use_the_kernels_of_the_tests() -> None:
-    """Else each test session would compile all kernels twice."""
-    code = "from padforge.common.compilation import cache_folder; print(cache_folder())"
-    said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
-    assert said.strip() == str(compilation.cache_folder())
 
 
 @pytest.fixture

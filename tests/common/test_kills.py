@@ -1,26 +1,24 @@
 """A kill between any two file operations leaves the old set of files, the new one, or one without its document."""
 
 import os
-from itertools import count
 from pathlib import Path
 
 import pytest
 
 from padforge.common import files
 from padforge.common.validation import InputError
-from tests.helpers.kills import killed
+from tests.helpers.kills import after_kills
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="kills as POSIX has them")
 
 NAMES = ("a.csv", "b.png", "mine.txt", "set.json")
 
 
-def make_set(folder: Path) -> Path:
+def make_set(folder: Path) -> None:
     """A folder with files of an earlier run, and one of a person."""
     folder.mkdir()
     for name in NAMES:
         (folder / name).write_text("old")
-    return folder
 
 
 def replace_set(folder: Path) -> None:
@@ -37,9 +35,7 @@ def test_atomic_files_after_a_kill_at_any_operation(tmp_path: Path) -> None:
     old = dict.fromkeys(NAMES, "old")
     new = {"b.png": "new", "c.csv": "new", "set.json": "new", "mine.txt": "old"}
     results = []
-    for number in count():
-        folder = make_set(tmp_path / str(number))
-        ended = not killed(lambda folder=folder: replace_set(folder), number, folder)
+    for folder in after_kills(replace_set, make_set, tmp_path):
         after = read_set(folder)
         results.append("old" if after == old else "new" if after == new else "refused")
         assert after["mine.txt"] == "old"
@@ -48,19 +44,12 @@ def test_atomic_files_after_a_kill_at_any_operation(tmp_path: Path) -> None:
                 files.read_json(folder / "set.json", "set/1")
         replace_set(folder)  # nothing that a kill leaves is in the way of the next run
         assert read_set(folder) == new
-        if ended:
-            break
     assert sorted(set(results), key=results.index) == ["old", "refused", "new"]
     assert results == sorted(results, key=["old", "refused", "new"].index)
 
 
 def test_atomic_file_after_a_kill_at_any_operation(tmp_path: Path) -> None:
-    results = []
-    for number in count():
-        folder = make_set(tmp_path / str(number))
-        ended = not killed(lambda path=folder / "set.json": files.write_text(path, "new"), number, folder)
-        results.append((folder / "set.json").read_text())
-        if ended:
-            break
+    folders = after_kills(lambda folder: files.write_text(folder / "set.json", "new"), make_set, tmp_path)
+    results = [(folder / "set.json").read_text() for folder in folders]
     assert results == sorted(results, reverse=True)
     assert {*results} == {"old", "new"}

@@ -60,8 +60,10 @@ def parser(monkeypatch: pytest.MonkeyPatch) -> click.Command:
 
 
 @pytest.mark.parametrize("page", PAGES, ids=relative)
-def test_commands_on_pages_parse(page: Path, parser: click.Command) -> None:
+def test_commands_on_pages_parse_and_quote_commas(page: Path, parser: click.Command) -> None:
+    """PowerShell takes an argument with a comma apart, unless it is in quotes."""
     for command, whole in commands(page.read_text(encoding="utf-8")):
+        assert not whole or "," not in re.sub(r"'[^']*'|\"[^\"]*\"", "", command), f"{relative(page)}: {command}"
         for call in arguments(command):
             try:
                 parser.main(call, standalone_mode=False, prog_name="padforge")
@@ -71,43 +73,22 @@ def test_commands_on_pages_parse(page: Path, parser: click.Command) -> None:
                 pytest.fail(f"{relative(page)}: {command}: {error.format_message()}")
 
 
-@pytest.mark.parametrize("page", PAGES, ids=relative)
-def test_commands_on_pages_quote_commas(page: Path) -> None:
-    """PowerShell takes an argument with a comma apart, unless it is in quotes."""
-    for command, whole in commands(page.read_text(encoding="utf-8")):
-        assert not whole or "," not in re.sub(r"'[^']*'|\"[^\"]*\"", "", command), f"{relative(page)}: {command}"
-
-
 @pytest.mark.parametrize(
     ("name", "command"), list(every(cli)), ids=lambda value: value if isinstance(value, str) else ""
 )
-def test_help_examples_parse(name: str, command: click.Command, parser: click.Command) -> None:
-    lines = [line for line in cleandoc(command.help or "").splitlines() if line.startswith("padforge ")]
-    assert [line for line in lines if line.startswith(name)]
-    for line in lines:
+def test_help_examples_parse_and_groups_list_all_commands_uncut(
+    name: str, command: click.Command, parser: click.Command
+) -> None:
+    examples = [line for line in cleandoc(command.help or "").splitlines() if line.startswith("padforge ")]
+    assert [line for line in examples if line.startswith(name)]
+    for line in examples:
         example, _, _ = line.partition("  ")  # what follows explains it
         for call in arguments(example):
             parser.main(call, standalone_mode=False, prog_name="padforge")
-
-
-@pytest.mark.parametrize(
-    ("name", "group"),
-    [pair for pair in every(cli) if isinstance(pair[1], click.Group)],
-    ids=lambda value: value if isinstance(value, str) else "",
-)
-def test_group_lists_all_commands_uncut_in_80_columns(name: str, group: click.Group) -> None:
-    lines = group.get_help(click.Context(group, info_name=name, terminal_width=80)).splitlines()
-    assert [line for line in lines if len(line) > 80] == []
-    for word in group.commands:
-        listed = [line for line in lines if re.match(rf"  {word}  ", line)]
-        assert len(listed) == 1, word
-        assert not listed[0].endswith("..."), listed
-
-
-def test_help_of_sense_lists_commands_by_what_they_are_for() -> None:
-    sense = cli.commands["sense"]
-    text = sense.get_help(click.Context(sense, info_name="padforge sense"))
-    listed = re.findall(r"^(\w+):\n((?:  .+\n?)+)", text, re.MULTILINE)
-    headings = {heading: re.findall(r"^  ([\w-]+) ", rows, re.MULTILINE) for heading, rows in listed}
-    assert [*headings] == ["Options", "Record", "Calibrate", "Use", "Study"]
-    assert headings["Use"] == ["live", "locate", "health", "deploy"]
+    if isinstance(command, click.Group):
+        lines = command.get_help(click.Context(command, info_name=name, terminal_width=80)).splitlines()
+        assert [line for line in lines if len(line) > 80] == []
+        for word in command.commands:
+            listed = [line for line in lines if re.match(rf"  {word}  ", line)]
+            assert len(listed) == 1, word
+            assert not listed[0].endswith("..."), listed

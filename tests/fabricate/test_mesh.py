@@ -1,5 +1,6 @@
 """Files of meshes: there and back, damaged, or made to be awkward; each is read and judged, or refused in one line."""
 
+import itertools
 import json
 import zipfile
 from pathlib import Path
@@ -126,27 +127,23 @@ def test_read_mesh_leaves_out_what_is_not_printed(tmp_path, caplog, objects, ite
 BEYOND = TRIANGLE.replace('v3="2"', 'v3="9"')
 
 
-MODELS = {
-    "missing": (model("", '<item objectid="1"/>'), "model.3mf"),
-    "none": (model("", ""), "model.3mf"),
-    "beyond": (model(f'<object id="1">{BEYOND}</object>', '<item objectid="1"/>'), "model.3mf"),
-    "outside": ('<!DOCTYPE x [<!ENTITY a SYSTEM "file:///dev/zero">]><model>&a;</model>', "model.3mf"),
-    "text": ("no model at all", "model.3mf"),
+BROKEN_FILES = {
+    "missing.3mf": model("", '<item objectid="1"/>'),
+    "none.3mf": model("", ""),
+    "beyond.3mf": model(f'<object id="1">{BEYOND}</object>', '<item objectid="1"/>'),
+    "outside.3mf": '<!DOCTYPE x [<!ENTITY a SYSTEM "file:///dev/zero">]><model>&a;</model>',
+    "text.3mf": "no model at all",
 }
+TORN = [None, b"", b"solid\n", b"\0" * 84, b"\xff" * 500]
 
 
-@pytest.mark.parametrize("name", MODELS)
-def test_read_mesh_refuses_broken_3mf_in_one_line(tmp_path, name):
-    content, said = MODELS[name]
-    with pytest.raises(InputError, match=said) as refusal:
-        read_mesh(packed(tmp_path / "model.3mf", content))
-    require_line(refusal.value, "model.3mf")
-
-
-@pytest.mark.parametrize("name", ["torn.stl", "torn.3mf"])
-@pytest.mark.parametrize("content", [None, b"", b"solid\n", b"\0" * 84, b"\xff" * 500])
+@pytest.mark.parametrize(
+    ("name", "content"), [*BROKEN_FILES.items(), *itertools.product(("torn.stl", "torn.3mf"), TORN)]
+)
 def test_check_mesh_refuses_other_files_in_one_line(tmp_path, name, content):
-    if content is not None:
+    if isinstance(content, str):
+        packed(tmp_path / name, content)
+    elif content is not None:
         (tmp_path / name).write_bytes(content)
     with pytest.raises(InputError) as refusal:
         check_mesh(tmp_path / name)

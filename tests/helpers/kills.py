@@ -2,7 +2,9 @@
 
 import os
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from functools import partial
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -41,3 +43,13 @@ def killed(work: Callable[[], object], number: int, folder: Path) -> bool:
     code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
     assert code in (0, KILLED), code
     return code == KILLED
+
+
+def after_kills(work: Callable[[Path], object], make: Callable[[Path], object], base: Path) -> Iterator[Path]:
+    """Folders filled by `make`, in which `work` is killed before its first change, its second, ...; at last it ends."""
+    for number in count():
+        make(folder := base / str(number))
+        was_killed = killed(partial(work, folder), number, folder)
+        yield folder
+        if not was_killed:
+            break

@@ -2,6 +2,7 @@
 
 import json
 import os
+import resource
 import shutil
 import signal
 import subprocess
@@ -15,9 +16,9 @@ import pytest
 from padforge.common.files import find_unchanged, write_json
 from padforge.design.morphology import Morphology
 from padforge.fabricate.mesh import read_mesh
-from tests.helpers.door import contents
+from tests.helpers.door import called, contents
 
-pytestmark = [pytest.mark.slow, pytest.mark.skipif(os.name != "posix", reason="limits and signals as POSIX has them")]
+pytestmark = pytest.mark.skipif(os.name != "posix", reason="limits and signals as POSIX has them")
 
 CHEAP = """
 [pad]
@@ -48,69 +49,52 @@ COMMANDS = {
 }
 """Commands that write into the folder `pad`, cheap ones."""
 
-ENDED = """
-import resource, sys
-limit = int(sys.argv.pop(1))
-if limit >= 0:
-    resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
-from padforge.cli import main
-main()
-"""
-"""The command line under a limit of the size of files, bytes; -1 for none."""
-
-
-@pytest.fixture(scope="module")
-def made(tmp_path_factory) -> Path:
-    """A folder with settings, and a pad in `made` that was designed before."""
-    folder = tmp_path_factory.mktemp("disk")
-    (folder / "pad.toml").write_text(CHEAP)
-    Morphology.random(2, 1, 3).save(folder / "made" / "morphology.json")
-    return folder
-
 
 @pytest.fixture
-def room(made: Path, tmp_path: Path) -> Path:
-    """Such a folder of its own, with the results of an earlier search in `pad`."""
+def room(tmp_path: Path) -> Path:
+    """A folder with settings, a pad in `made`, and the results of an earlier search in `pad`."""
     (tmp_path / "pad.toml").write_text(CHEAP)
     for name in ("made", "pad"):
-        (tmp_path / name).mkdir()
-        (tmp_path / name / "morphology.json").write_bytes((made / "made" / "morphology.json").read_bytes())
+        Morphology.random(2, 1, 3).save(tmp_path / name / "morphology.json")
     write_json(tmp_path / "pad" / "fabrication.json", {"format": "padforge-fabrication/1"})
     return tmp_path
 
 
-def start(folder: Path, *arguments: str, limit: int = -1, tied: bool = False) -> subprocess.Popen[str]:
-    # Root may write everywhere, unless it starts without that right.
-    without = ["setpriv", "--bounding-set", "-dac_override,-dac_read_search"] if tied and os.geteuid() == 0 else []
-    return subprocess.Popen(
-        [*without, sys.executable, "-c", ENDED, str(limit), *arguments],
-        cwd=folder,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
+EACH = """
+import sys
+from padforge.cli import main
+for words in sys.argv[1:]:
+    sys.argv = ["padforge", *words.split()]
+    try:
+        main()
+    except SystemExit as end:
+        print(end.code)
+"""
+"""Several commands in one process, with their exit codes."""
 
 
-def require_whole_file(path: Path) -> None:
-    """See that a file can be read to its end by what reads its kind."""
-    match path.suffix:
-        case ".json":
-            json.loads(path.read_text())
-        case ".stl" | ".3mf":
-            read_mesh(path)
-        case ".png":
-            assert path.read_bytes().endswith(b"IEND\xaeB`\x82"), path
-        case ".svg":
-            assert path.read_text().rstrip().endswith("</svg>"), path
-        case ".npz":
-            np.load(path).close()
+def start(folder: Path) -> subprocess.Popen[str]:
+    """Begin to make a mould."""
+    command = [sys.executable, "-m", "padforge", *COMMANDS["fabricate"], "--formats", "stl,3mf,svg"]
+    return subprocess.Popen(command, cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
 
 def require_whole(folder: Path) -> None:
     """Every file in a folder can be read to its end by what reads its kind; temporary ones are none."""
     for path in folder.rglob("*"):
-        if path.is_file() and not any(part.startswith(".") for part in path.relative_to(folder).parts):
-            require_whole_file(path)
+        if not path.is_file() or any(part.startswith(".") for part in path.relative_to(folder).parts):
+            continue
+        match path.suffix:
+            case ".json":
+                json.loads(path.read_text())
+            case ".stl" | ".3mf":
+                read_mesh(path)
+            case ".png":
+                assert path.read_bytes().endswith(b"IEND\xaeB`\x82"), path
+            case ".svg":
+                assert path.read_text().rstrip().endswith("</svg>"), path
+            case ".npz":
+                np.load(path).close()
 
 
 def litter(folder: Path) -> list[str]:
@@ -118,41 +102,42 @@ def litter(folder: Path) -> list[str]:
     return [name for _, inner, files in os.walk(folder) for name in (*inner, *files) if name.startswith(".unfinished-")]
 
 
-@pytest.mark.parametrize(
-    ("name", "limit"),
-    [
-        ("design", 2000),
-        ("fabricate", 2000),
-        ("record", 0),
-    ],
-)
+@pytest.mark.parametrize(("name", "limit"), [("design", 2000), ("fabricate", 2000), ("record", 0)])
 def test_full_disk_leaves_old_files_and_no_temporary_files(room: Path, name: str, limit: int):
     before = (room / "pad" / "morphology.json").read_bytes()
-    child = start(room, *COMMANDS[name], limit=limit)
-    _, err = child.communicate(timeout=120)
-    assert child.returncode == 2, err
-    assert err.startswith("padforge: "), err
-    assert err.count("\n") == 1, err
+    allowed = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (limit, allowed[1]))
+    try:
+        ended = called(*COMMANDS[name], cwd=room)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, allowed)
+    assert (ended.code, ended.err.count("\n")) == (2, 1), ended
+    assert ended.err.startswith("padforge: "), ended
     assert litter(room) == []
     require_whole(room)
     if limit == 0:
         assert (room / "pad" / "morphology.json").read_bytes() == before
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(os.geteuid() == 0 and not shutil.which("setpriv"), reason="root may write everywhere")
-@pytest.mark.parametrize("name", ["fabricate", "record"])
-def test_read_only_folder_is_refused_in_one_line(room: Path, name: str):
+def test_read_only_folder_is_refused_in_one_line(room: Path):
     (room / "pad").chmod(0o555)
     before = contents(room)
-    child = start(room, *COMMANDS[name], tied=True)
-    _, err = child.communicate(timeout=120)
-    assert (child.returncode, err.count("\n")) == (2, 1), err
-    assert err.startswith("padforge: "), err
+    # Root may write everywhere, unless it starts without that right.
+    without = ["setpriv", "--bounding-set", "-dac_override,-dac_read_search"] if os.geteuid() == 0 else []
+    words = [" ".join(COMMANDS[name]) for name in ("fabricate", "record")]
+    ended = subprocess.run(
+        [*without, sys.executable, "-c", EACH, *words], cwd=room, capture_output=True, text=True, timeout=120
+    )
+    assert (ended.stdout, ended.stderr.count("\n")) == ("2\n2\n", 2), ended
+    assert all(line.startswith("padforge: ") for line in ended.stderr.splitlines()), ended
     assert contents(room) == before
 
 
+@pytest.mark.slow
 def test_kill_while_writing_leaves_one_mould(room: Path):
-    child = start(room, *COMMANDS["fabricate"])
+    child = start(room)
     deadline = time.monotonic() + 60
     while not litter(room / "pad") and child.poll() is None and time.monotonic() < deadline:
         time.sleep(0.0005)
@@ -161,15 +146,16 @@ def test_kill_while_writing_leaves_one_mould(room: Path):
     assert child.returncode in (-signal.SIGKILL, 0), err
     require_whole(room)
     if not (room / "pad" / "fabrication.json").exists():
-        child = start(room, *COMMANDS["fabricate"])
+        child = start(room)
         assert child.wait(timeout=60) == 0, child.communicate()
     digests = json.loads((room / "pad" / "fabrication.json").read_text()).get("sha256", {})
     there = {path.name for path in (room / "pad").glob("[!.]*") if path.is_file()}
     assert there - {"morphology.json", "fabrication.json"} == digests.keys() == find_unchanged(room / "pad", digests)
 
 
+@pytest.mark.slow
 def test_concurrent_runs_leave_one_result(room: Path):
-    children = [start(room, *COMMANDS["fabricate"]) for _ in range(2)]
+    children = [start(room) for _ in range(2)]
     for child in children:
         _, err = child.communicate(timeout=120)
         assert child.returncode in (0, 1, 2), err

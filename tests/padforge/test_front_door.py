@@ -10,9 +10,11 @@ from pathlib import Path
 import pytest
 
 import padforge
-from padforge import Spec, design, fabricate, sense
-from padforge.design import Contact, PadSettings, RulesSettings, SearchSettings
+from padforge import design, fabricate, sense
+from padforge.common import compilation
 from tests.helpers.door import called, refused
+
+SMALLEST = "[pad]\ngrid = 1\n[search]\nknots = 1\nstarts = 1\nsteps = 1\nmax_failures = 1\n"
 
 
 def loaded_by(*codes: str) -> list[set[str]]:
@@ -28,10 +30,12 @@ def test_package_help_and_stages_import_only_what_they_need(tmp_path: Path) -> N
     pad, build = "p = design.Morphology.straight(1)", f"build(p, {str(tmp_path)!r}, ['stl', 'svg'])"
     compare = "from padforge.design.contact_comparison import errors_by_contact"
     settings = "design.PadSettings(grid=1), design.SearchSettings(max_failures=0)"
-    package, helped, stage, built, compared = loaded_by(
+    (tmp_path / "pad.toml").write_text(SMALLEST)
+    package, helped, stage, designed, built, compared = loaded_by(
         "import padforge",
         "sys.argv = ['padforge', '--help']; from padforge.cli import main; main()",
         "import padforge.fabricate.cli",
+        f"import os; os.chdir({str(tmp_path)!r}); sys.argv = ['padforge', 'design', '--json']; main()",
         f"from padforge import build, design; {pad}; design.signals(p, [[1, 1]]); {build}",
         f"{compare}; errors_by_contact({{'': p}}, {{'': design.Contact()}}, {settings})",
     )
@@ -42,8 +46,10 @@ def test_package_help_and_stages_import_only_what_they_need(tmp_path: Path) -> N
     assert not helped & (cad | {"numpy", "numba", "pydantic", "shapely"})
     assert "padforge.fabricate.cli" in stage
     assert not stage & (cad | {"trimesh", "manifold3d", "numpy", "pydantic"})
+    assert "numba" in designed
+    assert not designed & {"build123d", "manifold3d", "pymoo", "h5py", "torch", "trimesh"}
     assert built >= {"numba", "manifold3d"}
-    assert not built & (cad - {"matplotlib"})
+    assert not built & (cad - {"matplotlib"} | {"ezdxf"})
     assert "padforge.design.objectives.bayes_error" in compared
     assert "torch" not in compared
 
@@ -57,33 +63,15 @@ def test_bench_of_a_wheel_is_refused_in_one_line() -> None:
     assert "checkout" in result.stderr
 
 
-def test_init_writes_settings_that_every_command_reads(tmp_path: Path) -> None:
-    assert called("init", cwd=tmp_path).code == 0
-    text = (tmp_path / "pad.toml").read_text()
-    for section in ("pad", "contact", "search", "rules", "mould", "printer", "dispenser", "rig", "localizer"):
-        assert f"[{section}]" in text
-    assert "exists already" in refused("init", cwd=tmp_path)
-    (tmp_path / "pad.toml").write_text(text.replace('steps = "contact"', "steps = 0"))
-    assert "pad.toml: [search] steps: got 0" in refused("run", cwd=tmp_path)
-
-
-def test_init_writes_published_preset(tmp_path: Path) -> None:
-    """And says which presets there are, where one is asked for that is none."""
-    assert called("init", "--preset", "published", cwd=tmp_path).code == 0
-    spec = Spec.load(tmp_path / "pad.toml")
-    assert spec.section(PadSettings) == PadSettings(sensed_mm="fibres")
-    assert spec.section(Contact) == Contact(
-        radius=0.6, sides=30, weight="uniform", length="manhattan", sensitivity_profile=()
-    )
-    assert spec.section(SearchSettings) == SearchSettings(noise=0.005, scatter=0.0)
-    assert spec.section(RulesSettings) == RulesSettings(max_common_track_mm=None)
-    assert called("init", "other.toml", "--preset", "mine", cwd=tmp_path).code == 2
-    assert "published" in called("init", "--help", cwd=tmp_path).out
+WHOLE = [[-40, -40], [40, -40], [40, 40], [-40, 40]]  # a keep-out
 
 
 @pytest.mark.parametrize(
     ("settings", "words", "said"),
     [
+        ("", "init", "pad.toml: exists already"),
+        ("", "init other.toml --preset mine", "'mine' is not one of 'published'"),
+        ("[search]\nsteps = 0\n", "run", "pad.toml: [search] steps: got 0"),
         ("", "design check none.json", "none.json"),
         ("", "design --knots 0", "Invalid value for '--knots': got 0, input should be greater than or equal to 1"),
         ("[search]\nknots = 3\n", "design --starts -1 --knots 2", "'--starts': got -1, input should be greater"),
@@ -98,12 +86,18 @@ def test_init_writes_published_preset(tmp_path: Path) -> None:
         ("", "fabricate check m.json --picture a.jpg", "--picture is a.jpg, allowed is a name that ends in .png"),
         ('[localizer]\nmethod = "published"\n', "run --time-budget 9", "method: got published with --time-budget"),
         ("[pad]\npitch_mm = 0.3\n", "run", "ridge_width_mm"),
+        ("[rig]\nchannels = [0, 1]\n", "run", "[rig] channels: got 2 inputs, the pad has 8 fibres"),
+        ("[mould]\nexit_width_mm = 12\n", "run", "[mould] exit_width_mm: got 12, allowed is less than the pitch"),
+        ('[rig]\nplan = "adaptive"\n', "run", "[rig] plan is adaptive"),
+        ('[rig]\nplan = "deep.csv"\n', "run", "[rig] presses 6 mm deep, allowed is less than 6 mm"),
+        (f"[pad]\nkeep_out_mm = [{WHOLE}]\n", "run", "[pad] keep_out_mm leaves 0.0% of what is pressed"),
         ('[pad]\n"\\u001b]0;title\\u0007\\u009b2J\\u202eä" = 1\n', "run", r"[pad] \x1b]0;title\x07\x9b2J\u202eä: no"),
     ],
 )
 def test_mistakes_are_refused_in_one_line(tmp_path: Path, settings: str, words: str, said: str) -> None:
     """What would fail late, too: before anything is done."""
     (tmp_path / "pad.toml").write_text(settings)
+    (tmp_path / "deep.csv").write_text("x_mm,y_mm,depth_mm\n1,2,6\n")
     assert said in refused(*words.split(), cwd=tmp_path)
 
 
@@ -116,8 +110,7 @@ def test_only_the_genetic_search_needs_pymoo(tmp_path: Path, monkeypatch: pytest
         return metadata.version(name)
 
     monkeypatch.setattr("padforge.common.files.installed_version", version_without_pymoo)
-    smallest = "[pad]\ngrid = 1\n[search]\nknots = 1\nstarts = 1\nsteps = 1\nmax_failures = 1\n"
-    (tmp_path / "pad.toml").write_text(smallest)
+    (tmp_path / "pad.toml").write_text(SMALLEST)
     said = refused("design", "--method", "genetic", cwd=tmp_path)
     assert said == "padforge: this needs pymoo, which is not installed: pip install 'padforge[design]'\n"
     ended = called("design", cwd=tmp_path)
@@ -140,22 +133,24 @@ def test_package_exports_a_dozen_names_of_the_stages() -> None:
             __import__(name)
 
 
-@pytest.mark.skipif("PADFORGE_WHEEL" not in os.environ, reason="a checkout may be tested, too")
-def test_tests_run_on_the_installed_wheel() -> None:
-    """In this process and in those that it starts; benches come from the checkout, as a wheel has none."""
-    installed = Path(sysconfig.get_path("purelib")) / "padforge"
-    modules = {name: module.__file__ for name, module in sys.modules.items() if name.split(".")[0] == "padforge"}
-    assert len(modules) > 10
-    for name, path in modules.items():
-        assert path is None or name.startswith("padforge.benchmarks") or Path(path).is_relative_to(installed), name
-    code = "import padforge.design.cli; print(padforge.design.cli.__file__)"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert Path(done.stdout.strip()).parent == installed / "design"
+def test_processes_and_tests_import_one_padforge(tmp_path: Path) -> None:
+    """Where a wheel is tested it is that; benches come from the checkout, as a wheel has none.
 
-
-def test_stages_have_one_import_name(tmp_path: Path) -> None:
-    """A checkout shows `design` beside a lab's own folder of that name only to who works in the checkout."""
-    code = "import padforge.design.morphology as m, padforge; print(m.__name__, m.Morphology is padforge.Morphology)"
+    A checkout shows `design` beside a lab's own folder of that name only to who works in the checkout. Compiled kernels
+    are those of the tests: else each session would compile all of them twice.
+    """
+    code = (
+        "import padforge.design.morphology as m, padforge, padforge.common.compilation as c;"
+        "print(m.__name__, m.Morphology is padforge.Morphology, m.__file__, c.cache_folder(), sep='|')"
+    )
     done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=True)
-    assert done.stdout.split() == ["padforge.design.morphology", "True"]
+    name, is_same, path, cache = done.stdout.strip().split("|")
+    assert (name, is_same, cache) == ("padforge.design.morphology", "True", str(compilation.cache_folder()))
     assert not [finder for finder in sys.meta_path if type(finder).__module__.startswith("padforge")]
+    if "PADFORGE_WHEEL" in os.environ:  # a checkout may be tested, too
+        installed = Path(sysconfig.get_path("purelib")) / "padforge"
+        modules = {name: module.__file__ for name, module in sys.modules.items() if name.split(".")[0] == "padforge"}
+        assert len(modules) > 10
+        for name, file in modules.items():
+            assert file is None or name.startswith("padforge.benchmarks") or Path(file).is_relative_to(installed), name
+        assert Path(path).parent == installed / "design"

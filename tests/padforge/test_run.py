@@ -47,21 +47,12 @@ def breaks(*_: object, **__: object) -> None:
 
 
 def test_run_makes_everything(finished: tuple[Path, str]) -> None:
-    out = finished[0] / "out" / "pad"
-    assert {path.name for path in out.iterdir()} >= {
-        *("morphology.json", "design.json", "design.svg", "design.png", "mould.stl", "mould.step", "tracks.svg"),
-        *(
-            "mould.png",
-            "tracks.png",
-            "laying.md",
-            "orientation.svg",
-            "crossing.svg",
-            "fabrication.json",
-            "recording",
-            "contacts.json",
-        ),
-        *("localizer.safetensors", "localizer.json", "calibration.json", "error_map.png", "error_by_loss.png"),
-    }
+    folder, printed = finished
+    out = folder / "out" / "pad"
+    names = "morphology.json design.json design.svg design.png mould.stl mould.step mould.png tracks.svg tracks.png"
+    names += " laying.md orientation.svg crossing.svg fabrication.json recording contacts.json localizer.safetensors"
+    names += " localizer.json calibration.json error_map.png error_by_loss.png"
+    assert {path.name for path in out.iterdir()} >= set(names.split())
     mesh = trimesh.load_mesh(out / "mould.stl")
     assert mesh.is_watertight
     assert mesh.body_count == 1
@@ -78,28 +69,26 @@ def test_run_makes_everything(finished: tuple[Path, str]) -> None:
     assert "http://" not in text.replace("http://www.w3.org", "")
     for heading in ("Fibres", "Mould", "Making the pad", "Recording", "Calibration", "Fibre loss", "Provenance"):
         assert f">{heading}</h2>" in text
-
-
-def test_run_compares_contacts(finished: tuple[Path, str]) -> None:
-    folder, printed = finished
-    rows = json.loads((folder / "out/pad/contacts.json").read_text())["rows"]
+    rows = json.loads((out / "contacts.json").read_text())["rows"]
     assert {row["pad"] for row in rows} == {"designed", "straight"}
     assert len(rows) == 2 * len(judged_contacts(Contact(), SearchSettings()))
     assert all(0 < min(row["errors_mm"]) < 20 for row in rows)
     assert printed.count("\ncontact: expected error ") == 1
 
 
-def test_resume_reuses_finished_run(folder: Path) -> None:
+def test_resume_reuses_finished_run_of_the_same_search(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without it nothing is reused, nor does anything of an earlier run count as finished once it has begun."""
     before = digests(folder, "report.html")
     assert resumed(folder) == ALL
     assert digests(folder, "report.html") == before
-
-
-def test_run_without_resume_reuses_nothing(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """And nothing of an earlier run counts as finished once it has begun."""
+    note = folder / "out" / "pad" / "run.json"
+    kept = note.read_bytes()
     monkeypatch.setattr("padforge.design.design_run.run_design", breaks)
+    assert called("run", "--resume", cwd=folder).code == 0
+    assert called("run", "--resume", "--seed", "1", cwd=folder).code == 130
+    note.write_bytes(kept)
     assert called("run", cwd=folder).code == 130
-    assert not (folder / "out" / "pad" / "run.json").exists()
+    assert not note.exists()
 
 
 @pytest.mark.parametrize(
@@ -119,20 +108,10 @@ def test_resume_repeats_stages_of_changed_settings(
     assert {name for name in ("mould.stl", "recording") if after[name] != before[name]} == others
 
 
-def test_resume_with_another_seed_searches_again(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("padforge.design.design_run.run_design", breaks)
-    assert called("run", "--resume", cwd=folder).code == 0
-    assert called("run", "--resume", "--seed", "1", cwd=folder).code == 130
-
-
 def test_resume_repeats_stages_of_changed_files(folder: Path) -> None:
     def kept() -> dict[str, str]:
-        files = digests(folder, "fabrication.json", *VOLATILE)  # the document has digests of pictures, which are blank
-        return {
-            name: digest
-            for name, digest in files.items()
-            if not name.endswith((".png", "orientation.svg", "crossing.svg"))
-        }
+        blank = (".png", "orientation.svg", "crossing.svg", "fabrication.json")  # pictures, and digests of them
+        return {name: digest for name, digest in digests(folder, *VOLATILE).items() if not name.endswith(blank)}
 
     before = kept()
     (folder / "out" / "pad" / "mould.stl").unlink()
@@ -143,25 +122,13 @@ def test_resume_repeats_stages_of_changed_files(folder: Path) -> None:
 
 
 @pytest.mark.slow
-def test_resume_repeats_interrupted_calibration_only(
+def test_resume_continues_interrupted_search_and_calibration(
     finished: tuple[Path, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """And two runs give the same files."""
+    """And a run broken off twice gives the same files as one that was not."""
     (tmp_path / "pad.toml").write_text(SMALL)
     compare_little(monkeypatch)
     small_pictures(monkeypatch)
-    with monkeypatch.context() as patch:
-        patch.setattr("padforge.sense.report.calibration.calibrate_into", breaks)
-        assert called("run", cwd=tmp_path).code == 130
-    assert resumed(tmp_path) == "design, mould, recording, contacts"
-    assert digests(tmp_path, *VOLATILE) == digests(finished[0], *VOLATILE)
-
-
-@pytest.mark.slow
-def test_resume_continues_search(finished: tuple[Path, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (tmp_path / "pad.toml").write_text(SMALL)
-    compare_little(monkeypatch)
-    blank_pictures(monkeypatch)
     save, begin, found = Checkpoints.save, Checkpoints.begin, []
 
     def save_and_break(kept: Checkpoints, start: int, state: dict) -> None:
@@ -176,11 +143,15 @@ def test_resume_continues_search(finished: tuple[Path, str], tmp_path: Path, mon
         patch.setattr(Checkpoints, "save", save_and_break)
         assert called("run", cwd=tmp_path).code == 9
     assert not (tmp_path / "out" / "pad" / "morphology.json").exists()
-    monkeypatch.setattr(Checkpoints, "begin", begin_and_note)
-    assert resumed(tmp_path, "--formats", "svg") == ""
+    with monkeypatch.context() as patch:
+        patch.setattr(Checkpoints, "begin", begin_and_note)
+        patch.setattr("padforge.sense.report.calibration.calibrate_into", breaks)
+        ended = called("run", "--resume", cwd=tmp_path)
+    assert (ended.code, "reused from an earlier run" in ended.err) == (130, False), ended
     assert [sorted(states) for states in found] == [[0]]
-    assert digests(tmp_path)["morphology.json"] == digests(finished[0])["morphology.json"]
     assert not (tmp_path / "out" / "pad" / "search").exists()
+    assert resumed(tmp_path) == "design, mould, recording, contacts"
+    assert digests(tmp_path, *VOLATILE) == digests(finished[0], *VOLATILE)
 
 
 @pytest.mark.slow

@@ -12,9 +12,11 @@ import pytest
 from padforge.cli import PRESETS
 from padforge.common.settings import Spec
 from padforge.common.validation import InputError
-from padforge.settings import SECTIONS, section_models
+from padforge.design import Contact, PadSettings, RulesSettings, SearchSettings
+from padforge.settings import SECTIONS, check_settings, section_models
 from tests.docs.pages import BLOCK, PAGES, relative
 from tests.helpers.door import called
+from tests.helpers.golden import Golden
 
 MODELS = section_models()
 
@@ -52,10 +54,29 @@ def test_schema_is_valid_and_describes_every_key(schema: Any) -> None:
     assert "null" not in json.dumps(schema)  # which TOML does not have
 
 
-@pytest.mark.parametrize("preset", [None, *PRESETS])
-def test_written_settings_validate(validator: jsonschema.Draft7Validator, tmp_path: Path, preset: str | None) -> None:
-    assert called("init", *(["--preset", preset] if preset else []), cwd=tmp_path).code == 0
-    validator.validate(tomllib.loads((tmp_path / "pad.toml").read_text(encoding="utf-8")))
+def test_written_settings(validator: jsonschema.Draft7Validator, tmp_path: Path, golden: Golden) -> None:
+    """They validate and agree, and let the rig follow the contact; of presets those lines are kept that differ."""
+    lines, defaults = [], ""
+    for preset in ("", *PRESETS):
+        ended = called("init", f"{preset or 'pad'}.toml", *(["--preset", preset] if preset else []), cwd=tmp_path)
+        assert (ended.code, ended.out) == (0, f"settings -> {preset or 'pad'}.toml\n")
+        text = (tmp_path / f"{preset or 'pad'}.toml").read_text(encoding="utf-8")
+        validator.validate(tomllib.loads(text))
+        check_settings(Spec.load(tmp_path / f"{preset or 'pad'}.toml"))
+        assert '\ndepth_mm = "contact" ' in text
+        defaults = defaults or text
+        section, known = "", set(defaults.splitlines())
+        lines += [f"preset {preset}"] if preset else []
+        for line in text.splitlines():
+            section = line if line.startswith("[") else section
+            lines += [f"  {section} {line}"] if line not in known else []
+    golden("padforge/pad.toml", defaults)
+    published = Spec.load(tmp_path / "published.toml")
+    shape = Contact(radius=0.6, sides=30, weight="uniform", length="manhattan", sensitivity_profile=())
+    sections = [PadSettings(sensed_mm="fibres"), shape, SearchSettings(noise=0.005, scatter=0.0)]
+    for section in (*sections, RulesSettings(max_common_track_mm=None)):
+        assert published.section(type(section)) == section
+    golden("padforge/presets.txt", "\n".join(lines))
 
 
 def test_documented_settings_validate(validator: jsonschema.Draft7Validator) -> None:

@@ -38,25 +38,6 @@ def test_every_command_refuses_sections_that_contradict_each_other(tmp_path: Pat
         assert line in refused(*command, cwd=tmp_path), command
 
 
-@pytest.mark.parametrize(
-    ("text", "line"),
-    [
-        ("[rig]\nchannels = [0, 1]\n", "[rig] channels: got 2 inputs, the pad has 8 fibres"),
-        ("[mould]\nexit_width_mm = 12\n", "[mould] exit_width_mm: got 12, allowed is less than the pitch"),
-        ('[rig]\nplan = "adaptive"\n', "[rig] plan is adaptive"),
-        ('[rig]\nplan = "deep.csv"\n', "[rig] presses 6 mm deep, allowed is less than 6 mm"),
-        (
-            "[pad]\nkeep_out_mm = [[[-40, -40], [40, -40], [40, 40], [-40, 40]]]\n",
-            "[pad] keep_out_mm leaves 0.0% of what is pressed",
-        ),
-    ],
-)
-def test_run_refuses_at_its_start_what_would_end_it_later(tmp_path: Path, text: str, line: str) -> None:
-    (tmp_path / "pad.toml").write_text(text)
-    (tmp_path / "deep.csv").write_text("x_mm,y_mm,depth_mm\n1,2,6\n")
-    assert line in refused("run", cwd=tmp_path)
-
-
 def test_thin_pad_is_pressed_as_deep_as_it_is_designed_for(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     """Without a word, which it takes only if the rig presses otherwise."""
     (tmp_path / "thin.toml").write_text(THIN)
@@ -117,11 +98,3 @@ def test_mould_follows_contact_where_it_leaves_the_pad_open() -> None:
     assert cast.pad.deep_family == "horizontal"
     measured = Spec({"contact": {"thickness_mm": 6.1}, "mould": {"silicone_mm": 6.0}})
     assert FabricationSettings.from_spec(measured).mould.silicone_mm == 6.0
-
-
-def test_written_settings_agree_and_let_the_rig_follow(tmp_path: Path) -> None:
-    for preset in ("", "published", "built", "ideal"):
-        path = tmp_path / f"{preset}.toml"
-        assert called("init", str(path), *(("--preset", preset) if preset else ()), cwd=tmp_path).code == 0
-        check_settings(Spec.load(path))
-        assert '\ndepth_mm = "contact" ' in path.read_text()

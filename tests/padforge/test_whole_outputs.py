@@ -7,7 +7,7 @@ from pathlib import Path
 import click
 import pytest
 
-from padforge.cli import PRESETS, cli
+from padforge.cli import cli
 from padforge.common import profiling
 from padforge.design import Contact, Morphology
 from padforge.design.contact import contact_press, fibre_strains, half_width_mm
@@ -36,22 +36,6 @@ def test_help_of_padforge_itself(tmp_path: Path, golden) -> None:
     golden("padforge/help/padforge.txt", called("--help", cwd=tmp_path).out)
     ended = called(cwd=tmp_path)
     assert (ended.code, ended.out, ended.err) == (2, "", called("-h", cwd=tmp_path).out)
-
-
-def test_settings_files(tmp_path: Path, golden) -> None:
-    """Of presets those lines alone that differ."""
-    assert called("init", cwd=tmp_path).out == "settings -> pad.toml\n"
-    defaults = (tmp_path / "pad.toml").read_text(encoding="utf-8")
-    golden("padforge/pad.toml", defaults)
-    lines = []
-    for preset in PRESETS:
-        assert called("init", f"{preset}.toml", "--preset", preset, cwd=tmp_path).code == 0
-        section, known = "", set(defaults.splitlines())
-        lines.append(f"preset {preset}")
-        for line in (tmp_path / f"{preset}.toml").read_text(encoding="utf-8").splitlines():
-            section = line if line.startswith("[") else section
-            lines += [f"  {section} {line}"] if line not in known else []
-    golden("padforge/presets.txt", "\n".join(lines))
 
 
 def test_comparison_of_two_pads(tmp_path: Path, golden, figures, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -14,7 +14,7 @@ from padforge.fabricate.checks.plan_checks import check_plan
 from padforge.fabricate.fibre_placement import check_toolpath, plan_toolpath
 from padforge.fabricate.plan import Plan
 from padforge.fabricate.settings import FabricationSettings
-from tests.fabricate.checks.trays import CROSS, block, check_body, line, prism, ridge, tray
+from tests.fabricate.checks.trays import CROSS, block, check_body, line, prism, ridge, together, tray
 from tests.fabricate.planted import level_pad, with_settings
 
 STRAIGHT = Morphology.straight(2)
@@ -94,8 +94,8 @@ def make_meshes() -> dict[str, Any]:
     return {
         "tray": tray(*CROSS),
         "open box": type(box)(box.vertices, faces[1:]),
-        "two boxes": type(box)(*_joined(box, block(2, 2, 2, at=(30, 7, 0)))),
-        "a box in a box": type(box)(*_joined(box, block(2, 2, 2))),
+        "two boxes": type(box)(*together(box, block(2, 2, 2, at=(30, 7, 0)))),
+        "a box in a box": type(box)(*together(box, block(2, 2, 2))),
         "large": block(300, 20, 5),
         "small": block(0.3, 0.2, 0.05),
         "on its side": tray(*CROSS).rotate((90, 0, 0)),
@@ -105,11 +105,6 @@ def make_meshes() -> dict[str, Any]:
         "narrow": tray(*CROSS, ridge(line((2, -6), (7, -5), width=0.3)), ridge(line((-9, -6), (9, -6))), floor=0.3),
         "leaning inwards": tray(*CROSS, draft_deg=-3),
     }
-
-
-def _joined(*meshes):
-    corners = np.concatenate([mesh.triangles for mesh in meshes]).reshape(-1, 3)
-    return corners, np.arange(len(corners)).reshape(-1, 3)
 
 
 def test_sentences_of_checks_of_meshes(golden):

@@ -2,6 +2,7 @@
 
 import math
 
+import numpy as np
 import shapely
 import trimesh
 from manifold3d import CrossSection, Manifold, OpType
@@ -46,6 +47,12 @@ def spanning(y: float, width: float = 0.4) -> BaseGeometry:
 
 def block(*sizes: float, at: tuple[float, float, float] = (0, 0, 0)) -> trimesh.Trimesh:
     return trimesh.creation.box(sizes, trimesh.transformations.translation_matrix(at))
+
+
+def together(*meshes: trimesh.Trimesh) -> tuple[np.ndarray, np.ndarray]:
+    """Corners and triangles of several meshes as of one."""
+    corners = np.concatenate([mesh.triangles for mesh in meshes]).reshape(-1, 3)
+    return corners, np.arange(len(corners)).reshape(-1, 3)
 
 
 def check_body(solid: Manifold | trimesh.Trimesh, **arguments: object) -> dict[str, Finding]:
