@@ -417,8 +417,8 @@ def _lay_lines(document: Document) -> Iterator[str]:
         " clear. Let it cure before the next step."
     )
     yield (
-        "4. Measure the resistance of every fibre again, write it down, and measure between all fibres: no two may be in"
-        " contact. Then crimp a wire to each end, and pull gently: the resistance must not change."
+        "4. Measure the resistance of every fibre again, write it down, and measure between all fibres: no two may be"
+        " in contact. Then crimp a wire to each end, and pull gently: the resistance must not change."
     )
     yield ""
     rows = []

@@ -33,12 +33,13 @@ from padforge.sense.health.trace_model import (
     extract_trace,
     predict_fibres,
 )
+from padforge.sense.localizer.features import MIN_PRESENT
 from padforge.sense.localizer.model_files import check_same_pad, files_of
 from padforge.sense.recording.frames import framed
 from padforge.sense.recording.recording import PRESSES_DETECTED, Recording
 from padforge.sense.signals.press_detection import align_to_detected
 
-MAX_MISSING = 20  # successive presses without a reading after which a fibre is missing
+MAX_MISSING = 20  # successive presses with too few readings, see `MIN_PRESENT`, after which a fibre is missing
 WINDOW = 64  # presses that are evaluated again to identify a faulty fibre
 MAX_SUSPECTS = 4  # fibres that are compared then
 MAX_SCORE = 99.0  # score of what is certain
@@ -179,7 +180,7 @@ class FaultMonitor:
         return [fault, FibreFault(self.n_presses, since, tuple(sorted(self._suspected)), "misfit", score)]
 
     def _find_missing(self, trace: Array) -> list[FibreFault]:
-        self._n_missing = np.where(np.isfinite(trace).all(axis=1), 0, self._n_missing + 1)
+        self._n_missing = np.where(np.isfinite(trace).mean(axis=1) >= MIN_PRESENT, 0, self._n_missing + 1)
         missing = ~self._failed & (self._n_missing == MAX_MISSING)
         self._failed |= missing
         since = self.n_presses - MAX_MISSING + 1

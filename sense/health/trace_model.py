@@ -44,7 +44,8 @@ LOG_STD = (-4.0, 2.0)  # range of the logarithm of a predicted standard deviatio
 def extract_trace(readings: Array, down_command: int, up_command: int, first: int, end: int) -> Array:
     """Extract the trace (C, TRACE) of a press from the readings (R, C) from `first` to before `end`.
 
-    Missing readings repeat the nearest one; those after the release are NaN if the press ends before it.
+    Before `first` and from `end` on, the nearest reading is repeated; after the release all are NaN if the press ends
+    before it.
     """
     before = np.arange(down_command - REST, down_command).clip(min(first, down_command - 1))
     held = np.minimum(np.arange(down_command, down_command + HELD), up_command - 1)

@@ -362,6 +362,7 @@ class Training:
         phase: Phase,
         bayes: Sequence[BayesianLocalizer] = (),
         start: Weights | None = None,
+        augmentation: float = AUGMENTATION,
     ) -> None:
         rng = np.random.default_rng(seed)
         self.n_steps = 0  # batches so far
@@ -371,7 +372,7 @@ class Training:
         self._bounds = low, high = targets[:, :3].min(axis=0), targets[:, :3].max(axis=0)
         spacing = math.sqrt((high - low)[:2].prod() / len(np.unique(targets[:, :2], axis=0)))
         with_depth = POSITION_AUGMENTATION, POSITION_AUGMENTATION, DEPTH_AUGMENTATION
-        self._std = np.float32(with_depth if sampler.depth_gain else (AUGMENTATION * spacing,) * 2)
+        self._std = np.float32(with_depth if sampler.depth_gain else (augmentation * spacing,) * 2)
         self._force_per_depth = 0.0
         if sampler.depth_gain:
             centred = (targets - targets.mean(axis=0))[:, 2:]
@@ -455,6 +456,7 @@ class Training:
 
 RETRAINING_STEPS = 150  # from a similar response; with 400, networks err no less and are overconfident
 RETRAINING_RATE = 1e-3
+RETRAINING_AUGMENTATION = 2.2  # presses are few: with less, the networks of an unchanged pad err a tenth more
 
 
 def retrain(
@@ -486,13 +488,14 @@ def retrain(
     if residual_network:
         phase = RESIDUAL_PHASE if presses.complete.shape[1] else phases["press"]
         tasks.append((RESIDUAL, residual_network, phase, bayes))
-    seeds = rng.integers(2**63, size=len(tasks)).tolist()
+    members_of = [unstack_members(weights) for _, weights, *_ in tasks]
+    seeds = [rng.integers(2**63, size=len(members)).tolist() for members in members_of]
 
     def train(number: int) -> Weights:
-        _, weights, phase, corrected_bayes = tasks[number]
+        _, _, phase, corrected_bayes = tasks[number]
         members, steps = [], round(RETRAINING_STEPS * phase.length)
-        for member in unstack_members(weights):
-            training = Training(presses, table, options, seeds[number], phase, corrected_bayes, member)
+        for member, seed in zip(members_of[number], seeds[number], strict=True):
+            training = Training(presses, table, options, seed, phase, corrected_bayes, member, RETRAINING_AUGMENTATION)
             parameters = dict(training.network.named_parameters())
             members.append(training.weights(fit_network(parameters, training.loss, steps, RETRAINING_RATE)))
         return stack_members(members)

@@ -42,7 +42,8 @@ class Golden:
         """Compare an output with the one that is kept.
 
         Words must be the same. Numbers may differ by one in the last decimal that is printed, if that is at most
-        `ROUNDING` of them, or by `rtol`; whole numbers by `rtol` alone. Digests, times of the day and the test's folder are left out.
+        `ROUNDING` of them, or by `rtol`; whole numbers by `rtol` alone. Digests, times of the day and the test's folder
+        are left out.
 
         Args:
             name: of the file in `tests/golden`, as "design/score.txt".

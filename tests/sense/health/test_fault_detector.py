@@ -115,6 +115,16 @@ def test_fibre_is_missing_after_twenty_successive_presses(pad: Recording, model:
     assert without(range(20)) == [(first + 19, first, "missing")]
 
 
+@pytest.mark.parametrize(("lost", "is_missing"), [(1, False), (12, False), (13, True)])
+def test_fibre_is_missing_that_lacks_a_quarter_of_its_readings(pad: Recording, model: HealthModel, lost, is_missing):
+    """Of the 50 of a press."""
+    readings = pad.readings.copy()
+    for down in pad.down_command[BAD_FROM : BAD_FROM + 20]:
+        readings[down : down + lost, 2] = np.nan
+    faults = [fault for fault in detect_later(model, readings, pad) if fault.kind == "missing"]
+    assert [fault.fibres for fault in faults] == [(2,)] * is_missing
+
+
 def test_predict_and_update_refuse_other_pads(pad: Recording, model: HealthModel, tmp_path: Path) -> None:
     presses = pad.presses_mm, pad.down_command, pad.up_command
     with pytest.raises(InputError, match="readings are of 5 fibres, health was learnt from 6"):
