@@ -362,7 +362,7 @@ class Training:
         phase: Phase,
         bayes: Sequence[BayesianLocalizer] = (),
         start: Weights | None = None,
-        augmentation: float = AUGMENTATION,
+        spread: float = 1.0,
     ) -> None:
         rng = np.random.default_rng(seed)
         self.n_steps = 0  # batches so far
@@ -372,7 +372,7 @@ class Training:
         self._bounds = low, high = targets[:, :3].min(axis=0), targets[:, :3].max(axis=0)
         spacing = math.sqrt((high - low)[:2].prod() / len(np.unique(targets[:, :2], axis=0)))
         with_depth = POSITION_AUGMENTATION, POSITION_AUGMENTATION, DEPTH_AUGMENTATION
-        self._std = np.float32(with_depth if sampler.depth_gain else (augmentation * spacing,) * 2)
+        self._std = np.float32(with_depth if sampler.depth_gain else (spread * AUGMENTATION * spacing,) * 2)
         self._force_per_depth = 0.0
         if sampler.depth_gain:
             centred = (targets - targets.mean(axis=0))[:, 2:]
@@ -456,7 +456,9 @@ class Training:
 
 RETRAINING_STEPS = 150  # from a similar response; with 400, networks err no less and are overconfident
 RETRAINING_RATE = 1e-3
-RETRAINING_AUGMENTATION = 2.2  # presses are few: with less, the networks of an unchanged pad err a tenth more
+RETRAINING_SPREAD = (
+    1.4  # factor on `AUGMENTATION`, since presses are few; without it an unchanged pad errs a tenth more
+)
 
 
 def retrain(
@@ -495,7 +497,7 @@ def retrain(
         _, _, phase, corrected_bayes = tasks[number]
         members, steps = [], round(RETRAINING_STEPS * phase.length)
         for member, seed in zip(members_of[number], seeds[number], strict=True):
-            training = Training(presses, table, options, seed, phase, corrected_bayes, member, RETRAINING_AUGMENTATION)
+            training = Training(presses, table, options, seed, phase, corrected_bayes, member, RETRAINING_SPREAD)
             parameters = dict(training.network.named_parameters())
             members.append(training.weights(fit_network(parameters, training.loss, steps, RETRAINING_RATE)))
         return stack_members(members)
