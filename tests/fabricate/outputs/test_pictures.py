@@ -85,12 +85,13 @@ def test_mould_picture_has_colours_by_family_and_height(tmp_path, figures):
 
 
 def test_mesh_picture_has_upper_faces_on_top(tmp_path, figures):
-    """A roof that rises along x, from 0 to 10, under a small plate at 7 in its upper left corner."""
+    """A roof that rises along x, from 0 to 10, under a small plate at 7 in its upper left corner, all 20 above z = 0."""
     vertices = [[0, 0, 0], [10, 0, 10], [10, 10, 10], [0, 10, 0], [1, 7, 7], [3, 7, 7], [3, 9, 7], [1, 9, 7.0]]
-    draw_findings(vertices, [[4, 5, 6], [4, 6, 7], [0, 1, 2], [0, 2, 3]], [], tmp_path / "mesh.png")
+    draw_findings(np.add(vertices, (0, 0, 20)), [[4, 5, 6], [4, 6, 7], [0, 1, 2], [0, 2, 3]], [], tmp_path / "mesh.png")
     plate, roof = (colour_at(faces_of(figures[0]), 2, y) for y in (8, 3))
     assert sum(bytes.fromhex(plate[1:])) < sum(bytes.fromhex(roof[1:]))  # the ramp darkens with height
     assert figures[0].axes[0].get_xlim() == (0, 10)
+    assert [text.get_text() for text in figures[0].axes[1].texts] == ["0 mm", "10 mm above the lowest point"]
 
 
 def test_pictures_are_small_and_show_layers_and_marks(tmp_path, monkeypatch):
