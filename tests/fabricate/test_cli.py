@@ -122,11 +122,16 @@ def test_lines_and_documents_of_checks(tmp_path, golden, figures):
     (tmp_path / "small.toml").write_text("[printer]\nbed_mm = [30, 30, 100]\n")
     invoke(tmp_path / "crossed.json", "--formats", "stl", "--out", tmp_path)
     lines = []
-    for file, spec in (("crossed.json", "two.toml"), ("crossed.json", "small.toml"), ("mould.stl", "small.toml")):
+    (tmp_path / "plain.toml").write_text("")
+    checks = ("mould.stl", "plain"), ("crossed.json", "two"), ("crossed.json", "small"), ("mould.stl", "small")
+    for file, name in checks:
+        spec = f"{name}.toml"
         words = ["check", tmp_path / file, "--spec", tmp_path / spec]
         result = invoke(*words, "--picture", tmp_path / "findings.png")
         lines += [f"{file} {spec}: exit code {result.exit_code}", result.output]
     golden("fabricate/checked.txt", "\n".join(lines))
+    assert lines[0] == "mould.stl plain.toml: exit code 0"  # warnings alone
+    assert "warn" in lines[1]
     document = json.loads(invoke(*words, "--json").output)
     golden("fabricate/checked.json", json_text(document))
     for number, figure in enumerate(figures[-3:], 1):

@@ -85,7 +85,7 @@ def test_mould_picture_has_colours_by_family_and_height(tmp_path, figures):
 
 
 def test_mesh_picture_has_upper_faces_on_top(tmp_path, figures):
-    """A roof that rises along x, from 0 to 10, under a small plate at 7 in its upper left corner, all 20 above z = 0."""
+    """A roof that rises by 10 along x, under a small plate at 7 in its upper left corner, all 20 above z = 0."""
     vertices = [[0, 0, 0], [10, 0, 10], [10, 10, 10], [0, 10, 0], [1, 7, 7], [3, 7, 7], [3, 9, 7], [1, 9, 7.0]]
     draw_findings(np.add(vertices, (0, 0, 20)), [[4, 5, 6], [4, 6, 7], [0, 1, 2], [0, 2, 3]], [], tmp_path / "mesh.png")
     plate, roof = (colour_at(faces_of(figures[0]), 2, y) for y in (8, 3))

@@ -13,6 +13,9 @@ from matplotlib.colors import to_rgb
 
 from padforge.common.files import sha256
 from padforge.common.plotting import HORIZONTAL, VERTICAL
+from padforge.common.settings import Spec
+from padforge.design import Morphology
+from padforge.fabricate import FabricationSettings, build
 from padforge.fabricate.outputs import report
 from padforge.fabricate.outputs.report import PackedMesh, fabrication_sections, pack_mesh
 from padforge.report import write_report
@@ -66,6 +69,19 @@ def test_view_colours_heights_from_the_lowest_point_of_the_mesh(made: Path, tmp_
     assert data["low"] == pytest.approx(mould.bounds[0], abs=1e-4)
     size = " x ".join(f"{side:.4g}" for side in np.ptp(mould.vertices, axis=0))
     assert f"The mould, {size} mm. Tops of" in "".join(section.body)
+
+
+@pytest.mark.parametrize("deep", ["horizontal", "vertical"])
+def test_key_of_colours_gives_numbers_the_family_of_their_height(tmp_path: Path, deep: str) -> None:
+    settings = FabricationSettings.from_spec(Spec({"pad": {"deep_family": deep}}))
+    document = build(Morphology.straight(2), tmp_path, ["stl"], settings).to_dict()
+    heights = {fibre["fibre"].split()[0]: fibre["ridge_mm"] for fibre in document["fibres"]}
+    low = min(heights, key=lambda family: heights[family])  # as high as the numbers
+    assert (low, document["settings"]["mould"]["shallow_ridge_height_mm"]) != (deep, heights[deep])
+    section, _ = fabrication_sections(tmp_path, document)
+    first, second = (" and the numbers" * (family == low) for family in ("horizontal", "vertical"))
+    key = f"Tops of horizontal ridges{first} are blue, of vertical ones{second} orange."
+    assert key in "".join(section.body)
 
 
 def test_section_counts_checks_and_gives_first_positions(made: Path) -> None:
