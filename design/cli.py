@@ -21,7 +21,6 @@ if TYPE_CHECKING:
     from padforge.design.settings import Contact, PadSettings
 
 SEARCH = "padforge.design.settings:SearchSettings"
-EDIT_PORT = 8322
 POLL_S = 0.2  # period of checking for Ctrl-C where the system does not wake a waiting thread, s
 MIN_SHOWN_MM = 5e-4  # smallest shift of a fibre's ends that `import` prints, mm
 morphology_argument = click.argument("morphology", type=click.Path(path_type=Path))
@@ -216,7 +215,7 @@ def _load_and_check(
 @common.out_option(what="Morphology to save to", file=True)
 @common.force_option
 @click.option(
-    "--port", type=click.IntRange(0, 65535), default=EDIT_PORT, show_default=True, help="Port of the page; 0: any."
+    "--port", type=click.IntRange(0, 65535), default=8322, show_default=True, help="Port of the page; 0: any."
 )
 def edit(pad: Path | None, spec: Path | None, out: Path | None, force: bool, port: int) -> None:
     """Edit the paths in a browser on this machine. The page shows broken rules and ambiguity at every step.

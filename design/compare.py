@@ -1,4 +1,4 @@
-"""Compare pads: variants of settings side by side, by what they cost to make and by their localisation errors."""
+"""Compare pads, such as those of variants of settings, by what they cost to make and by their localisation errors."""
 
 import itertools
 import re
@@ -91,7 +91,7 @@ def read_variants(
     if not 2 <= len(variants) <= MAX_VARIANTS:
         advice = "name settings or morphologies, or vary a setting with --vary"
         raise InputError(f"pads to compare are {len(variants)}, allowed are 2 to {MAX_VARIANTS}: {advice}")
-    for variant in variants:  # before minutes are spent on another one
+    for variant in variants:  # refuse invalid settings before minutes are spent on another variant
         for model in (PadSettings, SearchSettings, RulesSettings):
             variant.spec.section(model)
     return variants

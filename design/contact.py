@@ -145,12 +145,7 @@ def _sum_elements(
 
 
 def widened(contact: Contact, factor: float) -> Contact:
-    """Return a contact whose press is wider by a factor, of the same weight at its centre.
-
-    Args:
-        contact: a contact of any model.
-        factor: > 0.
-    """
+    """Return a contact whose press is wider by a factor > 0, of the same weight at its centre."""
     if factor == 1:
         return contact
     if contact.model == "layer":
@@ -196,13 +191,8 @@ def indented_signals(
 def depth_terms(depths_mm: Array, contact: Contact) -> Iterator[tuple[Ints, Array, Contact]]:
     """Yield the terms of an interpolation over depth of a quantity that is 0 at depth 0, for presses into a layer.
 
-    Args:
-        depths_mm: depth of each press; shape (Q,), 0 to the depth of the contact, mm.
-        contact: a layer.
-
-    Yields:
-        Indices (n,) of presses, the weights (n,) of a solved contact for them, and that contact. If there are few
-        depths, each is solved, and the weights are 1.
+    The depths (Q,), mm, are from 0 to that of the contact. A term is the indices (n,) of presses, the weights (n,) of a
+    solved contact for them, and that contact. If there are few depths, each is solved, and the weights are 1.
     """
     depths = np.unique(depths_mm)
     if len(depths) <= DEPTH_STEPS:
@@ -254,7 +244,7 @@ def _check_depths(contact: Contact | None, depths_mm: ArrayLike) -> tuple[Contac
 
 
 def _depth_steps(contact: Contact) -> list[Contact]:
-    """Return the contact at the depths for which it is solved, up to its own."""
+    """Return the contact at DEPTH_STEPS depths up to its own."""
     shares = (np.arange(1, DEPTH_STEPS + 1) / DEPTH_STEPS) ** 2
     return [contact.model_copy(update={"depth_mm": share * contact.depth_mm}) for share in shares.tolist()]
 
@@ -383,13 +373,7 @@ def search_precision(contact: Contact) -> float:
 
 @lru_cache(maxsize=128)
 def element_spacings(contact: Contact, unit_mm: float, precision: float) -> tuple[float, float]:
-    """Return the spacings of elements of `element_signals` for a contact with a profile, grid units of `unit_mm`.
-
-    Args:
-        contact: a layer or a profile.
-        unit_mm: the grid unit, mm.
-        precision: as of `signals`.
-    """
+    """Return the spacings of elements of `element_signals` for a layer or a profile, grid units of `unit_mm`."""
     return element_signals.element_spacings(contact_law(contact, unit_mm), precision)
 
 
@@ -411,23 +395,12 @@ def contact_law(contact: Contact, unit_mm: float) -> geometry.WeightLaw:
 
 
 def contact_press(contact: Contact) -> LayerPress:
-    """Return the press of a tool into the layer of a contact, without its `scale`.
-
-    Args:
-        contact: a layer.
-    """
+    """Return the press of the tool of a contact into its layer, without its `scale`."""
     return solve_press(contact.tool, contact.tool_radius_mm, contact.depth_mm, contact.thickness_mm, contact.base)
 
 
 def fibre_strains(contact: Contact) -> list[tuple[float, float]]:
-    """Compute the maximum strains of the horizontal and of the vertical fibres under a press.
-
-    Args:
-        contact: a layer.
-
-    Returns:
-        Compressive strain across the fibres, and tensile strain along them, by family.
-    """
+    """Compute by family the maximum compressive strain across fibres and tensile strain along them, in a layer."""
     press = contact_press(contact)
     distances_mm = np.linspace(0, 2 * press.contact_radius_mm, 100)
     heights_mm = [contact.thickness_mm - depth_mm for depth_mm in contact.fibre_depths_mm]
@@ -436,11 +409,7 @@ def fibre_strains(contact: Contact) -> list[tuple[float, float]]:
 
 
 def describe_large_strain(contact: Contact) -> str:
-    """Return a warning if the linear layer has strains above 1, which are impossible; "" otherwise.
-
-    Args:
-        contact: any contact; only a layer has strains.
-    """
+    """Return a warning if a contact is a layer with strains above 1, which are impossible; "" otherwise."""
     if contact.model != "layer":
         return ""
     press, fibres_mm = contact_press(contact), contact.thickness_mm - min(contact.fibre_depths_mm)
@@ -461,14 +430,8 @@ def profile_weights(contact: Contact) -> tuple[tuple[Array, Array, Array], ...]:
     """Return the weights of a contact that is no shape, once for all fibres, or for each family.
 
     An element has the weight w(d) + v(d) cos^2 phi, with its distance d and the angle phi between the fibre and the
-    direction to the press.
-
-    Args:
-        contact: a layer or a profile.
-
-    Returns:
-        Distances d, mm, ascending from 0 to the end of the weight, and w and v there; all of shape (n,). For a layer
-        they are strains, whose integral over the length of a fibre is its effective elongation.
+    direction to the press. Returned are distances d, mm, ascending from 0 to the end of the weight, and w and v there;
+    all of shape (n,). For a layer these are strains, whose integral along a fibre is its effective elongation.
     """
     if contact.model == "profile":
         distance, weight = np.array(contact.sensitivity_profile).T
@@ -496,10 +459,7 @@ def half_width_mm(contact: Contact) -> float:
 def half_widths_mm(contact: Contact) -> list[float]:
     """Return the largest distance at which the weight is half of its maximum, mm, once for all fibres or by family.
 
-    The weight is the mean over all directions of the fibre.
-
-    Args:
-        contact: a layer or a profile.
+    The weight is that of a layer or a profile, averaged over all directions of the fibre.
     """
     widths = []
     for distance, plain, directed in profile_weights(contact):

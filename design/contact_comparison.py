@@ -1,10 +1,7 @@
-"""Sensitivity of expected errors to the contact model: what becomes of them if the real contact is another one.
-
-The result is `contacts.json`.
-"""
+"""Sensitivity of expected errors to the contact model, written to `contacts.json`."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import partial
 from itertools import product
 from pathlib import Path
@@ -38,7 +35,7 @@ class ContactErrors:
 def errors_by_contact(
     pads: Mapping[str, Morphology], contacts: Mapping[str, Contact], size: PadSettings, search: SearchSettings
 ) -> list[ContactErrors]:
-    """Compute the expected errors of pads of one layout under every contact, contact by contact, by the same draws."""
+    """Compute the expected errors of pads of one layout under every contact, all by the same random numbers."""
     names = list(product(contacts, pads))
     with threadpool_limits(1, "blas"):  # around those of the tasks, which would lift them for one another
         tasks = (((c, p), partial(expected_errors, pads[p], contacts[c], search, size)) for c, p in names)
@@ -67,7 +64,7 @@ def compare_contacts(spec: "Spec", pad: Morphology, out: Path, seed: int | None 
     document = {
         "format": FORMAT,
         "scatter": settings.response_scatter._asdict(),
-        "rows": [{"contact": row.contact, "pad": row.pad, "errors_mm": list(row.errors_mm)} for row in errors],
+        "rows": list(map(asdict, errors)),
         "provenance": provenance("padforge run", settings.seed, [out / "morphology.json"]),
     }
     write_json(out / NAME, document)

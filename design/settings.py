@@ -294,13 +294,10 @@ def _stated_model(stated: Mapping[str, Any]) -> Any:
 
 
 def read_contact(spec: Spec) -> Contact:
-    """Read `[contact]`; lengths of the pad that it does not state are those of the pad as it will be cast.
+    """Read `[contact]` of a settings file; lengths of the pad that it does not state are those of the pad as cast.
 
     These are `thickness_mm`, by `[mould]`, and `fibre_depths_mm`, by the ridges of `[mould]`, the diameter of `[fibre]`
     and the deep family of `[pad]`, as far as the settings state them.
-
-    Args:
-        spec: settings file.
 
     Raises:
         InputError: an unknown key or a value out of range, or a pad that is too thin for the press or its fibres.
@@ -308,7 +305,7 @@ def read_contact(spec: Spec) -> Contact:
     stated = spec.stated(Contact)
     if _stated_model(stated) != "layer":
         return spec.section(Contact)
-    radius_mm = _fibre_radius_mm(spec)
+    radius_mm = _stated_mm(spec, "fibre", "diameter_mm", FIBRE_MM) / 2
     depths_mm = [
         _stated_mm(spec, "mould", key, default) - radius_mm
         for key, default in zip(_RIDGES, TRACK_DEPTHS_MM, strict=True)
@@ -320,11 +317,7 @@ def read_contact(spec: Spec) -> Contact:
 
 
 def contact_designed_for(provenance: Mapping[str, Any]) -> Contact | None:
-    """Return the contact that a pad was designed for; None if its provenance, which is free, does not say so.
-
-    Args:
-        provenance: of the morphology.
-    """
+    """Return the contact that a pad was designed for, by the provenance of its morphology; None if that has none."""
     settings = provenance.get("settings")
     stated = settings.get("contact") if isinstance(settings, Mapping) else None
     if not isinstance(stated, Mapping):
@@ -336,9 +329,7 @@ def contact_designed_for(provenance: Mapping[str, Any]) -> Contact | None:
 def cast_as_contact(spec: Spec, keys: Collection[str]) -> Spec:
     """Return settings whose mould makes the pad that `[contact]` describes, the inverse of `read_contact`.
 
-    Args:
-        spec: settings file.
-        keys: of `[contact]` that the mould follows, of which those other than lengths of the pad do not count.
+    The mould follows the lengths of the pad among the `keys` of `[contact]`.
     """
     return spec.replaced(_tables_of_cast(spec, keys))
 
@@ -346,11 +337,8 @@ def cast_as_contact(spec: Spec, keys: Collection[str]) -> Spec:
 def fill_cast(spec: Spec) -> Spec:
     """Return settings whose mould makes the pad that `[contact]` states, where they leave it open.
 
-    Args:
-        spec: settings file.
-
     Raises:
-        InputError: they state another pad.
+        InputError: the settings state another pad.
     """
     stated, tables = spec.stated(Contact), {}
     if _stated_model(stated) != "layer":
@@ -358,22 +346,15 @@ def fill_cast(spec: Spec) -> Spec:
     slack_mm = CAST_SHARE * read_contact(spec).thickness_mm
     for key in (name for name in _CAST_KEYS if name in stated):
         for section, values in _tables_of_cast(spec, [key]).items():
+            of_section = spec.stated(section)
             for name, value in values.items():
-                _check_agrees(spec, section, name, value, slack_mm, key)
-            tables[section] = tables.get(section, {}) | values | spec.stated(section)
+                got = of_section.get(name, value)
+                is_length = isinstance(value, float)
+                if abs(_stated_mm(spec, section, name, value) - value) > slack_mm if is_length else got != value:
+                    allowed = f"allowed is {value}, as [contact] {key} says, or only one of these keys"
+                    raise InputError(f"{spec.source}: [{section}] {name}: got {short_repr(got)}, {allowed}")
+            tables[section] = tables.get(section, {}) | values | of_section
     return spec.replaced(tables)
-
-
-def _check_agrees(spec: Spec, section: str, name: str, value: Any, slack_mm: float, key: str) -> None:
-    """Refuse a value that a section states beside another one, by which the pad is as `key` of `[contact]` says."""
-    stated = spec.stated(section).get(name, value)
-    if isinstance(value, float):
-        agrees = abs(_stated_mm(spec, section, name, value) - value) <= slack_mm
-    else:
-        agrees = stated == value
-    if not agrees:
-        allowed = f"allowed is {value}, as [contact] {key} says, or only one of these keys"
-        raise InputError(f"{spec.source}: [{section}] {name}: got {short_repr(stated)}, {allowed}")
 
 
 def _tables_of_cast(spec: Spec, keys: Collection[str]) -> dict[str, dict[str, Any]]:
@@ -385,19 +366,15 @@ def _tables_of_cast(spec: Spec, keys: Collection[str]) -> dict[str, dict[str, An
         horizontal, vertical = contact.fibre_depths_mm
         if min(horizontal, vertical) > contact.thickness_mm / 2:  # the face without tracks is pressed
             horizontal, vertical = contact.thickness_mm - horizontal, contact.thickness_mm - vertical
-        radius_mm = _fibre_radius_mm(spec)
+        radius_mm = _stated_mm(spec, "fibre", "diameter_mm", FIBRE_MM) / 2
         heights_mm = [round(depth + radius_mm, 9) for depth in (max(horizontal, vertical), min(horizontal, vertical))]
         tables["mould"] = tables.get("mould", {}) | dict(zip(_RIDGES, heights_mm, strict=True))
         tables["pad"] = {"deep_family": "horizontal" if horizontal > vertical else "vertical"}
     return tables
 
 
-def _fibre_radius_mm(spec: Spec) -> float:
-    return _stated_mm(spec, "fibre", "diameter_mm", FIBRE_MM) / 2
-
-
 def _stated_mm(spec: Spec, section: str, key: str, default: float) -> float:
-    """Return a length that a section states; the default if it is none: those who own the section refuse it."""
+    """Return a length that a section states; the default if it is no number, which the section's model refuses."""
     value = spec.stated(section).get(key, default)
     return float(value) if isinstance(value, int | float) and not isinstance(value, bool) else default
 
@@ -430,13 +407,10 @@ def _check_overshoot(points: tuple[Point, ...]) -> None:
 
 
 PUBLISHED_CONTACT = Contact(radius=0.6)  # of the paper: a polygon of 30 sides, Manhattan lengths
-# the authors' pad: a dome of 0.75 pitches, pressed 5 mm by their code; which family lies deeper, and that the pad slips
-# on its table, is what their readings say
-BUILT_CONTACT = Contact(base="slipping", fibre_depths_mm=FIBRE_DEPTHS_MM[::-1])
 TRACK_WIDTH_MM = 0.4  # default width of a track
-MIN_COMMON_MM = 2.5 * TRACK_WIDTH_MM  # two straight tracks at a right angle have two widths in common
 
-MaxCommon = Annotated[Annotated[float, Field(ge=MIN_COMMON_MM, le=1000)] | None, *null_as("any")]
+# two straight tracks that cross at a right angle have two widths in common
+MaxCommon = Annotated[Annotated[float, Field(ge=2.5 * TRACK_WIDTH_MM, le=1000)] | None, *null_as("any")]
 MaxCrossings = Annotated[Annotated[int, Field(ge=0)] | None, *null_as("any")]
 RuleMm = Annotated[float, Field(ge=0, le=1000)]
 
@@ -490,8 +464,6 @@ WEIGHTS = (1.0, 1e-7, 5e-6)  # published alpha, beta and gamma: weights of entro
 SIDE = 7  # presses per row and column in the published search
 LEVELS = 4096  # levels of the published 12-bit converter
 MAX_LEVELS = 2**24
-
-
 Entropy = Literal["families", "joint"]
 """Entropy in the published objective: of either family, summed, as the published code has it, or of all fibres."""
 
@@ -820,5 +792,9 @@ PUBLISHED: Mapping[str, Settings] = {
     **{"pad": PUBLISHED_PAD, "contact": PUBLISHED_CONTACT, "search": PUBLISHED_SEARCH},
     "rules": RulesSettings(max_common_track_mm=None),
 }
-# settings of the pad that the authors built
-BUILT: Mapping[str, Settings] = {"pad": PadSettings(deep_family="vertical"), "contact": BUILT_CONTACT}
+# settings of the pad that the authors built, pressed by a dome of 0.75 pitches, 5 mm deep by their code; which family
+# lies deeper, and that the pad slips on its table, is what their readings say
+BUILT: Mapping[str, Settings] = {
+    "pad": PadSettings(deep_family="vertical"),
+    "contact": Contact(base="slipping", fibre_depths_mm=FIBRE_DEPTHS_MM[::-1]),
+}

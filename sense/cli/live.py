@@ -15,7 +15,6 @@ from padforge.sense.cli.options import FOLDER, redrawn_lines
 from padforge.sense.cli.rig import check_rig, rig_option
 
 if TYPE_CHECKING:
-    from padforge.sense.health.health_model import HealthModel
     from padforge.sense.live.outputs import OutputStream
     from padforge.sense.live.pipeline import Estimate, Event
     from padforge.sense.localizer.model import LocalizerModel
@@ -91,6 +90,7 @@ def live(
     """
     from padforge.sense.formats.import_export import open_recording
     from padforge.sense.live.outputs import LivePage, MessageBuilder, broadcast
+    from padforge.sense.live.pad_sensor import load_health
     from padforge.sense.live.pipeline import Live
     from padforge.sense.localizer.model import LocalizerModel
     from padforge.sense.rig.streams import stream_recording
@@ -103,7 +103,9 @@ def live(
         else:
             recording = open_recording(replay)
             stream, mirrored = stream_recording(recording, speed), recording.mirrored
-        pipeline = Live(localizer, rate_hz=stream.rate_hz, fibres=stream.fibres, health=_load_health(model))
+        if (health := load_health(model)) is None:
+            echo(f"{model}: health was not learnt, so no faulty fibre will be detected", err=True)
+        pipeline = Live(localizer, rate_hz=stream.rate_hz, fibres=stream.fibres, health=health)
         page = stack.enter_context(LivePage(port, host=output["host"], token=output["token"]))
         if replay is None and rig == "simulated":
             echo("touches are simulated, at random positions; --rig shows those of a real pad", err=True)
@@ -179,16 +181,6 @@ def _open_outputs(
     return outputs, addresses
 
 
-def _load_health(model: Path) -> "HealthModel | None":
-    """Load the health model in the folder of a model; print a line if there is none."""
-    from padforge.sense.live.pad_sensor import load_health
-
-    health = load_health(model)
-    if health is None:
-        echo(f"{model}: health was not learnt, so no faulty fibre will be detected", err=True)
-    return health
-
-
 class EventPrinter:
     """Prints events: all as JSON, or as text without the estimates that add little to the last one of their press."""
 
@@ -212,15 +204,15 @@ class EventPrinter:
     def _is_news(self, estimate: "Estimate") -> bool:
         """Return whether to print an estimate, and remember it if so."""
         latest = self._latest
-        is_news = (
+        if (
             latest is None
             or latest.press != estimate.press
             or estimate.final
             or estimate.is_sharper_than(latest)
             or estimate.has_moved_from(latest)
-        )
-        self._latest = estimate if is_news else latest
-        return is_news
+        ):
+            self._latest = estimate
+        return self._latest is estimate
 
 
 def view_lines(view: dict[str, Any]) -> list[str]:

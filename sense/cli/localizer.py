@@ -13,9 +13,6 @@ from padforge.common.validation import InputError
 from padforge.sense.cli.options import (
     FILE,
     FOLDER,
-    METHODS,
-    PARTS,
-    SPLITS,
     fibre_indices,
     fibres_option,
     max_failures_option,
@@ -31,13 +28,15 @@ from padforge.sense.cli.options import (
 @recording_argument
 @click.option(
     "--method",
-    type=click.Choice(METHODS),
+    type=click.Choice(["ensemble", "published"]),
     help="ensemble: one localizer for all failed fibres; published: the network of the paper.",
 )
 @click.option(
     "--morphology", type=FILE, help="The pad as planned: morphology.json or published .mat, for up to 500 presses."
 )
-@click.option("--test-split", "split", type=click.Choice(SPLITS), help="How test presses are chosen.")
+@click.option(
+    "--test-split", "split", type=click.Choice(["random", "chronological"]), help="How test presses are chosen."
+)
 @click.option(
     "--time-budget",
     type=common.FiniteRange(min=0, min_open=True),
@@ -46,7 +45,7 @@ from padforge.sense.cli.options import (
 )
 @click.option(
     "--without",
-    type=click.Choice(PARTS),
+    type=click.Choice(["health", "figures", "moments"]),
     multiple=True,
     help="Leave out the health of the fibres, the figures, or the errors by moment; may be given several times.",
 )

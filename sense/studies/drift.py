@@ -1,4 +1,4 @@
-"""Drift: what filters and drift compensation bring, on simulated and on real recordings.
+"""Drift: the gain by filters and drift compensation, on simulated and on real recordings.
 
 The published method (paper, section V-A, figure 12 and table III) filters the readings by total variation, and gives
 the network the levels of each fibre before, in and after a press. Here every filter is combined with every kind of
@@ -44,13 +44,11 @@ HIDDEN, EPOCHS = 50, 200
 RIG = RigSettings(presses=1000)  # that records pads
 SIDE = 32  # presses along a side of the published serpentine on which idle shares are simulated
 SETTLED = 10  # readings from a command of the probe to the level, as published: 10, 30 and 50 of a cycle of 40
-SLOW_PRESSES = 15  # with the last one, over whose rest levels the median is the slow baseline
 EXCERPT_PRESSES = 5  # in the figure's excerpt of readings
 MAX_LEVELS = 400  # presses by which the figure shows the drift of a whole recording
 COLUMNS = 2  # recordings side by side whose errors are drawn
 PHASES = (("before", INK), ("pressed", ALARM), ("after", CURVES[2]))
-RAW, AS_PUBLISHED = "none", "robust TV"
-"""No filter, and the published one."""
+RAW, AS_PUBLISHED = "none", "robust TV"  # no filter, and the published one
 FILTERS: dict[str, Callable[[Array], Array]] = {
     RAW: lambda readings: readings,
     "median of 15": partial(running_median, width=15),
@@ -142,7 +140,7 @@ def network_inputs(
     if compensation == "baseline":
         return pressed - before
     if compensation == "slow baseline":
-        return pressed - running_median(before, SLOW_PRESSES, causal=True)
+        return pressed - running_median(before, 15, causal=True)  # of the last 15 presses
     return pressed
 
 

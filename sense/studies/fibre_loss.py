@@ -129,7 +129,7 @@ def fibre_loss_study(
 def _evaluate(
     fibres: int, levels: range, chosen: Failed, positions_mm: Array, predict: Callable[[Failed], Localization]
 ) -> MethodErrors:
-    """Return errors by number and by set of failed fibres, and maps without the worst and the chosen ones."""
+    """Return errors by number and by set of failed fibres, and maps without the worst and the chosen sets."""
     rows, by_subset = errors_by_loss(fibres, levels, predict, positions_mm)
     worst = [
         max((row for row in by_subset if len(row["failed"]) == level), key=lambda row: row["mean_mm"])["failed"]
@@ -163,14 +163,10 @@ def train_without(
     """Train on the other fibres alone, and predict the test presses; independent of all other trainings."""
     remaining = np.setdiff1d(np.arange(recording.fibres), failed)
     partial_recording = replace(recording, readings=recording.readings[:, remaining])
-    rng = np.random.default_rng([options.seed, _bit_mask(failed)])
+    rng = np.random.default_rng([options.seed, sum(1 << fibre for fibre in failed)])
     localizer = fit_recording(partial_recording, training, options, rng)
     prediction = localizer.predict_features(localizer.scaled_features(partial_recording)[test])
     return {key: value for key, value in vars(prediction).items() if key != "measures"}
-
-
-def _bit_mask(failed: Failed) -> int:
-    return sum(1 << fibre for fibre in failed)
 
 
 def fibre_loss_lines(result: FibreLoss) -> list[str]:

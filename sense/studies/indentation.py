@@ -33,8 +33,8 @@ from padforge.sense.studies.study import (
 )
 
 LOG_SCALE = 4.0
-"""Counts below which the logarithm of a reading becomes linear, since there it would be one of noise. To logarithms a
-deeper press adds, as it multiplies all signals."""
+"""Counts below which the logarithm of a reading becomes linear, since readings there are mostly noise. A deeper press
+multiplies all signals, and so adds a constant to their logarithms."""
 DEPTHS = LOW, HIGH = 0.2, 1.0  # least and greatest, as a share of the contact's depth
 MIDDLE = (LOW + HIGH) / 2
 CASES = {"depth unknown": (DEPTHS, False), "depth known": (DEPTHS, True), "one depth": ((MIDDLE, MIDDLE), False)}
@@ -56,13 +56,8 @@ def force_study(
 ) -> Study:
     """Estimate position, depth and force of presses of random depth, from the signals of a pressed layer.
 
-    An unknown depth is compared with one that is an input, and with presses of the middle depth alone.
-
-    Args:
-        pads: the pads, by label.
-        contact: a layer; presses are up to as deep, and at least a fifth as deep. `Contact()` if None.
-        sizes: of the networks and of their sets of presses.
-        seed: of every random choice.
+    Presses are a fifth as deep as those of the contact, `Contact()` if None, to as deep. An unknown depth is compared
+    with one that is an input, and with presses of the middle depth alone.
 
     Raises:
         InputError: the contact is no layer.
@@ -70,7 +65,7 @@ def force_study(
     contact = _check_layer(contact)
     tasks = [
         Task(
-            f"{label}, noise of {_counts(noise)}, {name}",
+            f"{label}, noise of {noise:g} count{'s' * (noise != 1)}, {name}",
             partial(_estimate_depth, pad, contact, *case, noise, sizes, seed),
         )
         for label, pad in pads.items()
@@ -125,10 +120,6 @@ def _estimate_depth(
 def signed_logarithm(counts: Array) -> Array:
     """Return the logarithm of the magnitude of readings, with their sign, linear below LOG_SCALE."""
     return np.sign(counts) * np.log1p(np.abs(counts) / LOG_SCALE)
-
-
-def _counts(number: float) -> str:
-    return f"{number:g} count" if number == 1 else f"{number:g} counts"
 
 
 def _conclude_force(
@@ -238,13 +229,8 @@ def shape_study(
 ) -> Study:
     """Classify the object: tools of unknown depth, and footprints of unknown size, the position unknown too.
 
-    Tools press the layer of the contact, footprints follow the published contact: polygons of one orientation.
-
-    Args:
-        pads: the pads, by label.
-        contact: a layer, whose tools have that tool's radius and are pressed up to as deep. `Contact()` if None.
-        sizes: of the networks and of their sets of presses.
-        seed: of every random choice.
+    Tools of the radius of the contact's, `Contact()` if None, press its layer up to as deep. Footprints are polygons of
+    one orientation under the published contact.
 
     Raises:
         InputError: the contact is no layer.

@@ -29,7 +29,6 @@ from padforge.sense.recording.recording import Recording
 FORMAT = "padforge-learning-curve/1"
 SHARES = (1 / 16, 1 / 8, 1 / 4, 1 / 2, 1.0)  # of the training presses
 MIN_PRESSES = 10  # training presses of the smallest localizer
-EXPONENTS = np.linspace(0.1, 1.5, 57)  # exponents b that are tried
 RESAMPLINGS = 400
 
 
@@ -67,12 +66,12 @@ def learning_curve(
     *,
     on_progress: OnProgress = ignore_progress,
 ) -> LearningCurve:
-    """Train localizers on more and more presses, and extrapolate their error.
+    """Train localizers on growing numbers of presses, and extrapolate their error.
 
     Args:
         recording: with presses of known position.
-        options: how to train; a single member is, so errors are somewhat above those of a calibration. The defaults if
-            None.
+        options: of the training; the defaults if None. A single member is trained, so that errors are somewhat above
+            those of a calibration.
         on_progress: called with (steps done, total, what is done beside the steps).
 
     Raises:
@@ -147,7 +146,7 @@ def fit_power_law(presses: Array, errors: Array) -> tuple[float, float, float]:
         terms = np.column_stack([np.ones_like(presses), (presses / presses[-1]) ** -exponent])
         return nnls(terms / errors[:, None], np.ones_like(errors))
 
-    exponent = min(EXPONENTS.tolist(), key=lambda b: solve(b)[1])
+    exponent = min(np.linspace(0.1, 1.5, 57).tolist(), key=lambda b: solve(b)[1])
     (floor, last), _ = solve(exponent)
     return float(floor), float(last * presses[-1] ** exponent), float(exponent)
 

@@ -35,7 +35,7 @@ SCATTER = SearchSettings().response_scatter
 
 
 class _Objects(NamedTuple):
-    """How the objects of a contact model differ, are named and judged."""
+    """Fields, names and errors of the objects of a contact model."""
 
     size: str  # field of `Contact` that is their size
     other: str  # the other field that differs
@@ -60,13 +60,10 @@ _OBJECTS = {
 
 
 def sensitivity_study(pads: Mapping[str, Morphology], *, contact: Contact | None = None, seed: int = 0) -> Study:
-    """Compare errors for what presses, by networks trained with the same or with something else.
+    """Compare errors by object that presses, of networks trained with that object or with another one.
 
-    Args:
-        pads: the pads, by label.
-        contact: a layer, about whose tool and depth others are tried; or a shape, which is replaced by the published
-            ones. `Contact()` if None.
-        seed: of every random choice.
+    The objects differ in tool radius and depth about those of the contact, if it is a layer, as `Contact()` is; in
+    place of a shape they are the published ones.
 
     Raises:
         InputError: the contact is a profile.

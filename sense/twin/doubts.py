@@ -80,7 +80,7 @@ def _other_wirings(result: Identification) -> Iterator[str]:
     built = result.fit.pad
     planned_mm = planned_paths_mm(built.plan, built.transform, built.fibres)
 
-    def apart_mm(other: Wiring) -> float:
+    def distance_mm(other: Wiring) -> float:
         paths_mm = planned_paths_mm(built.plan, other.transform, other.fibres)
         # a fibre may run either way
         squares = [((planned_mm - paths) ** 2).sum(axis=2).mean(axis=1) for paths in (paths_mm, paths_mm[:, ::-1])]
@@ -88,11 +88,11 @@ def _other_wirings(result: Identification) -> Iterator[str]:
 
     beside_mm = np.concatenate([offset[within] for offset, _, within in result.lateral_offsets_mm()])
     is_laid = np.sqrt((beside_mm**2).mean()) <= LAID_MM
-    others = [other for other in result.alternatives if not (is_laid and apart_mm(other) <= SAME_PLAN_MM)]
+    others = [other for other in result.alternatives if not (is_laid and distance_mm(other) <= SAME_PLAN_MM)]
     if not others:
         return
-    say = "pose or wiring explains" if len(others) == 1 else "poses or wirings explain"
-    yield f"{len(others)} other {say} the presses nearly as well"
+    explain = "pose or wiring explains" if len(others) == 1 else "poses or wirings explain"
+    yield f"{len(others)} other {explain} the presses nearly as well"
     for row, fibre in enumerate(built.fibres):
         if read := sorted({other.fibres[row] + 1 for other in others} - {fibre + 1}):
             fibres = " or ".join(map(str, read))

@@ -4,9 +4,9 @@
 2. Channels that respond to the position at all are live: a Gaussian process explains them better than noise.
 3. Wirings and poses are searched for on the plan; each of the best is fitted as built, and the most probable one taken.
 4. It is fitted to all presses, with an angular term if held-out presses ask for one.
-5. Presses are split into their parts, and each is fitted on the same paths; with it how presses take away what remains
-   of earlier ones, and how responses scatter.
-6. How wide a press is, and how much of it is stretch, is measured on its fibres by the layer it is believed to be.
+5. Presses are split into their parts, and each is fitted on the same paths; so are the removal of the residues of
+   earlier presses, and the scatter of responses.
+6. The width of a press, and its share of stretch, are measured by fitting the layer that it is believed to be.
 """
 
 from dataclasses import dataclass, replace
@@ -128,48 +128,43 @@ class Identification:
     @property
     def twin(self) -> Twin:
         """The pad as a twin, without provenance."""
-        built, unit_mm = self.fit.pad, self.pad.unit_mm
+        built = self.fit.pad
+        response = self._part(built)
         paths_mm: list[Array | None] = [None] * len(self.pad.knots)
-        sensitivities: list[Array | None] = list(paths_mm)
         channels = [TwinChannel(c, None, 0.0, float(noise_v), 0.0) for c, noise_v in enumerate(self.noise_v)]
-        fibre_lengths = lengths(self.pad)
         for row, channel in enumerate(self.live.tolist()):
-            path, sensitivity = built.path(row)
-            fibre, mean = built.fibres[row], sensitivity.mean()
+            fibre, path = built.fibres[row], built.path(row)[0]
             ends = [1.5 * path[:1] - 0.5 * path[1:2], (path[1:] + path[:-1]) / 2, 1.5 * path[-1:] - 0.5 * path[-2:-1]]
-            paths_mm[fibre], sensitivities[fibre] = self.pad.to_mm(np.vstack(ends)), sensitivity / mean
-            gain_v = float(built.channel_values[row, 0] * mean * fibre_lengths[fibre])
-            explained = float(self.explained[row])
+            paths_mm[fibre] = self.pad.to_mm(np.vstack(ends))
+            gain_v, explained = float(response.gains_v[channel]), float(self.explained[row])
             channels[channel] = replace(channels[channel], fibre=fibre, gain_v=gain_v, explained=explained)
-        parts = {name: self._part(fit.pad, len(channels)) for name, fit in self.parts.items()}
-        distance, weight, angular_weight = _sample_profile(built)
         pressed = built.transform.to_plan(self.training.positions_mm)
         return Twin(
             morphology=self.pad,
             channels=tuple(channels),
             frame=built.transform,
-            distance_mm=distance * unit_mm,
-            weight=weight,
+            distance_mm=response.distance_mm,
+            weight=response.weight,
             as_built_mm=tuple(paths_mm),
             noise=self.noise,
             sensed_mm=tuple(np.ptp(pressed, axis=0).tolist()),
             presses=len(self.training),
-            angular_weight=angular_weight,
-            sensitivity=tuple(sensitivities),
+            angular_weight=response.angular_weight,
+            sensitivity=response.sensitivity,
             readings=self.readings,
             scatter=self.scatter,
-            parts=parts,
+            parts={name: self._part(fit.pad) for name, fit in self.parts.items()},
             residual=self.residual,
         )
 
-    def _part(self, built: AsBuiltPad, channels: int) -> TwinPart:
-        """Return a part of a press, of a pad whose fibres lie as those of `fit`."""
+    def _part(self, built: AsBuiltPad) -> TwinPart:
+        """Return the response of the pad to a press, or to a part of one."""
         sensitivities: list[Array | None] = [None] * len(self.pad.knots)
-        gains_v = np.zeros(channels)
+        gains_v, fibre_lengths = np.zeros(len(self.noise_v)), lengths(self.pad)
         for row, channel in enumerate(self.live.tolist()):
             fibre, sensitivity = built.fibres[row], built.path(row)[1]
             sensitivities[fibre] = sensitivity / sensitivity.mean()
-            gains_v[channel] = built.channel_values[row, 0] * sensitivity.mean() * lengths(self.pad)[fibre]
+            gains_v[channel] = built.channel_values[row, 0] * sensitivity.mean() * fibre_lengths[fibre]
         distance, weight, angular_weight = _sample_profile(built)
         return TwinPart(distance * self.pad.unit_mm, weight, gains_v, angular_weight, tuple(sensitivities))
 
@@ -271,7 +266,7 @@ def identify_pad(
 
     # 6. Contact
     on_plan = replace(best.on_plan.pad, plan=plan)
-    measured = _measure_contact(_as_deep(contact, recording), fit.pad, on_plan, training, held_out)
+    measured = _measure_contact(contact, recording, fit.pad, on_plan, training, held_out)
     noise_v = np.nan_to_num(noise_v)
     held = parts["held"].pad if parts else fit.pad
     noise_v[live] = estimate_noise(held.residuals(pressed), pad.unit_mm)
@@ -332,11 +327,6 @@ class _FittedWiring:
         """Logarithm of its probability, up to a constant."""
         return self.fit.log_evidence + self.log_prior
 
-    @property
-    def turn_deg(self) -> float:
-        """How far the pad lay turned, from 0 to 180."""
-        return abs(self.fit.pad.transform.turn_deg)
-
 
 def _fit_candidates(
     plan: PadPlan,
@@ -359,10 +349,8 @@ def _fit_candidates(
             as_built = fit_as_built(on_plan.pad, compared, FIRST_PRIORS)
             is_unturned = not wiring.transform.mirrored and abs(as_built.pad.transform.turn_deg) < 45
             log_prior = LOG_ODDS_IN_ORDER * (wiring.fibres == tuple(live.tolist())) + LOG_ODDS_POSE * is_unturned
-            key, candidate = (
-                (wiring.transform.mirrored, wiring.fibres),
-                _FittedWiring(wiring, on_plan, as_built, log_prior),
-            )
+            key = wiring.transform.mirrored, wiring.fibres
+            candidate = _FittedWiring(wiring, on_plan, as_built, log_prior)
             if key not in candidates or candidates[key].log_posterior < candidate.log_posterior:
                 candidates[key] = candidate
         return max(candidates.values(), key=lambda candidate: candidate.log_posterior)
@@ -385,7 +373,7 @@ def _fit_candidates(
 
     def rank(candidate: _FittedWiring) -> tuple[float, float]:
         is_best = candidate.log_posterior > best.log_posterior - SAME_LOG_EVIDENCE
-        return candidate.turn_deg if is_best else 360.0, -candidate.log_posterior
+        return abs(candidate.fit.pad.transform.turn_deg) if is_best else 360.0, -candidate.log_posterior
 
     return sorted(candidates.values(), key=rank)
 
@@ -425,23 +413,24 @@ def _noise_inflation(pad: AsBuiltPad, responses: Responses) -> Array:
     return np.sqrt((noise_var + systematic_var * repeats) / (noise_var + systematic_var))
 
 
-def _as_deep(contact: Contact, recording: Recording) -> Contact | None:
-    """Return a layer pressed as deep as a recording says, if it does; None if that cannot be, or it is no layer."""
+def _measure_contact(
+    contact: Contact,
+    recording: Recording,
+    as_built: AsBuiltPad,
+    on_plan: AsBuiltPad,
+    training: Responses,
+    held_out: Responses,
+) -> MeasuredContact | None:
+    """Fit a layer to a pad as built, and for comparison to the pad as planned, as well as a Gaussian.
+
+    The layer is pressed as deep as the recording says, if it does. None if it is thinner, or the contact is no layer.
+    """
     depths_mm = recording.actual_depths_mm[recording.has_position]
     depths_mm = depths_mm[depths_mm > 0]
     depth_mm = float(np.median(depths_mm)) if len(depths_mm) else contact.depth_mm
     if contact.model != "layer" or depth_mm >= contact.thickness_mm:
         return None
-    return contact.model_copy(update={"depth_mm": depth_mm})
-
-
-def _measure_contact(
-    contact: Contact | None, as_built: AsBuiltPad, on_plan: AsBuiltPad, training: Responses, held_out: Responses
-) -> MeasuredContact | None:
-    """Fit a layer to a pad as built, and for comparison to the pad as planned, as well as a Gaussian."""
-    if contact is None:
-        return None
-
+    contact = contact.model_copy(update={"depth_mm": depth_mm})
     training = training.select(np.arange(min(N_CONTACT, len(training))))
 
     def fit(pad: AsBuiltPad, contact: Contact) -> ContactFit:
@@ -457,7 +446,7 @@ def _measure_contact(
 
 
 def _fit_part(fit: AsBuiltFit, training: Responses) -> AsBuiltFit:
-    """Fit a part of a press, to which the fibres lie where they do to the response."""
+    """Fit a part of a press to fibres that lie where the fit of the response has put them."""
     start = fit.pad.fit_gains(training)
     priors = replace(fit.priors, lateral_offset_mm=0.0, pose=False)
     return fit_as_built(start, training, priors, _noise_inflation(start, training))
@@ -466,13 +455,13 @@ def _fit_part(fit: AsBuiltFit, training: Responses) -> AsBuiltFit:
 def _residual_maps(
     parts: PressParts[Responses], fits: dict[str, AsBuiltFit], live: Indices, training: Mask
 ) -> TwinResidual:
-    """Return the smooth function of the position that is left in the parts of presses."""
+    """Return the smooth function of the position in the residuals of the parts of presses."""
     positions, middle_mm, half_mm = normalize(parts.held.positions_mm)
     valid = parts.held.valid[training][:, live]
     residuals = []
     for name, fit in fits.items():
         part: Responses = getattr(parts, name)
-        # what they are far from any fibre counts to it
+        # without the rest of the channel, so that the response far from any fibre belongs to the residual
         stretched = fit.pad.predict(part.positions_mm[training]) - fit.pad.channel_values[:, 1]
         residuals.append(part.volts[training][:, live] - stretched)
     maps = smooth_maps(positions[training], np.stack(residuals, axis=2), valid)[::MAP_STRIDE, ::MAP_STRIDE]
