@@ -102,13 +102,21 @@ def signals(
     fibres = along.shape[1]
     check_memory(len(along) * len(centres) * fibres)
     out = np.zeros((len(along), len(centres), fibres))
+    unit_mm = grid_unit_mm(pad)
     if contact.model == "shape":
-        shape = press_shape(contact, grid_unit_mm(pad))
-        _run_exact(along, across, ends, centres, shape, _NO_SPARSE_OUTPUT, out.reshape(-1))
+        _run_exact(along, across, ends, centres, press_shape(contact, unit_mm), _NO_SPARSE_OUTPUT, out.reshape(-1))
     elif len(centres):
         precision = check_float("precision", precision, 1e-6, 1.0)  # that of a `weight_table` is about 1e-7
-        for curves in zip(along, across, out, strict=True):
-            _sum_elements(*curves, ends, centres, contact, grid_unit_mm(pad), precision, sensitivity)
+        (_, extents, law), spacings = press_shape(contact, unit_mm), element_spacings(contact, unit_mm, precision)
+        for t, v, pad_signals in zip(along, across, out, strict=True):
+            slope = population_slopes(t[None], v[None])[0]
+            elements = element_signals.fibre_elements(t, v, slope, ends.horizontals, centres, law, spacings)
+            if sensitivity is not None:
+                element_signals.weigh_elements(elements, t, sensitivity)
+            table = weight_table(contact, unit_mm)
+            visited = element_signals.element_signals(t, v, elements, centres, law, table, pad_signals)
+            if profiling.is_profiling():
+                record_visits(t[None], geometry.max_offsets(v[None], ends), ends, centres, extents, visited)
     return _sum_simultaneous(out, (*batch, *press_counts, fibres))
 
 
@@ -118,30 +126,6 @@ def relative_stretch(pad: Morphology, presses: ArrayLike, contact: Contact) -> A
     A fibre is a strain gauge: its relative change of resistance, which a voltage divider measures, grows with it.
     """
     return signals(pad, presses, contact) / lengths(pad)
-
-
-def _sum_elements(
-    along: Array,
-    across: Array,
-    out: Array,
-    ends: geometry.Ends,
-    presses: Array,
-    contact: Contact,
-    unit_mm: float,
-    precision: float,
-    sensitivity: Array | None,
-) -> None:
-    """Compute the signals of one pad with knots (F, N + 2) from elements of its fibres into `out` (Q, F)."""
-    shape, slope = press_shape(contact, unit_mm), population_slopes(along[None], across[None])[0]
-    law, spacings = shape[2], element_spacings(contact, unit_mm, precision)
-    elements = element_signals.fibre_elements(along, across, slope, ends.horizontals, presses, law, spacings)
-    if sensitivity is not None:
-        element_signals.weigh_elements(elements, along, sensitivity)
-    table = weight_table(contact, unit_mm)
-    visited = element_signals.element_signals(along, across, elements, presses, law, table, out)
-    if profiling.is_profiling():
-        offsets = geometry.max_offsets(across[None], ends)
-        record_visits(along[None], offsets, ends, presses, shape[1], visited)
 
 
 def widened(contact: Contact, factor: float) -> Contact:

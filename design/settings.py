@@ -166,14 +166,14 @@ _KEYS = {
     "profile": ("sensitivity_profile",),
     "shape": ("radius", "sides", "weight"),
 }
-"""Keys that count for each model of `[contact]`, besides those for all."""
+"""Keys of `[contact]` by the model that they belong to; all other keys belong to every model."""
 
 PRESS_DEPTH_MM = 5.0  # default depth of a press
 SILICONE_MM = 6.0  # default thickness of the cast pad
 FIBRE_MM = 0.3  # default diameter of a fibre
 TRACK_DEPTHS_MM = (1.2, 0.4)  # default depths of the tracks of the deep family and of the other one
 _CAST_KEYS = "thickness_mm", "fibre_depths_mm"  # of `[contact]`, of the pad as it is cast
-CAST_SHARE = 0.02  # of the thickness: by how much lengths of the pad may differ from those of its contact
+CAST_SHARE = 0.02  # largest difference of lengths of the pad and of its contact, as a share of the thickness
 _RIDGES = ("deep_ridge_height_mm", "shallow_ridge_height_mm")  # keys of `[mould]`, in that order
 FIBRE_DEPTHS_MM = (TRACK_DEPTHS_MM[0] - FIBRE_MM / 2, TRACK_DEPTHS_MM[1] - FIBRE_MM / 2)  # centre lines, at the bottom
 
@@ -187,12 +187,13 @@ class Contact(Settings, frozen=True):
     """`[contact]`: the contact model of a press, by which each fibre responds.
 
     The signal of a fibre is the line integral of a weight along it. The model "layer" computes the weight from the
-    press: the silicone is an elastic layer under a tool (`padforge.design.layer`), and an element of a fibre answers by
+    press: the silicone is an elastic layer under a tool (`padforge.design.layer`), and an element of a fibre responds
+    by
 
         squeeze (-eps_zz) + stretch (cos^2 phi du/dr + sin^2 phi u/r),
 
-    the strain that presses it flat and the strain along it, with phi the angle between the fibre and the way to the
-    press. In "profile" the weight is a measured function of the distance d to the press centre. In "shape" it is
+    the strain that presses it flat and the strain along it, with phi the angle between the fibre and the direction to
+    the press. In "profile" the weight is a measured function of the distance d to the press centre. In "shape" it is
     `weight` inside a regular polygon or circle (paper, formulas (1) and (2)), in grid units, as published: there, and
     only there, the press grows with the pitch. Stating keys of one model selects it; `sensitivity_profile = []` is a
     shape as well.
@@ -201,10 +202,10 @@ class Contact(Settings, frozen=True):
         model: "layer" if no key of another model is stated.
         tool: "dome" is a paraboloid of that tip radius, "finger" one as soft as the pad, "flat" the end of a rod.
         depth_mm: of the tool's tip, less than the thickness.
-        base: "slipping" where the pad lies on a table, as the built pad says; "bonded" where it is glued.
-        fibre_depths_mm: centre lines of the horizontal and of the vertical fibres, below the face that is pressed.
-            This and the thickness are of the mould, pressed on the side of its tracks, where a settings file does not
-            state them (`read_contact`).
+        base: "slipping" if the pad lies on a table, as readings of the built pad say; "bonded" if it is glued.
+        fibre_depths_mm: centre lines of the horizontal and of the vertical fibres, below the pressed face. If a
+            settings file does not state them or the thickness, they follow from the mould, with the face of the tracks
+            pressed (`read_contact`).
         sides: number of sides D; None for a circle ("circle" in pad.toml).
         weight: "inverse" is 1 / max(d, K / 100), the paper's 1 / d kept finite within a hundredth of the radius.
         length: "manhattan" is the default of shapes, "euclidean" that of the others.

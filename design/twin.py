@@ -112,11 +112,11 @@ class TwinReadings:
 
     noise_mv: float  # standard deviation of the white noise of a reading
     drift_mv: float  # standard deviation of the drifting baseline
-    hysteresis_s: float  # time constant by which what remains of a press decays
-    memory: float = 0.0  # share of what remains of a press that another one at its place takes away
-    memory_mm: float = 9.0  # distance by which that falls
-    gain_wander: float = 0.0  # standard deviation of the gains that wander over minutes
-    touch_s: float = 0.0  # standard deviation over the pad of when it is touched
+    hysteresis_s: float  # time constant by which the residue of a press decays
+    memory: float = 0.0  # share of the residue of a press that another press at its position removes
+    memory_mm: float = 9.0  # distance over which that share falls
+    gain_wander: float = 0.0  # standard deviation of changes of the gains over minutes
+    touch_s: float = 0.0  # standard deviation over the pad of the time of the touch
 
     def __post_init__(self) -> None:
         _check_fields(self, noise_mv=(0, 1e3), drift_mv=(0, 1e3), hysteresis_s=(0.01, 1e4))

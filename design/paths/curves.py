@@ -283,10 +283,7 @@ def _concatenate(lines: Sequence[Array]) -> tuple[Array, NDArray[np.int_]]:
 
 
 def extreme_headings(slopes: Array) -> Array:
-    """Return headings (..., 2 n + 1), rad, at ends of spans and extremes of their slopes (..., n, 3) inside.
-
-    They are monotone between these.
-    """
+    """Return headings (..., 2 n + 1), rad, at ends and extremes of spans of slopes (..., n, 3): monotone in between."""
     pairs = np.stack([slopes[..., 0], quadratic(slopes, _stationary(slopes))], axis=-1)
     return np.arctan(np.concatenate([pairs.reshape(*pairs.shape[:-2], -1), slopes[..., -1:, 2]], axis=-1))
 
@@ -417,7 +414,7 @@ def _closest_fraction(start: Array, step: Array, low: Array | float, high: Array
 
 
 def _stationary(slopes: Array) -> Array:
-    """Return the parameter within 0..1 of the extremum of quadratic Beziers (..., 3); any if there is none inside."""
+    """Return the parameter of the extremum of quadratic Beziers (..., 3), or any within 0..1 if none is inside."""
     first, second = slopes[..., 0] - slopes[..., 1], slopes[..., 2] - slopes[..., 1]
     bend = first + second
     return np.clip(np.divide(first, bend, out=np.zeros_like(bend), where=bend != 0), 0, 1)

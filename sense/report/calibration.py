@@ -1,4 +1,4 @@
-"""What a calibration leaves in a folder: localizer, health models, document and figures."""
+"""Files of a calibration: localizer, health models, document and figures."""
 
 import logging
 from collections.abc import Collection

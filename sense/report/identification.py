@@ -1,4 +1,4 @@
-"""What an identification leaves in a folder (twin, document, figures), its lines and its section of the report."""
+"""Files of an identification (twin, document, figures), its printed lines and its section of the report."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, replace

@@ -1,4 +1,4 @@
-"""Force and shape: whether the fibres that localize a press also tell how deep and hard it is, and with what object."""
+"""Force and shape: depth, force and object of a press, estimated from the fibres that localize it."""
 
 from collections.abc import Mapping
 from dataclasses import asdict
@@ -86,7 +86,7 @@ def force_study(
 
 
 def _check_layer(contact: Contact | None) -> Contact:
-    """Return the contact, the default one if None, if it has a depth."""
+    """Return the contact, the default one if None; refuse one that is no layer."""
     contact = contact or Contact()
     if contact.model != "layer":
         raise InputError(f"[contact] model is {contact.model}, allowed is layer: nothing else is pressed to a depth")

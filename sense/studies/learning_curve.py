@@ -1,4 +1,4 @@
-"""Learning curve: error against the number of training presses, and what recording more of them would bring.
+"""Learning curve: error against the number of training presses, and the gain by recording more of them.
 
 Localizers are trained on nested shares of the training presses and tested on the same presses. A power law with a
 floor, e(n) = c + a n^-b, describes such curves (J. Hestness et al., Deep learning scaling is predictable, empirically,

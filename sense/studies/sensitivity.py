@@ -1,4 +1,4 @@
-"""Sensitivity to what presses: other tools and depths than the pad was trained with (paper, figure 6).
+"""Sensitivity to the pressing object: tools and depths other than those of the training (paper, figure 6).
 
 A layer is pressed by tools of half to one and a half times the radius, half to one and a half times as deep, in mm.
 Responses scatter as on a built pad, since exact ones would locate even a press that fibres hardly feel. For a shape the

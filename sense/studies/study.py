@@ -34,13 +34,13 @@ NAMED = re.compile(r"(square|(optimised)|(random|optimised|genetic)-([1-9]\d?))(
 
 @dataclass(frozen=True)
 class Sizes:
-    """How many presses the networks of a study learn from and are tested on, and how large they are."""
+    """Numbers of training and test presses of a study, and sizes of its networks."""
 
     presses: int
     test: int
     hidden: int = 50  # neurons
     epochs: int = 200
-    members: int = 3  # of an ensemble: where training happens to end varies, and would hide what pads differ by
+    members: int = 3  # networks of an ensemble: errors of single ones vary by more than pads differ
 
 
 @dataclass(frozen=True)
@@ -68,8 +68,8 @@ class Study:
     title: str
     settings: dict[str, Any]  # all that its results depend on, as JSON
     tasks: Sequence[Task]
-    conclude: Callable[[list[State]], StudyResult]  # from the results of the tasks, in their order
-    draw: Callable[[Mapping[str, Any]], "Figure"]  # from the document
+    conclude: Callable[[list[State]], StudyResult]  # takes the results of the tasks, in their order
+    draw: Callable[[Mapping[str, Any]], "Figure"]  # takes the document
 
 
 def run(

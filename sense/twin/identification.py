@@ -58,10 +58,11 @@ N_CANDIDATES, N_COMPARED = 4, 250
 """Wirings that are fitted beside the images of the best, and presses by which they are compared: residuals are
 correlated over about half a grid unit, so that more presses would count the same evidence twice."""
 LOG_ODDS_IN_ORDER, LOG_ODDS_POSE = 15.0, 4.0
-"""Prior log odds of channels in the order of the plan, and of a pad that lay as planned. Half of the belief in either
-among 6! wirings and 8 poses would be 7 and 2; they count twice, as presses do, whose residuals are correlated. They are
-less than MIN_LOG_ODDS together, so that a wiring that fits as well as the stated one is an alternative."""
-N_CONTACT = 400  # presses that a contact is fitted to, for the same reason
+"""Prior log odds of channels in the order of the plan, and of a pad that lay as planned. A belief of one half in the
+stated one of 6! wirings and of 8 poses has log odds of 7 and 2; they are doubled, as the evidence of presses, whose
+residuals are correlated, counts double. Their sum is less than MIN_LOG_ODDS, so that a wiring that fits as well as the
+stated one is an alternative."""
+N_CONTACT = 400  # presses that a contact is fitted to: the residuals of more are correlated
 FIRST_PRIORS = Priors(lateral_offset_mm=1.0, log_sensitivity=0.2)
 MIN_LOG_BAYES_FACTOR = 10.0  # from which on a channel is live
 MIN_LOG_ODDS = 20.0  # from which on another wiring is ruled out
@@ -74,7 +75,7 @@ MIN_MATCH = 0.25
 
 @dataclass(frozen=True)
 class MeasuredContact:
-    """The contact that a pad was believed to be pressed by, against its presses."""
+    """Fits of the stated contact to the presses on a pad."""
 
     stated: Contact  # a layer, pressed as deep as the recording says if it does
     as_built: ContactFit  # of the fibres as built, which a profile without direction was fitted with
@@ -83,7 +84,7 @@ class MeasuredContact:
 
     @property
     def best(self) -> ContactFit:
-        """The fit that explains more: fibres as built fit their profile, planned ones do not fit what deviates."""
+        """The fit that explains more: paths as built were fitted with another profile, planned ones do not deviate."""
         return max(self.as_built, self.on_plan, key=lambda fit: fit.explained)
 
 
