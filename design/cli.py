@@ -195,7 +195,7 @@ def _echo_large_strain(contact: "Contact") -> None:
 def _load_and_check(
     morphology: Path, spec: Path | None, twin: Path | None = None
 ) -> "tuple[Morphology, Spec, PadSettings, list[Violation]]":
-    """Load a morphology and its settings, for a twin if there is one, and check the design rules."""
+    """Load a morphology and its settings, those for a twin if there is one, and check the design rules."""
     from padforge.design.morphology import Morphology
     from padforge.design.objectives.rules import check_rules
     from padforge.design.settings import PadSettings, RulesSettings
@@ -306,8 +306,11 @@ def import_(
         moved = f", ends moved by {fibre.end_shift_mm:.3f} mm" if fibre.end_shift_mm >= MIN_SHOWN_MM else ""
         lines.append(f"  fibre {number}: {fibre.name}, within {fibre.max_error_mm:.3f} mm{moved}")
     lines += [f"  broken: {violation}" for violation in violations] or ["  all rules hold"]
-    fibres = [{"fibre": number, **asdict(fibre)} for number, fibre in enumerate(result.fibres, 1)]
-    document = {"fibres": fibres, "knots": knots, "placement": result.placement}
-    document["violations"] = list(map(asdict, violations))
+    document = {
+        "fibres": [{"fibre": number, **asdict(fibre)} for number, fibre in enumerate(result.fibres, 1)],
+        "knots": knots,
+        "placement": result.placement,
+        "violations": list(map(asdict, violations)),
+    }
     common.show_result(document, lines, as_json)
     context.exit(int(bool(violations)))

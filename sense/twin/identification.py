@@ -242,8 +242,7 @@ def identify_pad(
         raise InputError(
             f"{len(live)} channels of the recording respond to presses, the pad has {len(pad.knots)} fibres"
         )
-    held_out_rows = np.flatnonzero(held_out_mask)
-    training, held_out = responses.select(rows, live), responses.select(held_out_rows, live)
+    training, held_out = responses.select(rows, live), responses.select(np.flatnonzero(held_out_mask), live)
     compared = training.select(np.arange(min(N_COMPARED, len(training))))
 
     # 3. Wiring

@@ -64,7 +64,8 @@ def split_presses(recording: Recording, training: Mask, hysteresis_s: float) -> 
     cycle = Cycle(2 * int(np.median(up - down)), recording.rate_hz)
 
     def smoothed(windows: Array) -> Array:
-        return interpolate(smooth_maps(positions[training], windows[training], valid[training]), positions)
+        maps = smooth_maps(positions[training], windows[training], valid[training])
+        return interpolate_grid(maps.reshape(*maps.shape[:2], -1), positions).reshape(windows.shape)
 
     rig = RigSettings(hysteresis_s=hysteresis_s, memory=0.7, memory_mm=9.0)  # where the fit of the memory starts
     kernels, replaced, parts = part_kernels(cycle, rig), np.zeros(valid.shape), np.empty((4, *valid.shape))
@@ -151,11 +152,6 @@ def part_kernels(cycle: Cycle, rig: RigSettings) -> Array:
 def smooth_maps(positions: Array, windows: Array, valid: Mask) -> Array:
     """Fit smooth functions of the position, within [-1, 1], to windows (Q, C, F); on a grid (S, S, C, F)."""
     return ResponseModel.fit(positions, windows, np.empty((*windows.shape[:2], 0)), valid).table
-
-
-def interpolate(maps: Array, positions: Array) -> Array:
-    """Interpolate maps (S, S, C, F) at positions (Q, 2); shape (Q, C, F)."""
-    return interpolate_grid(maps.reshape(*maps.shape[:2], -1), positions).reshape(len(positions), *maps.shape[2:])
 
 
 def _split(windows: Array, residual: Array, kernels: Array) -> Array:
