@@ -26,10 +26,10 @@ from padforge.design.settings import Contact, PadSettings, RulesSettings, Search
 
 FORMAT, NAME = "padforge-comparison/1", "comparison.json"
 MAX_VARIANTS = 64
-MODELS = (PadSettings, Contact, SearchSettings, RulesSettings)  # what a design depends on, and so may be varied
+MODELS = (PadSettings, Contact, SearchSettings, RulesSettings)  # settings of a design, which may be varied
 # names that no file can have on Windows
 WINDOWS_DEVICE = re.compile(r"(con|prn|aux|nul|com\d|lpt\d)(\.|$)", re.IGNORECASE)
-# makes the mould of a pad into a folder, and returns its costs by the keys of COSTS
+# makes the mould of a pad in a folder, and returns its costs by the keys of COSTS
 MakePad = Callable[[Morphology, Spec, Path], Mapping[str, Any]]
 # columns that not every pad has, with their units
 COSTS = {

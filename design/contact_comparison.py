@@ -49,7 +49,7 @@ def beside_straight(pad: Morphology) -> dict[str, Morphology]:
 
 
 def design_contact(spec: "Spec", settings: SearchSettings) -> Contact:
-    """Return the contact designed for: the one that `spec` states, or the default of such a search."""
+    """Return the contact to design for: the one that `spec` states, or the default of the search method."""
     is_default = settings.method == "genetic" and not spec.stated(Contact)
     return settings.default_contact if is_default else read_contact(spec)
 

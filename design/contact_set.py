@@ -4,7 +4,7 @@ from padforge.design.contact import half_width_mm, widened
 from padforge.design.settings import MEASURED_STD_MM, PUBLISHED_CONTACT, Contact, SearchSettings
 
 UNCERTAINTY = 0.1
-"""Share by which the width of a measured profile may be wrong: parts of one recording give profiles as far apart."""
+"""Relative uncertainty of the width of a measured profile, by which profiles from parts of one recording differ."""
 
 
 def served_contacts(assumed: Contact, search: SearchSettings) -> dict[str, Contact]:
@@ -41,8 +41,8 @@ def _plausible_contacts(assumed: Contact) -> dict[str, Contact]:
 def judged_contacts(assumed: Contact, search: SearchSettings) -> dict[str, Contact]:
     """Return the contacts that a pad is judged by, by name: those that a search serves, and others; none twice.
 
-    Beside a layer the others are presses by a tool half as large or half as deep, and fibres that answer to being
-    pressed flat alone; beside another contact narrower and wider profiles, and the published disc.
+    Beside a layer the others are presses by a tool half as large or half as deep, and fibres that respond to being
+    pressed flat alone; beside another contact they are narrower and wider profiles, and the published disc.
     """
     if assumed.model == "layer":
         tool_mm, depth_mm = assumed.tool_radius_mm / 2, assumed.depth_mm / 2

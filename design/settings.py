@@ -22,8 +22,8 @@ DEFAULT_PITCH_MM = 11.25  # pitch of the built pad
 MAX_FIBRES = 1024  # fibres of one family, also of a pad made of tiles
 
 Pair = tuple[float, float]
-Tool = Literal["dome", "ball", "flat", "finger"]  # shapes of what presses a layer
-Base = Literal["bonded", "slipping"]  # what a layer does on what it lies on
+Tool = Literal["dome", "ball", "flat", "finger"]  # shapes of tools that press a layer
+Base = Literal["bonded", "slipping"]  # boundary condition at the bottom of a layer
 Counts = int | tuple[int, int]  # M horizontals and M verticals, or (horizontals, verticals)
 Pitch = float | Pair  # distance of neighbouring fibre ends, mm: in both directions, or along x and along y
 
@@ -498,8 +498,9 @@ class SearchSettings(Settings):
         noise: additive scatter; this and the next two default to the scatter measured on a built pad. It is a share of
             the full scale of straight fibres: of the default pad under the default press for a layer, whose responses
             are strains, of the pad itself for other contacts, whose responses have no unit.
-        contacts: what the pad must serve beside `[contact]`: "plausible" contacts, which it may really meet
-            (`padforge.design.contact_set`); none, if "assumed"; or a list of tables such as `{radius = 0.9}`.
+        contacts: further contacts that the pad is optimised for beside `[contact]`: "plausible" ones, which it may
+            really meet (`padforge.design.contact_set`); none, if "assumed"; or a list of tables such as
+            `{radius = 0.9}`.
     """
 
     method: Literal["descent", "genetic"] = Field(
@@ -535,7 +536,7 @@ class SearchSettings(Settings):
 
     @property
     def default_contact(self) -> Contact:
-        """Contact designed for if none is stated: the default layer, or the paper's for the paper's own method."""
+        """Contact to design for if none is stated: the default layer, or the published one for the genetic search."""
         return PUBLISHED_CONTACT if self.method == "genetic" else Contact()
 
     @property
@@ -578,7 +579,7 @@ PitchMm = Annotated[float, Field(ge=0.1, le=1000)]
 
 
 def sensed_rectangle(layout: Layout, sensed_mm: Sensed = "beyond") -> Rectangle:
-    """Return the low and the high corner of what is pressed, grid units.
+    """Return the low and the high corner of the pressed area, grid units.
 
     The outermost of V verticals lie at 1 and V pitches of a pad of V + 1, and so along y for horizontals. The rectangle
     is never less than half the pad: 0.5 to 1.5 pitches for V = 1, 0.25 to 0.75 for V = 0. Otherwise "beyond" is 0.5 to
@@ -685,7 +686,7 @@ class PadSettings(Settings):
     @model_validator(mode="before")
     @classmethod
     def _size_to_pitch(cls, stated: object) -> object:
-        """Replace a size by the pitches that make a pad of it; the fields refuse what is no size, or no count."""
+        """Replace a size by the pitches that make a pad of it; an invalid size or count is left to the fields."""
         stated = to_builtins(stated)  # `Settings` does so later
         if not isinstance(stated, Mapping) or not isinstance(size_mm := stated.get("size_mm"), list | tuple):
             return stated

@@ -1,6 +1,6 @@
 """The twin: the as-built model (digital twin) of a printed pad, identified from presses.
 
-It describes how the pad was laid and wired, and what a press does to its fibres. `padforge sense identify` estimates it
+It holds the paths of the fibres, their wiring, and their response to a press. `padforge sense identify` estimates it
 from a recording; searches design for its sensitivity profile, and simulations respond like it.
 """
 

@@ -116,7 +116,7 @@ class Crossing:
 def crossings(pad: Morphology, tolerance: float = 1e-4, across: bool = True) -> list[Crossing]:
     """Find every crossing of two fibres, ordered by fibre and position.
 
-    Fibres that touch or run along each other cross in the middle of what they share.
+    Fibres that touch or run along each other cross in the middle of the common stretch.
 
     Args:
         pad: the fibres.

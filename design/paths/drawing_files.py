@@ -42,7 +42,7 @@ class DrawnPlan:
 
     unit_mm: float = 1.0  # of the drawing
     unit: str = "mm"  # name of the unit that the file states
-    notes: list[str] = field(default_factory=list)  # assumptions that were made, and what was left out
+    notes: list[str] = field(default_factory=list)  # assumptions about the drawing, and omitted curves
     curves: list[DrawnCurve] = field(default_factory=list)
     n_hidden: int = 0
 
@@ -57,7 +57,7 @@ class DrawnPlan:
 
     @property
     def border(self) -> Array | None:
-        """Low and high corner (2, 2) of what is named "pad"; None if nothing is."""
+        """Low and high corner (2, 2) of the curves named "pad"; None if there are none."""
         outlines = [curve.points for curve in self.curves if _is_pad(curve)]
         if not outlines:
             return None
@@ -122,7 +122,7 @@ def _join(curves: list[DrawnCurve], tolerance: float) -> Iterator[DrawnCurve]:
 
 
 def _pair_ends(ends: Array, candidates: Ints, tolerance: float, curves: Sequence[DrawnCurve]) -> dict[int, int]:
-    """Return the other end within the tolerance of each of the candidates that has one."""
+    """Return, for each candidate that has one, the other end within the tolerance."""
     from scipy.spatial import KDTree
 
     if len(candidates) < 2:
@@ -176,7 +176,7 @@ def read_svg(path: Path) -> DrawnPlan:
             drawing.unit = "pixels of 1/96 inch, as it states no other unit"
         # Internal entities, as Illustrator declares them, are replaced by expat, which limits them.
         root: Any = SVG.parse(io.BytesIO(ElementTree.tostring(tree)), on_error="raise", parse_display_none=True)
-        # the drawing's own origin is the one that was drawn from, not the corner of the viewBox
+        # positions count from the origin of the drawing's coordinates, not from the corner of the viewBox
         to_pixels = Matrix(root.viewbox_transform)
         to_file = ~to_pixels
         origin = to_pixels.point_in_matrix_space((0, 0))
@@ -221,13 +221,13 @@ def _adapt_tree(tree: Element) -> None:
 def _iterate_shapes(
     container: Any, groups: tuple[str, ...], is_hidden: bool
 ) -> Iterator[tuple[Any, tuple[str, ...], bool]]:
-    """Iterate over the lines, in order, with the names of all that contains each, and whether it is hidden."""
+    """Iterate over the shapes, in order, with the names of their groups and their own, and whether they are hidden."""
     from svgelements import Group, Path, Polygon, Polyline, Rect, SimpleLine, Use
 
     for element in container:
         attributes = element.values["attributes"]
         names = (*groups, attributes.get("id", ""), attributes.get(_LABEL, ""))
-        # What a group does not display, nothing in it can; what it makes invisible, something in it may show.
+        # "display" hides all that a group contains, while "visibility" may be overridden within it
         is_none = is_hidden or element.values.get("display") == "none" or element.values.get("opacity") == "0"
         if isinstance(element, Group | Use):
             yield from _iterate_shapes(element, names, is_none)
@@ -261,7 +261,7 @@ def _flatten_shape(shape: Any) -> Iterator[tuple[Array, bool]]:
 def read_dxf(path: Path) -> DrawnPlan:
     """Read the curves of a DXF's modelspace and of blocks inserted there, in $INSUNITS or mm.
 
-    Hatches, dimensions and text are ignored, and what is on a layer that is off or frozen.
+    Hatches, dimensions and text are ignored, and so are entities on layers that are off or frozen.
     """
     import ezdxf
     from ezdxf import path as paths

@@ -18,7 +18,7 @@ READERS = {".svg": read_svg, ".dxf": read_dxf}
 MAX_KNOTS = 64  # inner knots of a fibre, as of `[search] knots`
 _FAMILIES = "horizontal", "vertical"
 _MAX_BACKTRACK_MM = 2e-4  # largest step backwards along the axis: files are rounded
-_MARGIN_MM = 1.0  # beyond this margin across the pad, curves are leads to its other sides, which are ignored
+_MARGIN_MM = 1.0  # curves farther beyond the pad than this are leads to its other sides, which are ignored
 _FLATNESS_MM = 1e-3  # tolerance to which curves are compared
 _SCALES = {
     72 / 96: "points of 1/72 inch that were taken for 1/96 inch",
@@ -71,9 +71,10 @@ class _FibrePath:
 def import_plan(path: Path, layout: Layout, tolerance_mm: float) -> ImportedPlan:
     """Import a drawing: one curve a fibre, each a function of the coordinate along its axis.
 
-    The curves are those whose layer, group or name begins with fibre, horizontal or vertical, or all open curves. The
-    border is what is named pad. Without one the drawing is positioned where the ends fit best: its origin in the middle
-    or in a corner of the pad, or the middle of its curves in the middle. What lies beyond the pad is ignored.
+    The curves are those whose layer, group or name begins with fibre, horizontal or vertical, or else all open curves.
+    The border is the curve named pad. Without one the drawing is positioned where the ends fit best: with its origin in
+    the middle or in a corner of the pad, or with the middle of its curves in the middle. Leads beyond the pad are
+    ignored.
     """
     reader = READERS.get(path.suffix.lower())
     if reader is None:

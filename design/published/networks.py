@@ -49,7 +49,7 @@ class RangeScaler:
         return np.divide(values - self.middle, self.half, out=np.zeros(values.shape), where=self.half > 0)
 
     def inverse_transform(self, scaled: Array) -> Array:
-        """Return scaled values (Q, D) in their own units."""
+        """Return scaled values (Q, D) in the units before scaling."""
         return self.middle + self.half * scaled
 
 
@@ -170,12 +170,12 @@ def localisation_error(
 ) -> list[FailureError]:
     """Evaluate the published localizer, trained afresh for every set of failed fibres (paper, evaluation).
 
-    Errors are of presses that were never trained on; the paper's own figures are over all presses, those trained on
-    included, and so are lower. Networks are trained side by side, one thread a core; results do not depend on how many.
+    Errors are those of presses that were never trained on; the figures of the paper include training presses, and so
+    are lower. Networks are trained in parallel, one thread a core; results do not depend on the number of cores.
 
     Args:
         pad: the fibres.
-        contact: what a press does to them; PUBLISHED_CONTACT if None.
+        contact: contact model; PUBLISHED_CONTACT if None.
         n_failed: numbers of failed fibres; those that would leave no fibre are left out.
         seed: of the jitter, the test presses, the splits and the networks' first weights.
         hidden: neurons of a network.

@@ -186,7 +186,7 @@ def published_objective(
 
     Args:
         pad: the fibres.
-        contact: what a press does to a fibre; PUBLISHED_CONTACT if None.
+        contact: contact model; PUBLISHED_CONTACT if None.
         presses: in an order of neighbours; the 49 published ones if None; shape (Q, 2).
         samples: points per fibre of the quantised signals and of C.
         weights: alpha, beta, gamma.

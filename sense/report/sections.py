@@ -268,7 +268,7 @@ def _chart_cell(
 
 
 def _colour_scale(low: float, high: float, size: int, left: int, height: int) -> Iterator[str]:
-    """Draw the colours from the least error to the greatest, in the lower left corner."""
+    """Draw the scale of colours, from the least error to the greatest, in the lower left corner."""
     y = height - 1.4 * size
     yield _svg_text(f"{low:.2f}", left + 1.3 * size, y + 0.9 * size, size)
     for step in range(5):

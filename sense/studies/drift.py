@@ -101,9 +101,9 @@ def drift_study(pads: Mapping[str, Morphology], recordings: Mapping[str, Recordi
 
 
 def _split(presses: Indices, seed: int) -> tuple[Indices, Indices, dict[str, Indices]]:
-    """Split presses of known position into those to train on, to stop by, and to "test" on, at random and the "last".
+    """Split presses of known position into training and validation presses, random "test" presses, and the "last" ones.
 
-    The last ones are held out first, then of the others some at random.
+    The last ones are held out first, the test presses then drawn from the others.
     """
     rng = np.random.default_rng([7, seed])
     first, last = split_presses(len(presses), "chronological", TEST_SHARE, rng)
@@ -113,9 +113,10 @@ def _split(presses: Indices, seed: int) -> tuple[Indices, Indices, dict[str, Ind
 
 
 def level_indices(readings: int, down_command: Indices, up_command: Indices) -> Indices:
-    """Return which readings (Q, 3) are the levels before, in and after each press: SETTLED from the probe's commands.
+    """Return the indices (Q, 3) of the readings that are the levels before, in and after each press.
 
-    Where a cycle is too short, it is the nearest reading that belongs neither to another phase nor to another press.
+    They are SETTLED readings from a command of the probe or, if the cycle is too short, the nearest ones that belong
+    neither to another phase nor to another press.
     """
     previous, following = np.append(0, up_command[:-1]), np.append(down_command[1:], readings)
     before = np.maximum(down_command - SETTLED, previous)
@@ -174,7 +175,7 @@ def _evaluate(source: Callable[[], Recording], name: str, seed: int) -> State:
 
 
 def _excerpt(times_s: Array, readings: Array, filtered: Array, down_command: Indices, up_command: Indices) -> State:
-    """Select what the figure shows of the fibre whose response varies most.
+    """Select the data of the figure, of the fibre whose response varies most.
 
     Returns:
         Index of the "fibre"; "readings" (3, W): times, s, raw and filtered readings, V; "samples" (EXCERPT_PRESSES, 3,

@@ -87,8 +87,8 @@ def fibre_loss_study(
     """Evaluate every set of failed fibres, by one localizer, by networks retrained for each set, or by both.
 
     Args:
-        recording: with presses of known position. Those that `localizer` held out are the test if it was trained on
-            this recording, else the share of them that `options` hold out.
+        recording: with presses of known position. The test presses are those that `localizer` held out if it was
+            trained on this recording, else the share that `options` hold out.
         localizer: the one network; None for retraining alone.
         retrain: whether networks are retrained for every set.
         options: split, share and seed; the defaults if None.

@@ -56,8 +56,8 @@ def force_study(
 ) -> Study:
     """Estimate position, depth and force of presses of random depth, from the signals of a pressed layer.
 
-    Presses are a fifth as deep as those of the contact, `Contact()` if None, to as deep. An unknown depth is compared
-    with one that is an input, and with presses of the middle depth alone.
+    Depths are 0.2 to 1 of that of the contact, `Contact()` if None. The error of the position is compared with errors
+    by networks with the depth as an input, and with those of presses of the middle depth alone.
 
     Raises:
         InputError: the contact is no layer.
@@ -229,8 +229,8 @@ def shape_study(
 ) -> Study:
     """Classify the object: tools of unknown depth, and footprints of unknown size, the position unknown too.
 
-    Tools of the radius of the contact's, `Contact()` if None, press its layer up to as deep. Footprints are polygons of
-    one orientation under the published contact.
+    Tools have the radius and depths of the contact, `Contact()` if None, and press its layer. Footprints are polygons
+    of one orientation under the published contact.
 
     Raises:
         InputError: the contact is no layer.
@@ -259,7 +259,7 @@ def tool_contacts(contact: Contact) -> dict[str, Contact]:
     """Return the contact of each of TOOLS, by name.
 
     All have the radius of the contact's tool except the flat end, which has the contact radius of the dome at the
-    middle depth: they differ by the profile of what presses more than by the size.
+    middle depth: tools differ by their profile more than by their size.
     """
     layer = contact.thickness_mm, contact.base
     dome = solve_press("dome", contact.tool_radius_mm, MIDDLE * contact.depth_mm, *layer)

@@ -72,7 +72,7 @@ def learning_curve(
         recording: with presses of known position.
         options: of the training; the defaults if None. A single member is trained, so that errors are somewhat above
             those of a calibration.
-        on_progress: called with (steps done, total, what is done beside the steps).
+        on_progress: called with (steps done, total, name of work that is not counted in steps).
 
     Raises:
         InputError: too few presses for a curve.
@@ -122,8 +122,8 @@ def _predict(
     """Return the test positions (Q, 2) that a localizer predicts after each training."""
     from padforge.sense.localizer.training import JointProgress, training_steps
 
-    # as many steps as in a calibration on that many presses: with one short training for all, most presses would seem
-    # to bring little
+    # as many steps as in a calibration on that many presses: with one short training for all, more presses would hardly
+    # lower the error
     steps = [training_steps(len(training), options) for training in trainings]
     joint = JointProgress(steps, on_progress)
 

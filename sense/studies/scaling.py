@@ -2,9 +2,9 @@
 
 The published method learns from a serpentine of presses and is evaluated on those presses themselves. "Spread" and
 "shared" learn from presses spread over the whole surface and are evaluated on fresh ones. The inputs of "spread" are
-each fibre's share of its family's signal, of which the position is an almost linear function at any size. For "shared"
-the largest signals tell the tile, and one network for all tiles, given the fibres of it and its neighbours, the
-position in it: neither its size nor its error need grow with the surface.
+each fibre's share of its family's signal, of which the position is an almost linear function at any size. In "shared"
+the tile is that of the largest signals, and one network for all tiles estimates the position in it from the fibres of
+the tile and its neighbours: neither the size of the network nor its error need grow with the surface.
 """
 
 import math
@@ -108,7 +108,7 @@ def tile_inputs(responses: Array, tile: int) -> tuple[Array, Array]:
     In each family, of `tile` fibres a tile, it is the tile with the largest sum, the middle one if all signals are 0.
     """
     windows, origins = [], []
-    for family in np.split(responses, 2, axis=1)[::-1]:  # vertical fibres tell x, horizontal ones y
+    for family in np.split(responses, 2, axis=1)[::-1]:  # x depends on vertical fibres, y on horizontal ones
         sums = family.reshape(len(family), -1, tile).sum(axis=2)
         number = np.where(sums.any(axis=1), sums.argmax(axis=1), sums.shape[1] // 2)
         padded = np.pad(family, ((0, 0), (tile, tile)))

@@ -1,8 +1,8 @@
 """Sensitivity to the pressing object: tools and depths other than those of the training (paper, figure 6).
 
-A layer is pressed by tools of half to one and a half times the radius, half to one and a half times as deep, in mm.
-Responses scatter as on a built pad, since exact ones would locate even a press that fibres hardly feel. For a shape the
-objects are the published ones, in grid units, and responses have no noise.
+A layer is pressed by tools of 0.5 to 1.5 times the radius, to 0.5 to 1.5 times the depth of the contact, in mm.
+Responses scatter as on a built pad, since exact ones would localize even a press that fibres hardly respond to. In
+place of a shape, the objects are the published ones, in grid units, and responses have no noise.
 """
 
 import math

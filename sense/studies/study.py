@@ -1,4 +1,4 @@
-"""Frame of all studies: tasks in parallel, results as table, figure and text, pads by name."""
+"""Common parts of all studies: tasks in parallel, results as table, figure and text, pads by name."""
 
 import csv
 import hashlib
@@ -224,7 +224,7 @@ def describe_pads(pads: Mapping[str, Morphology]) -> dict[str, Any]:
 
 
 def read_counts(signals: Array, training: int, noise_counts: float, rng: np.random.Generator) -> Array:
-    """Read signals (Q, C) with a noisy 12-bit converter, in whole counts; a silent fibre reads its noise.
+    """Read signals (Q, C) with a noisy 12-bit converter, in whole counts; a fibre without signal reads noise.
 
     Full scale is the largest magnitude of a fibre's signal in the first `training` presses. Readings begin at 0 unless
     there are negative signals.

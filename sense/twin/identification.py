@@ -68,7 +68,7 @@ MIN_LOG_BAYES_FACTOR = 10.0  # from which on a channel is live
 MIN_LOG_ODDS = 20.0  # from which on another wiring is ruled out
 SAME_LOG_EVIDENCE = 1.0  # difference of log evidence below which two fits are equally good
 MIN_ANGULAR_GAIN = 0.01  # share of the variance of held-out responses that an angular term must explain
-MAP_STRIDE = 3  # every such node of the maps of residuals is kept: they change over several
+MAP_STRIDE = 3  # subsampling of the maps of residuals, which change over several nodes
 MIN_MATCH = 0.25
 """Share of the variance that the best wiring must explain on the plan, else the recording is of another pad."""
 
@@ -110,9 +110,9 @@ class Identification:
     held_out: Responses
 
     def lateral_offsets_mm(self) -> list[tuple[Array, Array, Mask]]:
-        """Compute how far each live channel's fibre lies to the left of its plan.
+        """Compute for each live channel the lateral offset of its fibre from the plan, to the left, mm.
 
-        Returned are, for each, offset and standard deviation (F,) of its elements, mm, and a mask of those pressed.
+        Returned are the offset of each element (F,), its standard deviation, and a mask of the pressed elements.
         """
         built, unit_mm = self.fit.pad, self.pad.unit_mm
         pressed = built.plan.to_grid(built.transform.to_plan(self.training.positions_mm))
@@ -196,9 +196,10 @@ def identify(
     Args:
         recording: presses at known positions over most of the pad; of several depths, the most common one is used.
         pad: as planned.
-        contact: what the pad is believed to be pressed by; `Contact()` if None. The twin does not depend on it.
-        seed: of what is drawn.
-        on_progress: called with (steps done, total, what is being done).
+        contact: the contact by which the pad is believed to be pressed; `Contact()` if None. The twin does not depend
+            on it.
+        seed: of the random split and samples of presses.
+        on_progress: called with (steps done, total, name of the stage).
 
     Returns:
         The twin, without provenance.

@@ -150,9 +150,9 @@ def images(wiring: Wiring, layout: Layout) -> list[Wiring]:
 
 
 def planned_paths_mm(plan: PadPlan, transform: PlanTransform, fibres: tuple[int, ...]) -> Array:
-    """Return where the fibres that channels read were planned under the arm (C, E, 2), mm from the middle of the pad.
+    """Return the planned paths (C, E, 2) of the fibres that channels read, mm from the middle of the pad under the arm.
 
-    The pad is taken to have lain in whole quarter turns, so that poses which differ as plans do not are the same.
+    Shift and scale are omitted and rotations rounded to quarter turns, so that poses which differ by less are the same.
     """
     mirrored, turn_deg = transform.mirrored, 90.0 * round(transform.turn_deg / 90)
     from_plan = PlanTransform(mirrored, turn_deg if mirrored else -turn_deg)  # the inverse of such a transform
