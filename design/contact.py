@@ -262,12 +262,12 @@ def signals_sparse(pad: Morphology, presses: ArrayLike, contact: Contact | None 
 
     contact = or_default("contact", contact, Contact)
     along, across, ends, _ = fibre_axes(check_type("pad", pad, Morphology))
-    centres, max_offsets = check_presses(presses)[0], geometry.max_offsets(across, ends)
+    centres, _ = check_presses(presses)
     if contact.model != "shape":
         blocks = np.array_split(centres, range(1000, len(centres), 1000))  # 1000 rows are dense at a time
         return csr_array(vstack([csr_array(signals(pad, block, contact)) for block in blocks], format="csr"))
     shape = press_shape(contact, pad.unit_mm)
-    starts = geometry.count_touched(max_offsets[0], centres, shape[1], ends)
+    starts = geometry.count_touched(geometry.max_offsets(across, ends)[0], centres, shape[1], ends)
     check_memory(int(starts[-1]))
     fibre, signal = np.empty(starts[-1], np.int64), np.empty(starts[-1])
     _run_exact(along, across, ends, centres, shape, (starts, fibre), signal)

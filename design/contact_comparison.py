@@ -33,12 +33,12 @@ class ContactErrors:
 
 
 def errors_by_contact(
-    pads: Mapping[str, Morphology], contacts: Mapping[str, Contact], size: PadSettings, search: SearchSettings
+    pads: Mapping[str, Morphology], contacts: Mapping[str, Contact], pad_settings: PadSettings, search: SearchSettings
 ) -> list[ContactErrors]:
     """Compute the expected errors of pads of one layout under every contact, all by the same random numbers."""
     names = list(product(contacts, pads))
     with threadpool_limits(1, "blas"):  # around those of the tasks, which would lift them for one another
-        tasks = (((c, p), partial(expected_errors, pads[p], contacts[c], search, size)) for c, p in names)
+        tasks = (((c, p), partial(expected_errors, pads[p], contacts[c], search, pad_settings)) for c, p in names)
         errors = dict(run_tasks(tasks))
     return [ContactErrors(c, p, tuple(pads[p].unit_mm * error for error in errors[c, p])) for c, p in names]
 
@@ -57,10 +57,10 @@ def design_contact(spec: "Spec", settings: SearchSettings) -> Contact:
 def compare_contacts(spec: "Spec", pad: Morphology, out: Path, seed: int | None = None) -> dict[str, Any]:
     """Write and return the errors of a pad and of straight fibres under the contact of `spec` and others."""
     settings = spec.section(SearchSettings, seed=seed)
-    size = spec.section(PadSettings, **pad.layout.settings)
+    pad_settings = spec.section(PadSettings, **pad.layout.settings)
     contacts = judged_contacts(design_contact(spec, settings), settings)
     with stage("contacts"):
-        errors = errors_by_contact(beside_straight(pad), contacts, size, settings)
+        errors = errors_by_contact(beside_straight(pad), contacts, pad_settings, settings)
     document = {
         "format": FORMAT,
         "scatter": settings.response_scatter._asdict(),

@@ -78,7 +78,7 @@ def calibrate_into(
         write_json(folder / "calibration.json", evaluation.to_dict())
         if "figures" not in without:
             with stage("figures"):
-                draw_error_map(evaluation, folder / MAP)
+                draw_test_errors(evaluation, folder / MAP)
                 figure, axes = new_figure(6.0, 4.4)
                 draw_errors_by_loss(axes, {"": evaluation}, f"One network, {evaluation.test_presses}")
                 save_figure(figure, folder / BY_LOSS)
@@ -87,8 +87,8 @@ def calibrate_into(
     return evaluation.to_dict()
 
 
-def draw_error_map(evaluation: Evaluation, path: Path) -> None:
-    """Draw the test presses of a calibration, true and predicted."""
+def draw_test_errors(evaluation: Evaluation, path: Path) -> None:
+    """Draw the true and the predicted positions of the test presses of a calibration."""
     pressed, predicted = (np.array(evaluation.test[name]) for name in ("pressed_mm", "predicted_mm"))
     errors = np.hypot(*(predicted - pressed).T)
     figure, axes = new_figure(6.4, 5.6)
