@@ -17,7 +17,6 @@ from padforge.sense.cli.rig import check_rig, rig_option
 if TYPE_CHECKING:
     from padforge.sense.live.outputs import OutputStream
     from padforge.sense.live.pipeline import Estimate, Event
-    from padforge.sense.localizer.model import LocalizerModel
     from padforge.sense.rig.streams import ReadingStream
 
 PORT = 8321
@@ -90,16 +89,20 @@ def live(
     """
     from padforge.sense.formats.import_export import open_recording
     from padforge.sense.live.outputs import LivePage, MessageBuilder, broadcast
-    from padforge.sense.live.pad_sensor import load_health
+    from padforge.sense.live.pad_sensor import load_health, open_board
     from padforge.sense.live.pipeline import Live
     from padforge.sense.localizer.model import LocalizerModel
-    from padforge.sense.rig.streams import stream_recording
+    from padforge.sense.rig.streams import is_pad_mirrored, stream_board, stream_recording
+    from padforge.sense.settings import RigSettings
 
     check_rig(rig)
     localizer = LocalizerModel.load(model)
     with ExitStack() as stack:
         if replay is None:
-            stream, mirrored = _stream_rig(stack, rig, model, localizer, spec)
+            options = load_spec(spec).section(RigSettings)
+            mirrored = is_pad_mirrored(model, options)
+            board = stack.enter_context(closing(open_board(rig, model, options, localizer.fibres)))
+            stream = stream_board(board, localizer.rate_hz)
         else:
             recording = open_recording(replay)
             stream, mirrored = stream_recording(recording, speed), recording.mirrored
@@ -136,20 +139,6 @@ def live(
                 if outputs:
                     broadcast(outputs, builder.build(times_s, readings, events))
     context.exit(int(pipeline.is_other_pad))
-
-
-def _stream_rig(
-    stack: ExitStack, rig: str, model: Path, localizer: "LocalizerModel", spec: Path | None
-) -> "tuple[ReadingStream, bool]":
-    """Return the readings of a board, which `stack` closes, and whether the pad lies with its tracks up."""
-    from padforge.sense.live.pad_sensor import open_board
-    from padforge.sense.rig.streams import is_pad_mirrored, stream_board
-    from padforge.sense.settings import RigSettings
-
-    options = load_spec(spec).section(RigSettings)
-    mirrored = is_pad_mirrored(model, options)
-    board = stack.enter_context(closing(open_board(rig, model, options, localizer.fibres)))
-    return stream_board(board, localizer.rate_hz), mirrored
 
 
 def _open_outputs(

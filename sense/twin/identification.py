@@ -166,22 +166,15 @@ class Identification:
             fibre, sensitivity = built.fibres[row], built.path(row)[1]
             sensitivities[fibre] = sensitivity / sensitivity.mean()
             gains_v[channel] = built.channel_values[row, 0] * sensitivity.mean() * fibre_lengths[fibre]
-        distance, weight, angular_weight = _sample_profile(built)
-        return TwinPart(distance * self.pad.unit_mm, weight, gains_v, angular_weight, tuple(sensitivities))
-
-
-def _sample_profile(pad: AsBuiltPad) -> tuple[Array, Array, Array | None]:
-    """Return distances (PROFILE_POINTS,), grid units, up to where weights are negligible, and w and v there.
-
-    v is None where the response does not depend on the angle.
-    """
-    fine = np.linspace(0, pad.max_distance, 400)
-    felt = np.flatnonzero(np.abs(pad.profile(fine)).max(axis=0) > MIN_WEIGHT)
-    distance = np.linspace(0, min(fine[felt[-1]] * (1 + 1 / PROFILE_POINTS), pad.max_distance), PROFILE_POINTS)
-    weights = pad.profile(distance)
-    weights[:, -1] = 0.0
-    weight, angular_weight = weights / np.abs(weights[0]).max()
-    return distance, weight, angular_weight if angular_weight.any() else None
+        # the profile, up to where its weights are negligible
+        fine = np.linspace(0, built.max_distance, 400)
+        end = fine[np.flatnonzero(np.abs(built.profile(fine)).max(axis=0) > MIN_WEIGHT)[-1]]
+        distance = np.linspace(0, min(end * (1 + 1 / PROFILE_POINTS), built.max_distance), PROFILE_POINTS)
+        weights = built.profile(distance)
+        weights[:, -1] = 0.0
+        weight, angular_weight = weights / np.abs(weights[0]).max()
+        angular = angular_weight if angular_weight.any() else None
+        return TwinPart(distance * self.pad.unit_mm, weight, gains_v, angular, tuple(sensitivities))
 
 
 def identify(
@@ -275,13 +268,15 @@ def identify_pad(
     if readings:  # which contains that of gains that wander
         scatter = replace(scatter, share=float(np.sqrt(max(scatter.share**2 - readings.gain_wander**2, 0))))
     smooth = np.column_stack([gps[channel].predict(held_out.positions_mm / pad.unit_mm) for channel in live])
+    likeliest_on_plan = max((candidate.on_plan for candidate in candidates), key=lambda fit: fit.log_evidence)
+    planned = fit_as_built(replace(likeliest_on_plan.pad, plan=plan), training, Priors()).pad
     full_scale_v = np.abs(fit.pad.predict(training.positions_mm) - fit.pad.channel_values[:, 1]).max(axis=0)
     return Identification(
         pad=pad,
         fit=fit,
         live=live,
         explained=held_out.explained_variance(fit.pad.predict(held_out.positions_mm)),
-        explained_on_plan=_explained_on_plan(candidates, plan, training, held_out),
+        explained_on_plan=float(held_out.explained_variance(planned.predict(held_out.positions_mm)).mean()),
         explained_smooth=held_out.explained_variance(smooth),
         noise_v=noise_v,
         noise=float(noise_v[live].mean() / full_scale_v.mean()),
@@ -377,15 +372,6 @@ def _fit_candidates(
         return abs(candidate.fit.pad.transform.turn_deg) if is_best else 360.0, -candidate.log_posterior
 
     return sorted(candidates.values(), key=rank)
-
-
-def _explained_on_plan(
-    candidates: list[_FittedWiring], plan: PadPlan, training: Responses, held_out: Responses
-) -> float:
-    """Return the mean explained variance of the most probable pad that lies on its plan, fitted to all presses."""
-    best = max((candidate.on_plan for candidate in candidates), key=lambda fit: fit.log_evidence)
-    pad = fit_as_built(replace(best.pad, plan=plan), training, Priors()).pad
-    return float(held_out.explained_variance(pad.predict(held_out.positions_mm)).mean())
 
 
 def _fit_all(pad: AsBuiltPad, training: Responses, on_progress: OnProgress) -> AsBuiltFit:
