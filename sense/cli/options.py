@@ -106,8 +106,8 @@ def predict_despite_faults(
 ) -> Prediction:
     """Localize all presses by the models in a folder, with faulty fibres masked from their first bad press on.
 
-    Further fibres to mask are the numbers `failed`, from 1. Only readings until a `moment`, "touch" or "lift" and the
-    time since, s, are used, if it is not None.
+    The fibres of the numbers `failed`, from 1, are masked, too. If there is a `moment`, "touch" or "lift" and the time
+    since then, s, only readings until this moment are used.
     """
     from padforge.sense.health.domain_shift import detect_shifts
     from padforge.sense.health.fault_detector import FaultDetector, has_health, mask_faults

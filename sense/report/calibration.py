@@ -44,8 +44,8 @@ def calibrate_into(
 ) -> dict[str, Any]:
     """Calibrate as `calibrate`, write FILES into `out`, and return the content of `calibration.json`.
 
-    No file changes before all are done. What the recording does not suffice for (depth, force, health) is logged as a
-    warning. The parts `without` which it is done are "health", "figures" and "moments". `on_progress` is also called
+    No file changes before all are done. A warning is logged for each of depth, force and health that the recording does
+    not suffice for. Parts in `without` are left out: "health", "figures" or "moments". `on_progress` is also called
     with (0, 0, "health"), and `force` replaces a localizer that other files in `out` were made from.
 
     Raises:
