@@ -1,6 +1,6 @@
 """Draw the plan of a pad, and write the sections of a report on its design and its contact."""
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
@@ -160,6 +160,12 @@ def design_sections(folder: Path, document: Mapping[str, Any]) -> list[PageSecti
         f" to a press vary by {float(search['scatter']):.0%} of their value from press to press, plus"
         f" {float(search['noise']):.1%} of full scale."
     )
+    broken, rules = {violation["rule"] for violation in violations}, []
+    for name, limit in settings["rules"].items():
+        if name != "enforce":
+            result = "fail" if name in broken else "pass" if enforced else "not enforced"
+            field = RulesSettings.model_fields.get(name)
+            rules.append([field.description if field else name, limit, result, name])
     body = [
         columns(
             [figures([(folder / "design.svg", plan)])],
@@ -171,10 +177,14 @@ def design_sections(folder: Path, document: Mapping[str, Any]) -> list[PageSecti
         ),
         heading("Design rules"),
         paragraph(f"Checked on the exact curves: {check}."),
-        table(["rule", "limit", "result", "setting"], list(_rule_rows(settings["rules"], violations))),
+        table(["rule", "limit", "result", "setting"], rules),
     ]
     if violations:
-        rows = list(map(_violation_row, violations))
+        rows = []
+        for violation in violations:
+            fibres, position_mm = ", ".join(map(str, violation["fibres"])), violation["place_mm"]
+            position = "-" if position_mm is None else "({:.1f}, {:.1f})".format(*position_mm)
+            rows.append([violation["rule"], fibres or "pad", position, violation["measured"], violation["limit"]])
         body.append(table(["broken rule", "fibres", "position (mm)", "measured", "limit"], rows))
     rows = [[name, value, document["descriptions"].get(name, "")] for name, value in terms.items()]
     body.append(collapsible("All terms of the objective", [table(["term", "value", "meaning"], rows)]))
@@ -188,21 +198,6 @@ def design_sections(folder: Path, document: Mapping[str, Any]) -> list[PageSecti
 
 def _size_text(sides_mm: Iterable[float]) -> str:
     return " x ".join(f"{round(float(side), 6):g}" for side in sides_mm) + " mm"
-
-
-def _rule_rows(rules: Mapping[str, Any], violations: Sequence[Mapping[str, Any]]) -> Iterator[list[object]]:
-    broken = {violation["rule"] for violation in violations}
-    for name, limit in rules.items():
-        if name != "enforce":
-            result = "fail" if name in broken else "pass" if rules["enforce"] else "not enforced"
-            field = RulesSettings.model_fields.get(name)
-            yield [field.description if field else name, limit, result, name]
-
-
-def _violation_row(violation: Mapping[str, Any]) -> list[object]:
-    fibres, position_mm = ", ".join(map(str, violation["fibres"])), violation["place_mm"]
-    position = "-" if position_mm is None else "({:.1f}, {:.1f})".format(*position_mm)
-    return [violation["rule"], fibres or "pad", position, violation["measured"], violation["limit"]]
 
 
 def draw_press(contact: Contact, pitch_mm: float) -> "Figure":

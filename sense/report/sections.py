@@ -239,9 +239,18 @@ def loss_chart(errors: Errors, fibres: int) -> str:
             shapes.append(_svg_text(str(fibre + 1), left + middle, top + fibres * CELL + 1.2 * size, size))
     shapes += _colour_scale(low, high, size, left, height)
     for failed, error in errors.items():
-        if failed:
-            corner = left + failed[0] * CELL, top + failed[-1] * CELL
-            shapes += _chart_cell(failed, error, (error - low) / ((high - low) or 1.0), corner, numbered)
+        if not failed:
+            continue
+        x, y, share = left + failed[0] * CELL, top + failed[-1] * CELL, (error - low) / ((high - low) or 1.0)
+        shapes.append(
+            f'<rect x="{x + 1}" y="{y + 1}" width="{CELL - 2}" height="{CELL - 2}" rx="3" fill="{_shade(share)}">'
+            f"<title>without {_names(failed)}: {error:.2f} mm</title></rect>"
+        )
+        if numbered:
+            bold = ' font-weight="700"' if len(failed) == 1 else ""
+            colour = f' fill="{INK if share < 0.65 else "#ffffff"}" pointer-events="none"'
+            text = f"{error:.2f}" if error < 10 else f"{error:.1f}"
+            shapes.append(_svg_text(text, x + CELL / 2, y + CELL / 2 + 5, 14, bold + colour))
     worst = (_worst(errors, count) for count in (1, 2))
     described = "; ".join(f"worst without {_names(failed)}: {errors[failed]:.2f} mm" for failed in worst)
     label = escape(f"Error without one and without two fibres; {described}.")
@@ -250,21 +259,6 @@ def loss_chart(errors: Errors, fibres: int) -> str:
         f' aria-label="{label}" font-family="system-ui, sans-serif" text-anchor="middle" fill="{INK}">'
         f"{''.join(shapes)}</svg>"
     )
-
-
-def _chart_cell(
-    failed: Sequence[int], error: float, share: float, corner: tuple[int, int], numbered: bool
-) -> Iterator[str]:
-    x, y = corner
-    yield (
-        f'<rect x="{x + 1}" y="{y + 1}" width="{CELL - 2}" height="{CELL - 2}" rx="3" fill="{_shade(share)}">'
-        f"<title>without {_names(failed)}: {error:.2f} mm</title></rect>"
-    )
-    if numbered:
-        bold = ' font-weight="700"' if len(failed) == 1 else ""
-        colour = f' fill="{INK if share < 0.65 else "#ffffff"}" pointer-events="none"'
-        text = f"{error:.2f}" if error < 10 else f"{error:.1f}"
-        yield _svg_text(text, x + CELL / 2, y + CELL / 2 + 5, 14, bold + colour)
 
 
 def _colour_scale(low: float, high: float, size: int, left: int, height: int) -> Iterator[str]:

@@ -118,7 +118,10 @@ def fibre_loss_study(
     if retrain:
         subsets = [subset for level in levels for subset in failure_subsets(fibres, level)]
         subsets += [chosen] if chosen and chosen not in subsets else []
-        predictions = _retrain(recording, training, test, options, subsets, on_progress)
+        published = options.model_copy(update={"method": "published"})
+        tasks = [Task("", partial(train_without, subset, recording, training, test, published)) for subset in subsets]
+        states: list[Any] = compute_states(tasks, on_progress)
+        predictions = {subset: Localization(**state) for subset, state in zip(subsets, states, strict=True)}
         methods[RETRAINED] = evaluate(predictions.__getitem__)
     origin = provenance("padforge sense fibre-loss", options.seed, packages=("torch",))
     origin["inputs"] = {"recording": recording.digest, "localizer": dict(localizer.provenance) if localizer else {}}
@@ -140,21 +143,6 @@ def _evaluate(
         for failed in (*worst, *([chosen] if chosen else []))
     ]
     return MethodErrors(rows, by_subset, maps)
-
-
-def _retrain(
-    recording: Recording,
-    training: Indices,
-    test: Indices,
-    options: settings.LocalizerSettings,
-    subsets: Sequence[Failed],
-    on_progress: OnProgress,
-) -> dict[Failed, Localization]:
-    """Predict the test presses by a network of each set of failed fibres."""
-    options = options.model_copy(update={"method": "published"})
-    tasks = [Task("", partial(train_without, failed, recording, training, test, options)) for failed in subsets]
-    states: list[Any] = compute_states(tasks, on_progress)
-    return {failed: Localization(**state) for failed, state in zip(subsets, states, strict=True)}
 
 
 def train_without(
