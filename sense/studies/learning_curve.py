@@ -5,7 +5,6 @@ floor, e(n) = c + a n^-b, describes such curves (J. Hestness et al., Deep learni
 2017) and is extrapolated to twice as many presses.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -21,7 +20,7 @@ from padforge.common.progress import OnProgress, ignore_progress
 from padforge.common.settings import or_default
 from padforge.common.validation import InputError
 from padforge.sense import settings
-from padforge.sense.arrays import Array, Indices
+from padforge.sense.arrays import Array
 from padforge.sense.localizer.calibration import fit_recording, split_presses
 from padforge.sense.localizer.evaluation import distances
 from padforge.sense.recording.recording import Recording
@@ -77,6 +76,8 @@ def learning_curve(
     Raises:
         InputError: too few presses for a curve.
     """
+    from padforge.sense.localizer.training import JointProgress, training_steps
+
     options = or_default("options", options, settings.LocalizerSettings)
     rng = np.random.default_rng(options.seed)
     presses = np.flatnonzero(recording.has_position)
@@ -89,8 +90,20 @@ def learning_curve(
     order = rng.permutation(training)
     sizes = [round(share * len(order)) for share in SHARES]
     options = options.model_copy(update={"members": 1, "method": "ensemble"})
-    predictions = _predict(recording, [np.sort(order[:size]) for size in sizes], test, options, on_progress)
-    errors = np.array([distances(positions_mm, recording.presses_mm[test]) for positions_mm in predictions])
+    # as many steps as in a calibration on that many presses: with one short training for all, more presses would hardly
+    # lower the error
+    joint = JointProgress([training_steps(size, options) for size in sizes], on_progress)
+
+    def test_errors(number: int) -> Array:
+        rows, rng = np.sort(order[: sizes[number]]), np.random.default_rng([options.seed, sizes[number]])
+        localizer = fit_recording(recording, rows, options, rng, partial(joint.update, number))
+        prediction = localizer.predict_features(localizer.scaled_features(recording)[test])
+        return distances(prediction.positions_mm, recording.presses_mm[test])
+
+    longest_first = reversed(range(len(sizes)))
+    with one_thread(), joint:
+        by_number = dict(run_tasks((number, partial(test_errors, number)) for number in longest_first))
+    errors = np.array([by_number[number] for number in range(len(sizes))])
     counts = np.array(sizes, dtype=float)
     fit = fit_power_law(counts, errors.mean(axis=1))
     forecast = _forecast(counts, errors, fit, rng)
@@ -110,33 +123,6 @@ def learning_curve(
         settings=options.model_dump(),
         provenance=origin,
     )
-
-
-def _predict(
-    recording: Recording,
-    trainings: Sequence[Indices],
-    test: Indices,
-    options: settings.LocalizerSettings,
-    on_progress: OnProgress,
-) -> list[Array]:
-    """Return the test positions (Q, 2) that a localizer predicts after each training."""
-    from padforge.sense.localizer.training import JointProgress, training_steps
-
-    # as many steps as in a calibration on that many presses: with one short training for all, more presses would hardly
-    # lower the error
-    steps = [training_steps(len(training), options) for training in trainings]
-    joint = JointProgress(steps, on_progress)
-
-    def train(number: int) -> Array:
-        training = trainings[number]
-        rng = np.random.default_rng([options.seed, len(training)])
-        localizer = fit_recording(recording, training, options, rng, partial(joint.update, number))
-        return localizer.predict_features(localizer.scaled_features(recording)[test]).positions_mm
-
-    longest_first = reversed(range(len(steps)))
-    with one_thread(), joint:
-        predictions = dict(run_tasks((number, partial(train, number)) for number in longest_first))
-    return [predictions[number] for number in range(len(steps))]
 
 
 def fit_power_law(presses: Array, errors: Array) -> tuple[float, float, float]:

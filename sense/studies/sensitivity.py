@@ -69,7 +69,13 @@ def sensitivity_study(pads: Mapping[str, Morphology], *, contact: Contact | None
         InputError: the contact is a profile.
     """
     contact = contact or Contact()
-    sizes, others = _values(contact)
+    if contact.model == "layer":
+        sizes = [factor * contact.tool_radius_mm for factor in FACTORS]
+        others = [depth for factor in FACTORS if (depth := factor * contact.depth_mm) < contact.thickness_mm]
+    elif contact.model == "shape":
+        sizes, others = list(RADII), list(SIDES)
+    else:
+        raise InputError(f"[contact] model is {contact.model}, allowed are layer and shape: only they have a size")
     kind = _OBJECTS[contact.model]
     objects = [
         contact.model_copy(update={kind.size: size, kind.other: other}) for other, size in product(others, sizes)
@@ -92,16 +98,6 @@ def sensitivity_study(pads: Mapping[str, Morphology], *, contact: Contact | None
     }
     conclude = partial(_conclude, dict(pads), objects, settings)
     return Study("sensitivity", "Sensitivity to the object that presses", settings, tasks, conclude, _draw)
-
-
-def _values(contact: Contact) -> tuple[list[float], list[float]]:
-    """Return the sizes of the objects, and their depths or shapes."""
-    if contact.model == "shape":
-        return list(RADII), list(SIDES)
-    if contact.model != "layer":
-        raise InputError(f"[contact] model is {contact.model}, allowed are layer and shape: only they have a size")
-    depths_mm = [factor * contact.depth_mm for factor in FACTORS]
-    return [factor * contact.tool_radius_mm for factor in FACTORS], [d for d in depths_mm if d < contact.thickness_mm]
 
 
 def _name(contact: Contact) -> str:
