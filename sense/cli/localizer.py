@@ -76,8 +76,8 @@ def calibrate(
     error_map.png, error_by_loss.png and error_by_moment.png. Exit 1 if the recording is doubtful: units that cannot be
     right, or presses that cannot lie where it says.
 
-    --morphology says what few presses do not, of a pad whose fibres are on the channels in the order of its plan, and
-    that is pressed at positions from its middle.
+    With few presses, --morphology adds the responses that the plan predicts. The fibres must be on the channels in the
+    order of the plan, and positions must count from the middle of the pad.
 
     A time budget is that of the training. On top come radii and errors, which may take as long as a training, and what
     --without leaves out: health most of all. A budget in which nothing can be learnt is refused, and a line says when
@@ -147,7 +147,7 @@ def _parse_moment(context: click.Context, param: click.Parameter, value: str | N
     "moment",
     metavar="MOMENT",
     callback=_parse_moment,
-    help="What is known then: 0.3s after the touch, end of the press, or lift+0.25s; all of it by default.",
+    help="Use readings until then: 0.3s after the touch, end of the press, or lift+0.25s (default: all readings).",
 )
 @common.out_option(what="CSV file of positions, places.csv", file=True)
 @common.profile_option
