@@ -21,7 +21,6 @@ if TYPE_CHECKING:
     from padforge.design.settings import Contact, PadSettings
 
 SEARCH = "padforge.design.settings:SearchSettings"
-EDIT_PORT = 8322
 POLL_S = 0.2  # period of checking for Ctrl-C where the system does not wake a waiting thread, s
 MIN_SHOWN_MM = 5e-4  # smallest shift of a fibre's ends that `import` prints, mm
 morphology_argument = click.argument("morphology", type=click.Path(path_type=Path))
@@ -196,7 +195,7 @@ def _echo_large_strain(contact: "Contact") -> None:
 def _load_and_check(
     morphology: Path, spec: Path | None, twin: Path | None = None
 ) -> "tuple[Morphology, Spec, PadSettings, list[Violation]]":
-    """Load a morphology and its settings, for a twin if there is one, and check the design rules."""
+    """Load a morphology and its settings, those for a twin if there is one, and check the design rules."""
     from padforge.design.morphology import Morphology
     from padforge.design.objectives.rules import check_rules
     from padforge.design.settings import PadSettings, RulesSettings
@@ -216,7 +215,7 @@ def _load_and_check(
 @common.out_option(what="Morphology to save to", file=True)
 @common.force_option
 @click.option(
-    "--port", type=click.IntRange(0, 65535), default=EDIT_PORT, show_default=True, help="Port of the page; 0: any."
+    "--port", type=click.IntRange(0, 65535), default=8322, show_default=True, help="Port of the page; 0: any."
 )
 def edit(pad: Path | None, spec: Path | None, out: Path | None, force: bool, port: int) -> None:
     """Edit the paths in a browser on this machine. The page shows broken rules and ambiguity at every step.
@@ -307,8 +306,11 @@ def import_(
         moved = f", ends moved by {fibre.end_shift_mm:.3f} mm" if fibre.end_shift_mm >= MIN_SHOWN_MM else ""
         lines.append(f"  fibre {number}: {fibre.name}, within {fibre.max_error_mm:.3f} mm{moved}")
     lines += [f"  broken: {violation}" for violation in violations] or ["  all rules hold"]
-    fibres = [{"fibre": number, **asdict(fibre)} for number, fibre in enumerate(result.fibres, 1)]
-    document = {"fibres": fibres, "knots": knots, "placement": result.placement}
-    document["violations"] = list(map(asdict, violations))
+    document = {
+        "fibres": [{"fibre": number, **asdict(fibre)} for number, fibre in enumerate(result.fibres, 1)],
+        "knots": knots,
+        "placement": result.placement,
+        "violations": list(map(asdict, violations)),
+    }
     common.show_result(document, lines, as_json)
     context.exit(int(bool(violations)))

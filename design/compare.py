@@ -1,4 +1,4 @@
-"""Compare pads: variants of settings side by side, by what they cost to make and by their localisation errors."""
+"""Compare pads, such as those of variants of settings, by what they cost to make and by their localisation errors."""
 
 import itertools
 import re
@@ -26,10 +26,10 @@ from padforge.design.settings import Contact, PadSettings, RulesSettings, Search
 
 FORMAT, NAME = "padforge-comparison/1", "comparison.json"
 MAX_VARIANTS = 64
-MODELS = (PadSettings, Contact, SearchSettings, RulesSettings)  # what a design depends on, and so may be varied
+MODELS = (PadSettings, Contact, SearchSettings, RulesSettings)  # settings of a design, which may be varied
 # names that no file can have on Windows
 WINDOWS_DEVICE = re.compile(r"(con|prn|aux|nul|com\d|lpt\d)(\.|$)", re.IGNORECASE)
-# makes the mould of a pad into a folder, and returns its costs by the keys of COSTS
+# makes the mould of a pad in a folder, and returns its costs by the keys of COSTS
 MakePad = Callable[[Morphology, Spec, Path], Mapping[str, Any]]
 # columns that not every pad has, with their units
 COSTS = {
@@ -91,7 +91,7 @@ def read_variants(
     if not 2 <= len(variants) <= MAX_VARIANTS:
         advice = "name settings or morphologies, or vary a setting with --vary"
         raise InputError(f"pads to compare are {len(variants)}, allowed are 2 to {MAX_VARIANTS}: {advice}")
-    for variant in variants:  # before minutes are spent on another one
+    for variant in variants:  # refuse invalid settings before minutes are spent on another variant
         for model in (PadSettings, SearchSettings, RulesSettings):
             variant.spec.section(model)
     return variants

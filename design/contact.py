@@ -102,13 +102,21 @@ def signals(
     fibres = along.shape[1]
     check_memory(len(along) * len(centres) * fibres)
     out = np.zeros((len(along), len(centres), fibres))
+    unit_mm = grid_unit_mm(pad)
     if contact.model == "shape":
-        shape = press_shape(contact, grid_unit_mm(pad))
-        _run_exact(along, across, ends, centres, shape, _NO_SPARSE_OUTPUT, out.reshape(-1))
+        _run_exact(along, across, ends, centres, press_shape(contact, unit_mm), _NO_SPARSE_OUTPUT, out.reshape(-1))
     elif len(centres):
         precision = check_float("precision", precision, 1e-6, 1.0)  # that of a `weight_table` is about 1e-7
-        for curves in zip(along, across, out, strict=True):
-            _sum_elements(*curves, ends, centres, contact, grid_unit_mm(pad), precision, sensitivity)
+        (_, extents, law), spacings = press_shape(contact, unit_mm), element_spacings(contact, unit_mm, precision)
+        for t, v, pad_signals in zip(along, across, out, strict=True):
+            slope = population_slopes(t[None], v[None])[0]
+            elements = element_signals.fibre_elements(t, v, slope, ends.horizontals, centres, law, spacings)
+            if sensitivity is not None:
+                element_signals.weigh_elements(elements, t, sensitivity)
+            table = weight_table(contact, unit_mm)
+            visited = element_signals.element_signals(t, v, elements, centres, law, table, pad_signals)
+            if profiling.is_profiling():
+                record_visits(t[None], geometry.max_offsets(v[None], ends), ends, centres, extents, visited)
     return _sum_simultaneous(out, (*batch, *press_counts, fibres))
 
 
@@ -120,37 +128,8 @@ def relative_stretch(pad: Morphology, presses: ArrayLike, contact: Contact) -> A
     return signals(pad, presses, contact) / lengths(pad)
 
 
-def _sum_elements(
-    along: Array,
-    across: Array,
-    out: Array,
-    ends: geometry.Ends,
-    presses: Array,
-    contact: Contact,
-    unit_mm: float,
-    precision: float,
-    sensitivity: Array | None,
-) -> None:
-    """Compute the signals of one pad with knots (F, N + 2) from elements of its fibres into `out` (Q, F)."""
-    shape, slope = press_shape(contact, unit_mm), population_slopes(along[None], across[None])[0]
-    law, spacings = shape[2], element_spacings(contact, unit_mm, precision)
-    elements = element_signals.fibre_elements(along, across, slope, ends.horizontals, presses, law, spacings)
-    if sensitivity is not None:
-        element_signals.weigh_elements(elements, along, sensitivity)
-    table = weight_table(contact, unit_mm)
-    visited = element_signals.element_signals(along, across, elements, presses, law, table, out)
-    if profiling.is_profiling():
-        offsets = geometry.max_offsets(across[None], ends)
-        record_visits(along[None], offsets, ends, presses, shape[1], visited)
-
-
 def widened(contact: Contact, factor: float) -> Contact:
-    """Return a contact whose press is wider by a factor, of the same weight at its centre.
-
-    Args:
-        contact: a contact of any model.
-        factor: > 0.
-    """
+    """Return a contact whose press is wider by a factor > 0, of the same weight at its centre."""
     if factor == 1:
         return contact
     if contact.model == "layer":
@@ -196,13 +175,8 @@ def indented_signals(
 def depth_terms(depths_mm: Array, contact: Contact) -> Iterator[tuple[Ints, Array, Contact]]:
     """Yield the terms of an interpolation over depth of a quantity that is 0 at depth 0, for presses into a layer.
 
-    Args:
-        depths_mm: depth of each press; shape (Q,), 0 to the depth of the contact, mm.
-        contact: a layer.
-
-    Yields:
-        Indices (n,) of presses, the weights (n,) of a solved contact for them, and that contact. If there are few
-        depths, each is solved, and the weights are 1.
+    The depths (Q,), mm, are from 0 to that of the contact. A term is the indices (n,) of presses, the weights (n,) of a
+    solved contact for them, and that contact. If there are few depths, each is solved, and the weights are 1.
     """
     depths = np.unique(depths_mm)
     if len(depths) <= DEPTH_STEPS:
@@ -254,7 +228,7 @@ def _check_depths(contact: Contact | None, depths_mm: ArrayLike) -> tuple[Contac
 
 
 def _depth_steps(contact: Contact) -> list[Contact]:
-    """Return the contact at the depths for which it is solved, up to its own."""
+    """Return the contact at DEPTH_STEPS depths up to its own."""
     shares = (np.arange(1, DEPTH_STEPS + 1) / DEPTH_STEPS) ** 2
     return [contact.model_copy(update={"depth_mm": share * contact.depth_mm}) for share in shares.tolist()]
 
@@ -288,12 +262,12 @@ def signals_sparse(pad: Morphology, presses: ArrayLike, contact: Contact | None 
 
     contact = or_default("contact", contact, Contact)
     along, across, ends, _ = fibre_axes(check_type("pad", pad, Morphology))
-    centres, max_offsets = check_presses(presses)[0], geometry.max_offsets(across, ends)
+    centres, _ = check_presses(presses)
     if contact.model != "shape":
         blocks = np.array_split(centres, range(1000, len(centres), 1000))  # 1000 rows are dense at a time
         return csr_array(vstack([csr_array(signals(pad, block, contact)) for block in blocks], format="csr"))
     shape = press_shape(contact, pad.unit_mm)
-    starts = geometry.count_touched(max_offsets[0], centres, shape[1], ends)
+    starts = geometry.count_touched(geometry.max_offsets(across, ends)[0], centres, shape[1], ends)
     check_memory(int(starts[-1]))
     fibre, signal = np.empty(starts[-1], np.int64), np.empty(starts[-1])
     _run_exact(along, across, ends, centres, shape, (starts, fibre), signal)
@@ -383,13 +357,7 @@ def search_precision(contact: Contact) -> float:
 
 @lru_cache(maxsize=128)
 def element_spacings(contact: Contact, unit_mm: float, precision: float) -> tuple[float, float]:
-    """Return the spacings of elements of `element_signals` for a contact with a profile, grid units of `unit_mm`.
-
-    Args:
-        contact: a layer or a profile.
-        unit_mm: the grid unit, mm.
-        precision: as of `signals`.
-    """
+    """Return the spacings of elements of `element_signals` for a layer or a profile, grid units of `unit_mm`."""
     return element_signals.element_spacings(contact_law(contact, unit_mm), precision)
 
 
@@ -411,23 +379,12 @@ def contact_law(contact: Contact, unit_mm: float) -> geometry.WeightLaw:
 
 
 def contact_press(contact: Contact) -> LayerPress:
-    """Return the press of a tool into the layer of a contact, without its `scale`.
-
-    Args:
-        contact: a layer.
-    """
+    """Return the press of the tool of a contact into its layer, without its `scale`."""
     return solve_press(contact.tool, contact.tool_radius_mm, contact.depth_mm, contact.thickness_mm, contact.base)
 
 
 def fibre_strains(contact: Contact) -> list[tuple[float, float]]:
-    """Compute the maximum strains of the horizontal and of the vertical fibres under a press.
-
-    Args:
-        contact: a layer.
-
-    Returns:
-        Compressive strain across the fibres, and tensile strain along them, by family.
-    """
+    """Compute by family the maximum compressive strain across fibres and tensile strain along them, in a layer."""
     press = contact_press(contact)
     distances_mm = np.linspace(0, 2 * press.contact_radius_mm, 100)
     heights_mm = [contact.thickness_mm - depth_mm for depth_mm in contact.fibre_depths_mm]
@@ -436,11 +393,7 @@ def fibre_strains(contact: Contact) -> list[tuple[float, float]]:
 
 
 def describe_large_strain(contact: Contact) -> str:
-    """Return a warning if the linear layer has strains above 1, which are impossible; "" otherwise.
-
-    Args:
-        contact: any contact; only a layer has strains.
-    """
+    """Return a warning if a contact is a layer with strains above 1, which are impossible; "" otherwise."""
     if contact.model != "layer":
         return ""
     press, fibres_mm = contact_press(contact), contact.thickness_mm - min(contact.fibre_depths_mm)
@@ -461,14 +414,8 @@ def profile_weights(contact: Contact) -> tuple[tuple[Array, Array, Array], ...]:
     """Return the weights of a contact that is no shape, once for all fibres, or for each family.
 
     An element has the weight w(d) + v(d) cos^2 phi, with its distance d and the angle phi between the fibre and the
-    direction to the press.
-
-    Args:
-        contact: a layer or a profile.
-
-    Returns:
-        Distances d, mm, ascending from 0 to the end of the weight, and w and v there; all of shape (n,). For a layer
-        they are strains, whose integral over the length of a fibre is its effective elongation.
+    direction to the press. Returned are distances d, mm, ascending from 0 to the end of the weight, and w and v there;
+    all of shape (n,). For a layer these are strains, whose integral along a fibre is its effective elongation.
     """
     if contact.model == "profile":
         distance, weight = np.array(contact.sensitivity_profile).T
@@ -496,10 +443,7 @@ def half_width_mm(contact: Contact) -> float:
 def half_widths_mm(contact: Contact) -> list[float]:
     """Return the largest distance at which the weight is half of its maximum, mm, once for all fibres or by family.
 
-    The weight is the mean over all directions of the fibre.
-
-    Args:
-        contact: a layer or a profile.
+    The weight is that of a layer or a profile, averaged over all directions of the fibre.
     """
     widths = []
     for distance, plain, directed in profile_weights(contact):

@@ -1,10 +1,7 @@
-"""Sensitivity of expected errors to the contact model: what becomes of them if the real contact is another one.
-
-The result is `contacts.json`.
-"""
+"""Sensitivity of expected errors to the contact model, written to `contacts.json`."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import partial
 from itertools import product
 from pathlib import Path
@@ -36,12 +33,12 @@ class ContactErrors:
 
 
 def errors_by_contact(
-    pads: Mapping[str, Morphology], contacts: Mapping[str, Contact], size: PadSettings, search: SearchSettings
+    pads: Mapping[str, Morphology], contacts: Mapping[str, Contact], pad_settings: PadSettings, search: SearchSettings
 ) -> list[ContactErrors]:
-    """Compute the expected errors of pads of one layout under every contact, contact by contact, by the same draws."""
+    """Compute the expected errors of pads of one layout under every contact, all by the same random numbers."""
     names = list(product(contacts, pads))
     with threadpool_limits(1, "blas"):  # around those of the tasks, which would lift them for one another
-        tasks = (((c, p), partial(expected_errors, pads[p], contacts[c], search, size)) for c, p in names)
+        tasks = (((c, p), partial(expected_errors, pads[p], contacts[c], search, pad_settings)) for c, p in names)
         errors = dict(run_tasks(tasks))
     return [ContactErrors(c, p, tuple(pads[p].unit_mm * error for error in errors[c, p])) for c, p in names]
 
@@ -52,7 +49,7 @@ def beside_straight(pad: Morphology) -> dict[str, Morphology]:
 
 
 def design_contact(spec: "Spec", settings: SearchSettings) -> Contact:
-    """Return the contact designed for: the one that `spec` states, or the default of such a search."""
+    """Return the contact to design for: the one that `spec` states, or the default of the search method."""
     is_default = settings.method == "genetic" and not spec.stated(Contact)
     return settings.default_contact if is_default else read_contact(spec)
 
@@ -60,14 +57,14 @@ def design_contact(spec: "Spec", settings: SearchSettings) -> Contact:
 def compare_contacts(spec: "Spec", pad: Morphology, out: Path, seed: int | None = None) -> dict[str, Any]:
     """Write and return the errors of a pad and of straight fibres under the contact of `spec` and others."""
     settings = spec.section(SearchSettings, seed=seed)
-    size = spec.section(PadSettings, **pad.layout.settings)
+    pad_settings = spec.section(PadSettings, **pad.layout.settings)
     contacts = judged_contacts(design_contact(spec, settings), settings)
     with stage("contacts"):
-        errors = errors_by_contact(beside_straight(pad), contacts, size, settings)
+        errors = errors_by_contact(beside_straight(pad), contacts, pad_settings, settings)
     document = {
         "format": FORMAT,
         "scatter": settings.response_scatter._asdict(),
-        "rows": [{"contact": row.contact, "pad": row.pad, "errors_mm": list(row.errors_mm)} for row in errors],
+        "rows": list(map(asdict, errors)),
         "provenance": provenance("padforge run", settings.seed, [out / "morphology.json"]),
     }
     write_json(out / NAME, document)

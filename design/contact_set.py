@@ -3,11 +3,8 @@
 from padforge.design.contact import half_width_mm, widened
 from padforge.design.settings import MEASURED_STD_MM, PUBLISHED_CONTACT, Contact, SearchSettings
 
-NARROWER, WIDER = 0.75, 1.25
-"""Widths of the isotropic profiles that a pad designed for a layer must serve, as shares of the measured one."""
 UNCERTAINTY = 0.1
-"""Share by which the width of a measured profile may be wrong: parts of one recording give profiles as far apart."""
-PROFILE_STD_MM = (5.0, MEASURED_STD_MM, 7.9)  # of the sensitivity profiles, about Gaussian, that are tried
+"""Relative uncertainty of the width of a measured profile, by which profiles from parts of one recording differ."""
 
 
 def served_contacts(assumed: Contact, search: SearchSettings) -> dict[str, Contact]:
@@ -24,15 +21,16 @@ def _plausible_contacts(assumed: Contact) -> dict[str, Contact]:
     """Return contacts that the assumed one may turn out to be.
 
     The share in which a press stretches fibres is the least certain part of a layer: on the built pad an isotropic
-    profile explains as much as the directions of a layer do. So a pad serves the layer and, of two widths, the measured
-    isotropic profile, which is as much wider under another press as the layer is. Pressed flat alone, fibres answer in
-    between. A profile was measured, and only its width is uncertain. A shape is a convention, to be served as it is.
+    profile explains as much as the directions of a layer do. So a pad serves the layer, and the measured isotropic
+    profile at 0.75 and at 1.25 of its width, which grows with the width of the press as that of the layer does. Fibres
+    that are only pressed flat respond in between. A profile was measured, so that only its width is uncertain. A shape
+    is a convention, to be served as it is.
     """
     if assumed.model == "layer":
         scale = half_width_mm(assumed) / half_width_mm(Contact())
         return {
             f"isotropic, {half_width_mm(profile):.2g} mm": profile
-            for profile in (widened(Contact(model="profile"), scale * share) for share in (NARROWER, WIDER))
+            for profile in (widened(Contact(model="profile"), scale * share) for share in (0.75, 1.25))
         }
     if assumed.model == "profile":
         shares = {"narrower": 1 - UNCERTAINTY, "wider": 1 + UNCERTAINTY}
@@ -43,8 +41,8 @@ def _plausible_contacts(assumed: Contact) -> dict[str, Contact]:
 def judged_contacts(assumed: Contact, search: SearchSettings) -> dict[str, Contact]:
     """Return the contacts that a pad is judged by, by name: those that a search serves, and others; none twice.
 
-    Beside a layer the others are presses by a tool half as large or half as deep, and fibres that answer to being
-    pressed flat alone; beside another contact narrower and wider profiles, and the published disc.
+    Beside a layer the others are presses by a tool half as large or half as deep, and fibres that respond to being
+    pressed flat alone; beside another contact they are narrower and wider profiles, and the published disc.
     """
     if assumed.model == "layer":
         tool_mm, depth_mm = assumed.tool_radius_mm / 2, assumed.depth_mm / 2
@@ -56,7 +54,8 @@ def judged_contacts(assumed: Contact, search: SearchSettings) -> dict[str, Conta
         others = {name: Contact(**assumed.model_dump() | change) for name, change in changes.items()}
     else:
         others = {
-            f"profile of {std:g} mm": widened(Contact(model="profile"), std / MEASURED_STD_MM) for std in PROFILE_STD_MM
+            f"profile of {std:g} mm": widened(Contact(model="profile"), std / MEASURED_STD_MM)
+            for std in (5.0, MEASURED_STD_MM, 7.9)
         }
         others["published disc, K = 0.6"] = PUBLISHED_CONTACT
     served = served_contacts(assumed, search)

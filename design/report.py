@@ -1,6 +1,6 @@
 """Draw the plan of a pad, and write the sections of a report on its design and its contact."""
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
@@ -160,6 +160,12 @@ def design_sections(folder: Path, document: Mapping[str, Any]) -> list[PageSecti
         f" to a press vary by {float(search['scatter']):.0%} of their value from press to press, plus"
         f" {float(search['noise']):.1%} of full scale."
     )
+    broken, rules = {violation["rule"] for violation in violations}, []
+    for name, limit in settings["rules"].items():
+        if name != "enforce":
+            result = "fail" if name in broken else "pass" if enforced else "not enforced"
+            field = RulesSettings.model_fields.get(name)
+            rules.append([field.description if field else name, limit, result, name])
     body = [
         columns(
             [figures([(folder / "design.svg", plan)])],
@@ -171,10 +177,14 @@ def design_sections(folder: Path, document: Mapping[str, Any]) -> list[PageSecti
         ),
         heading("Design rules"),
         paragraph(f"Checked on the exact curves: {check}."),
-        table(["rule", "limit", "result", "setting"], list(_rule_rows(settings["rules"], violations))),
+        table(["rule", "limit", "result", "setting"], rules),
     ]
     if violations:
-        rows = list(map(_violation_row, violations))
+        rows = []
+        for violation in violations:
+            fibres, position_mm = ", ".join(map(str, violation["fibres"])), violation["place_mm"]
+            position = "-" if position_mm is None else "({:.1f}, {:.1f})".format(*position_mm)
+            rows.append([violation["rule"], fibres or "pad", position, violation["measured"], violation["limit"]])
         body.append(table(["broken rule", "fibres", "position (mm)", "measured", "limit"], rows))
     rows = [[name, value, document["descriptions"].get(name, "")] for name, value in terms.items()]
     body.append(collapsible("All terms of the objective", [table(["term", "value", "meaning"], rows)]))
@@ -190,27 +200,10 @@ def _size_text(sides_mm: Iterable[float]) -> str:
     return " x ".join(f"{round(float(side), 6):g}" for side in sides_mm) + " mm"
 
 
-def _rule_rows(rules: Mapping[str, Any], violations: Sequence[Mapping[str, Any]]) -> Iterator[list[object]]:
-    broken = {violation["rule"] for violation in violations}
-    for name, limit in rules.items():
-        if name != "enforce":
-            result = "fail" if name in broken else "pass" if rules["enforce"] else "not enforced"
-            field = RulesSettings.model_fields.get(name)
-            yield [field.description if field else name, limit, result, name]
-
-
-def _violation_row(violation: Mapping[str, Any]) -> list[object]:
-    fibres, position_mm = ", ".join(map(str, violation["fibres"])), violation["place_mm"]
-    position = "-" if position_mm is None else "({:.1f}, {:.1f})".format(*position_mm)
-    return [violation["rule"], fibres or "pad", position, violation["measured"], violation["limit"]]
-
-
 def draw_press(contact: Contact, pitch_mm: float) -> "Figure":
     """Draw a press into a layer in section, beside the weights of elements of fibres by their distance from it.
 
-    Args:
-        contact: a layer.
-        pitch_mm: distance of the vertical fibres, which cross the section.
+    Vertical fibres, `pitch_mm` apart, cross the section.
     """
     from matplotlib.figure import Figure
 
@@ -258,19 +251,19 @@ def _tool_surface(contact: Contact, x: "Array") -> "Array":
     return tip + x**2 / (2 * radius)
 
 
-def _sink(press: LayerPress, r: "Array", height_mm: float, steps: int = 6) -> "Array":
+def _sink(press: LayerPress, r: "Array", height_mm: float) -> "Array":
     """Return how far the silicone at a height is down, mm: the integral of its vertical strain from the base."""
-    heights = (np.arange(steps) + 0.5) / steps * height_mm
-    return np.sum([press.strains(r, z, FIBRE_BLUR_MM).compressive for z in heights], axis=0) * height_mm / steps
+    heights = (np.arange(6) + 0.5) / 6 * height_mm
+    return np.sum([press.strains(r, z, FIBRE_BLUR_MM).compressive for z in heights], axis=0) * height_mm / 6
 
 
 def press_sections(
     document: Mapping[str, Any], max_strain: float | None, silicone: tuple[str, float] | None = None
 ) -> list[PageSection]:
-    """Return the section on the press that a pad is designed for, with its picture; none unless a layer.
+    """Return the section on the press that a pad is designed for, with its picture; none unless it is into a layer.
 
     Args:
-        document: its `design.json`; a damaged one raises any of the built-in errors.
+        document: `design.json` of the pad; a damaged one raises any of the built-in errors.
         max_strain: elongation that the fibres bear, relative to their length; None if unknown.
         silicone: name and Young's modulus, kPa; None for Ecoflex 00-20.
     """
@@ -303,18 +296,18 @@ def press_sections(
 
 
 def contact_lines(document: Mapping[str, Any]) -> list[str]:
-    """Summarise a `contacts.json`: errors with all fibres, by contact, and where straight fibres are as good."""
+    """Summarise a `contacts.json`: errors with all fibres by contact, and contacts under which straight fibres win."""
     parts = []
     for pad in ("designed", "straight"):
         assumed, *others = [row["errors_mm"][0] for row in document["rows"] if row["pad"] == pad]
         parts.append(f"{assumed:.2f} mm under the assumed contact, {min(others):.2f} to {max(others):.2f} mm otherwise")
     lines = [f"contact: expected error {parts[0]}; of straight fibres {parts[1]}"]
-    lost = [
+    cases = [
         f"{contact} with {' and '.join(map(str, levels))} failed"
         for contact, shares in _shares_of_straight(document).items()
         if (levels := [n_failed for n_failed, share in enumerate(shares) if share >= 1])
     ]
-    return lines + [f"  straight fibres are as good or better: {'; '.join(lost)}"] * bool(lost)
+    return lines + [f"  straight fibres are as good or better: {'; '.join(cases)}"] * bool(cases)
 
 
 def _shares_of_straight(document: Mapping[str, Any]) -> dict[str, list[float]]:

@@ -22,8 +22,8 @@ DEFAULT_PITCH_MM = 11.25  # pitch of the built pad
 MAX_FIBRES = 1024  # fibres of one family, also of a pad made of tiles
 
 Pair = tuple[float, float]
-Tool = Literal["dome", "ball", "flat", "finger"]  # shapes of what presses a layer
-Base = Literal["bonded", "slipping"]  # what a layer does on what it lies on
+Tool = Literal["dome", "ball", "flat", "finger"]  # shapes of tools that press a layer
+Base = Literal["bonded", "slipping"]  # boundary condition at the bottom of a layer
 Counts = int | tuple[int, int]  # M horizontals and M verticals, or (horizontals, verticals)
 Pitch = float | Pair  # distance of neighbouring fibre ends, mm: in both directions, or along x and along y
 
@@ -166,14 +166,14 @@ _KEYS = {
     "profile": ("sensitivity_profile",),
     "shape": ("radius", "sides", "weight"),
 }
-"""Keys that count for each model of `[contact]`, besides those for all."""
+"""Keys of `[contact]` by the model that they belong to; all other keys belong to every model."""
 
 PRESS_DEPTH_MM = 5.0  # default depth of a press
 SILICONE_MM = 6.0  # default thickness of the cast pad
 FIBRE_MM = 0.3  # default diameter of a fibre
 TRACK_DEPTHS_MM = (1.2, 0.4)  # default depths of the tracks of the deep family and of the other one
 _CAST_KEYS = "thickness_mm", "fibre_depths_mm"  # of `[contact]`, of the pad as it is cast
-CAST_SHARE = 0.02  # of the thickness: by how much lengths of the pad may differ from those of its contact
+CAST_SHARE = 0.02  # largest difference of lengths of the pad and of its contact, as a share of the thickness
 _RIDGES = ("deep_ridge_height_mm", "shallow_ridge_height_mm")  # keys of `[mould]`, in that order
 FIBRE_DEPTHS_MM = (TRACK_DEPTHS_MM[0] - FIBRE_MM / 2, TRACK_DEPTHS_MM[1] - FIBRE_MM / 2)  # centre lines, at the bottom
 
@@ -187,12 +187,13 @@ class Contact(Settings, frozen=True):
     """`[contact]`: the contact model of a press, by which each fibre responds.
 
     The signal of a fibre is the line integral of a weight along it. The model "layer" computes the weight from the
-    press: the silicone is an elastic layer under a tool (`padforge.design.layer`), and an element of a fibre answers by
+    press: the silicone is an elastic layer under a tool (`padforge.design.layer`), and an element of a fibre responds
+    by
 
         squeeze (-eps_zz) + stretch (cos^2 phi du/dr + sin^2 phi u/r),
 
-    the strain that presses it flat and the strain along it, with phi the angle between the fibre and the way to the
-    press. In "profile" the weight is a measured function of the distance d to the press centre. In "shape" it is
+    the strain that presses it flat and the strain along it, with phi the angle between the fibre and the direction to
+    the press. In "profile" the weight is a measured function of the distance d to the press centre. In "shape" it is
     `weight` inside a regular polygon or circle (paper, formulas (1) and (2)), in grid units, as published: there, and
     only there, the press grows with the pitch. Stating keys of one model selects it; `sensitivity_profile = []` is a
     shape as well.
@@ -201,10 +202,10 @@ class Contact(Settings, frozen=True):
         model: "layer" if no key of another model is stated.
         tool: "dome" is a paraboloid of that tip radius, "finger" one as soft as the pad, "flat" the end of a rod.
         depth_mm: of the tool's tip, less than the thickness.
-        base: "slipping" where the pad lies on a table, as the built pad says; "bonded" where it is glued.
-        fibre_depths_mm: centre lines of the horizontal and of the vertical fibres, below the face that is pressed.
-            This and the thickness are of the mould, pressed on the side of its tracks, where a settings file does not
-            state them (`read_contact`).
+        base: "slipping" if the pad lies on a table, as readings of the built pad say; "bonded" if it is glued.
+        fibre_depths_mm: centre lines of the horizontal and of the vertical fibres, below the pressed face. If a
+            settings file does not state them or the thickness, they follow from the mould, with the face of the tracks
+            pressed (`read_contact`).
         sides: number of sides D; None for a circle ("circle" in pad.toml).
         weight: "inverse" is 1 / max(d, K / 100), the paper's 1 / d kept finite within a hundredth of the radius.
         length: "manhattan" is the default of shapes, "euclidean" that of the others.
@@ -294,13 +295,10 @@ def _stated_model(stated: Mapping[str, Any]) -> Any:
 
 
 def read_contact(spec: Spec) -> Contact:
-    """Read `[contact]`; lengths of the pad that it does not state are those of the pad as it will be cast.
+    """Read `[contact]` of a settings file; lengths of the pad that it does not state are those of the pad as cast.
 
     These are `thickness_mm`, by `[mould]`, and `fibre_depths_mm`, by the ridges of `[mould]`, the diameter of `[fibre]`
     and the deep family of `[pad]`, as far as the settings state them.
-
-    Args:
-        spec: settings file.
 
     Raises:
         InputError: an unknown key or a value out of range, or a pad that is too thin for the press or its fibres.
@@ -308,7 +306,7 @@ def read_contact(spec: Spec) -> Contact:
     stated = spec.stated(Contact)
     if _stated_model(stated) != "layer":
         return spec.section(Contact)
-    radius_mm = _fibre_radius_mm(spec)
+    radius_mm = _stated_mm(spec, "fibre", "diameter_mm", FIBRE_MM) / 2
     depths_mm = [
         _stated_mm(spec, "mould", key, default) - radius_mm
         for key, default in zip(_RIDGES, TRACK_DEPTHS_MM, strict=True)
@@ -320,11 +318,7 @@ def read_contact(spec: Spec) -> Contact:
 
 
 def contact_designed_for(provenance: Mapping[str, Any]) -> Contact | None:
-    """Return the contact that a pad was designed for; None if its provenance, which is free, does not say so.
-
-    Args:
-        provenance: of the morphology.
-    """
+    """Return the contact that a pad was designed for, by the provenance of its morphology; None if that has none."""
     settings = provenance.get("settings")
     stated = settings.get("contact") if isinstance(settings, Mapping) else None
     if not isinstance(stated, Mapping):
@@ -336,9 +330,7 @@ def contact_designed_for(provenance: Mapping[str, Any]) -> Contact | None:
 def cast_as_contact(spec: Spec, keys: Collection[str]) -> Spec:
     """Return settings whose mould makes the pad that `[contact]` describes, the inverse of `read_contact`.
 
-    Args:
-        spec: settings file.
-        keys: of `[contact]` that the mould follows, of which those other than lengths of the pad do not count.
+    The mould follows the lengths of the pad among the `keys` of `[contact]`.
     """
     return spec.replaced(_tables_of_cast(spec, keys))
 
@@ -346,11 +338,8 @@ def cast_as_contact(spec: Spec, keys: Collection[str]) -> Spec:
 def fill_cast(spec: Spec) -> Spec:
     """Return settings whose mould makes the pad that `[contact]` states, where they leave it open.
 
-    Args:
-        spec: settings file.
-
     Raises:
-        InputError: they state another pad.
+        InputError: the settings state another pad.
     """
     stated, tables = spec.stated(Contact), {}
     if _stated_model(stated) != "layer":
@@ -358,22 +347,15 @@ def fill_cast(spec: Spec) -> Spec:
     slack_mm = CAST_SHARE * read_contact(spec).thickness_mm
     for key in (name for name in _CAST_KEYS if name in stated):
         for section, values in _tables_of_cast(spec, [key]).items():
+            of_section = spec.stated(section)
             for name, value in values.items():
-                _check_agrees(spec, section, name, value, slack_mm, key)
-            tables[section] = tables.get(section, {}) | values | spec.stated(section)
+                got = of_section.get(name, value)
+                is_length = isinstance(value, float)
+                if abs(_stated_mm(spec, section, name, value) - value) > slack_mm if is_length else got != value:
+                    allowed = f"allowed is {value}, as [contact] {key} says, or only one of these keys"
+                    raise InputError(f"{spec.source}: [{section}] {name}: got {short_repr(got)}, {allowed}")
+            tables[section] = tables.get(section, {}) | values | of_section
     return spec.replaced(tables)
-
-
-def _check_agrees(spec: Spec, section: str, name: str, value: Any, slack_mm: float, key: str) -> None:
-    """Refuse a value that a section states beside another one, by which the pad is as `key` of `[contact]` says."""
-    stated = spec.stated(section).get(name, value)
-    if isinstance(value, float):
-        agrees = abs(_stated_mm(spec, section, name, value) - value) <= slack_mm
-    else:
-        agrees = stated == value
-    if not agrees:
-        allowed = f"allowed is {value}, as [contact] {key} says, or only one of these keys"
-        raise InputError(f"{spec.source}: [{section}] {name}: got {short_repr(stated)}, {allowed}")
 
 
 def _tables_of_cast(spec: Spec, keys: Collection[str]) -> dict[str, dict[str, Any]]:
@@ -385,19 +367,15 @@ def _tables_of_cast(spec: Spec, keys: Collection[str]) -> dict[str, dict[str, An
         horizontal, vertical = contact.fibre_depths_mm
         if min(horizontal, vertical) > contact.thickness_mm / 2:  # the face without tracks is pressed
             horizontal, vertical = contact.thickness_mm - horizontal, contact.thickness_mm - vertical
-        radius_mm = _fibre_radius_mm(spec)
+        radius_mm = _stated_mm(spec, "fibre", "diameter_mm", FIBRE_MM) / 2
         heights_mm = [round(depth + radius_mm, 9) for depth in (max(horizontal, vertical), min(horizontal, vertical))]
         tables["mould"] = tables.get("mould", {}) | dict(zip(_RIDGES, heights_mm, strict=True))
         tables["pad"] = {"deep_family": "horizontal" if horizontal > vertical else "vertical"}
     return tables
 
 
-def _fibre_radius_mm(spec: Spec) -> float:
-    return _stated_mm(spec, "fibre", "diameter_mm", FIBRE_MM) / 2
-
-
 def _stated_mm(spec: Spec, section: str, key: str, default: float) -> float:
-    """Return a length that a section states; the default if it is none: those who own the section refuse it."""
+    """Return a length that a section states; the default if it is no number, which the section's model refuses."""
     value = spec.stated(section).get(key, default)
     return float(value) if isinstance(value, int | float) and not isinstance(value, bool) else default
 
@@ -430,13 +408,10 @@ def _check_overshoot(points: tuple[Point, ...]) -> None:
 
 
 PUBLISHED_CONTACT = Contact(radius=0.6)  # of the paper: a polygon of 30 sides, Manhattan lengths
-# the authors' pad: a dome of 0.75 pitches, pressed 5 mm by their code; which family lies deeper, and that the pad slips
-# on its table, is what their readings say
-BUILT_CONTACT = Contact(base="slipping", fibre_depths_mm=FIBRE_DEPTHS_MM[::-1])
 TRACK_WIDTH_MM = 0.4  # default width of a track
-MIN_COMMON_MM = 2.5 * TRACK_WIDTH_MM  # two straight tracks at a right angle have two widths in common
 
-MaxCommon = Annotated[Annotated[float, Field(ge=MIN_COMMON_MM, le=1000)] | None, *null_as("any")]
+# two straight tracks that cross at a right angle have two widths in common
+MaxCommon = Annotated[Annotated[float, Field(ge=2.5 * TRACK_WIDTH_MM, le=1000)] | None, *null_as("any")]
 MaxCrossings = Annotated[Annotated[int, Field(ge=0)] | None, *null_as("any")]
 RuleMm = Annotated[float, Field(ge=0, le=1000)]
 
@@ -490,8 +465,6 @@ WEIGHTS = (1.0, 1e-7, 5e-6)  # published alpha, beta and gamma: weights of entro
 SIDE = 7  # presses per row and column in the published search
 LEVELS = 4096  # levels of the published 12-bit converter
 MAX_LEVELS = 2**24
-
-
 Entropy = Literal["families", "joint"]
 """Entropy in the published objective: of either family, summed, as the published code has it, or of all fibres."""
 
@@ -525,8 +498,9 @@ class SearchSettings(Settings):
         noise: additive scatter; this and the next two default to the scatter measured on a built pad. It is a share of
             the full scale of straight fibres: of the default pad under the default press for a layer, whose responses
             are strains, of the pad itself for other contacts, whose responses have no unit.
-        contacts: what the pad must serve beside `[contact]`: "plausible" contacts, which it may really meet
-            (`padforge.design.contact_set`); none, if "assumed"; or a list of tables such as `{radius = 0.9}`.
+        contacts: further contacts that the pad is optimised for beside `[contact]`: "plausible" ones, which it may
+            really meet (`padforge.design.contact_set`); none, if "assumed"; or a list of tables such as
+            `{radius = 0.9}`.
     """
 
     method: Literal["descent", "genetic"] = Field(
@@ -562,7 +536,7 @@ class SearchSettings(Settings):
 
     @property
     def default_contact(self) -> Contact:
-        """Contact designed for if none is stated: the default layer, or the paper's for the paper's own method."""
+        """Contact to design for if none is stated: the default layer, or the published one for the genetic search."""
         return PUBLISHED_CONTACT if self.method == "genetic" else Contact()
 
     @property
@@ -605,7 +579,7 @@ PitchMm = Annotated[float, Field(ge=0.1, le=1000)]
 
 
 def sensed_rectangle(layout: Layout, sensed_mm: Sensed = "beyond") -> Rectangle:
-    """Return the low and the high corner of what is pressed, grid units.
+    """Return the low and the high corner of the pressed area, grid units.
 
     The outermost of V verticals lie at 1 and V pitches of a pad of V + 1, and so along y for horizontals. The rectangle
     is never less than half the pad: 0.5 to 1.5 pitches for V = 1, 0.25 to 0.75 for V = 0. Otherwise "beyond" is 0.5 to
@@ -712,7 +686,7 @@ class PadSettings(Settings):
     @model_validator(mode="before")
     @classmethod
     def _size_to_pitch(cls, stated: object) -> object:
-        """Replace a size by the pitches that make a pad of it; the fields refuse what is no size, or no count."""
+        """Replace a size by the pitches that make a pad of it; an invalid size or count is left to the fields."""
         stated = to_builtins(stated)  # `Settings` does so later
         if not isinstance(stated, Mapping) or not isinstance(size_mm := stated.get("size_mm"), list | tuple):
             return stated
@@ -820,5 +794,9 @@ PUBLISHED: Mapping[str, Settings] = {
     **{"pad": PUBLISHED_PAD, "contact": PUBLISHED_CONTACT, "search": PUBLISHED_SEARCH},
     "rules": RulesSettings(max_common_track_mm=None),
 }
-# settings of the pad that the authors built
-BUILT: Mapping[str, Settings] = {"pad": PadSettings(deep_family="vertical"), "contact": BUILT_CONTACT}
+# settings of the pad that the authors built, pressed by a dome of 0.75 pitches, 5 mm deep by their code; which family
+# lies deeper, and that the pad slips on its table, is what their readings say
+BUILT: Mapping[str, Settings] = {
+    "pad": PadSettings(deep_family="vertical"),
+    "contact": Contact(base="slipping", fibre_depths_mm=FIBRE_DEPTHS_MM[::-1]),
+}

@@ -1,6 +1,6 @@
 """The twin: the as-built model (digital twin) of a printed pad, identified from presses.
 
-It describes how the pad was laid and wired, and what a press does to its fibres. `padforge sense identify` estimates it
+It holds the paths of the fibres, their wiring, and their response to a press. `padforge sense identify` estimates it
 from a recording; searches design for its sensitivity profile, and simulations respond like it.
 """
 
@@ -19,10 +19,10 @@ from padforge.common.validation import (
     check_float,
     check_int,
     check_mapping,
+    check_path,
     check_type,
     short_repr,
 )
-from padforge.common.validation import check_path as as_path
 from padforge.design.contact import check_presses
 from padforge.design.kernels.element_signals import sum_elements
 from padforge.design.kernels.geometry import EUCLIDEAN, profile_law
@@ -112,11 +112,11 @@ class TwinReadings:
 
     noise_mv: float  # standard deviation of the white noise of a reading
     drift_mv: float  # standard deviation of the drifting baseline
-    hysteresis_s: float  # time constant by which what remains of a press decays
-    memory: float = 0.0  # share of what remains of a press that another one at its place takes away
-    memory_mm: float = 9.0  # distance by which that falls
-    gain_wander: float = 0.0  # standard deviation of the gains that wander over minutes
-    touch_s: float = 0.0  # standard deviation over the pad of when it is touched
+    hysteresis_s: float  # time constant by which the residue of a press decays
+    memory: float = 0.0  # share of the residue of a press that another press at its position removes
+    memory_mm: float = 9.0  # distance over which that share falls
+    gain_wander: float = 0.0  # standard deviation of changes of the gains over minutes
+    touch_s: float = 0.0  # standard deviation over the pad of the time of the touch
 
     def __post_init__(self) -> None:
         _check_fields(self, noise_mv=(0, 1e3), drift_mv=(0, 1e3), hysteresis_s=(0.01, 1e4))
@@ -125,7 +125,7 @@ class TwinReadings:
 
 @dataclass(frozen=True)
 class TwinPart:
-    """Part of a press, without what it takes away of the residues of earlier ones; the same fibres respond with it.
+    """Part of a press, to which the fibres of the twin respond, without the residues of earlier presses it removes.
 
     Attributes:
         distance_mm: as of the twin; shape (n,).
@@ -148,10 +148,10 @@ class TwinPart:
 
 @dataclass(frozen=True)
 class TwinResidual:
-    """Smooth function of the position that is left between measured and predicted parts of a press.
+    """Smooth function of the position by which the measured parts of a press differ from the predicted ones.
 
     Attributes:
-        middle_mm: centre of the square that it is given on, in the arm's frame.
+        middle_mm: centre of the square on which it is sampled, in the arm's frame.
         half_mm: half of its side.
         volts: on a grid over the square, x before y; shape (parts, C, n, n), in the order of `PARTS`.
     """
@@ -188,7 +188,7 @@ class Twin:
         readings: statistics of the readings; None where they were not measured.
         scatter: part of `noise`, and of the channels' noise, that grows with the response.
         parts: of a press, by name in `PARTS`; none where there were too few presses.
-        residual: what is left of the parts; None where there are none.
+        residual: what the fibres do not explain of the parts; None where there are none.
 
     Raises:
         InputError: values that do not fit together, or are out of range.
@@ -298,15 +298,15 @@ class Twin:
         if pressed_mm.shape[1:] != (2,):
             raise InputError(f"positions_mm have shape {pressed_mm.shape}, expected (Q, 2)")
         presses, _ = check_presses(self.morphology.to_grid(self.frame.to_plan(pressed_mm)))
-        of = self if part is None else self.parts[part]
-        angular = np.zeros_like(of.weight) if of.angular_weight is None else of.angular_weight
+        profile = self if part is None else self.parts[part]
+        angular = np.zeros_like(profile.weight) if profile.angular_weight is None else profile.angular_weight
+        distance = profile.distance_mm / self.morphology.unit_mm
         # cos 2 phi = 2 cos^2 phi - 1
-        distance = of.distance_mm / self.morphology.unit_mm
-        law = profile_law(EUCLIDEAN, ((distance, of.weight - angular, 2 * angular),))
+        law = profile_law(EUCLIDEAN, ((distance, profile.weight - angular, 2 * angular),))
         out = np.zeros((len(presses), len(self.as_built_mm)))
         for fibre, path in enumerate(self.as_built_mm):
             if path is not None:
-                sensitivity = None if of.sensitivity is None else of.sensitivity[fibre]
+                sensitivity = None if profile.sensitivity is None else profile.sensitivity[fibre]
                 out[:, fibre] = sum_elements(*_cut(self.morphology.to_grid(path), sensitivity), presses, law, 0)
         return out / lengths(self.morphology)
 
@@ -320,7 +320,7 @@ class Twin:
         Raises:
             InputError: the file is missing, torn, of another kind, or its values do not fit together.
         """
-        document = read_json(path := as_path("path", path), FORMAT)
+        document = read_json(path := check_path("path", path), FORMAT)
         try:
             return cls(
                 morphology=Morphology.from_dict(document["morphology"]),
@@ -361,14 +361,14 @@ class Twin:
             "parts": {
                 name: {"gains_v": part.gains_v.tolist(), **_profile_document(part)} for name, part in self.parts.items()
             },
-            "residual": None if self.residual is None else _residual_document(self.residual),
+            "residual": self.residual and asdict(self.residual) | {"volts": np.round(self.residual.volts, 6).tolist()},
             "noise": self.noise,
             "scatter": asdict(self.scatter),
             "sensed_mm": list(self.sensed_mm),
             "presses": self.presses,
             "provenance": dict(self.provenance),
         } | ({"readings": asdict(self.readings)} if self.readings else {})
-        write_json(as_path("path", path), document)
+        write_json(check_path("path", path), document)
 
 
 def _check_profile(part: "Twin | TwinPart") -> None:
@@ -393,12 +393,8 @@ def _profile_document(part: "Twin | TwinPart") -> dict[str, Any]:
     }
 
 
-def _residual_document(residual: TwinResidual) -> dict[str, Any]:
-    return asdict(residual) | {"volts": np.round(residual.volts, 6).tolist()}
-
-
 def _profile_from(document: Mapping[str, Any]) -> dict[str, Any]:
-    """Return what `_profile_document` was made of."""
+    """Return the fields of a twin or its part that `_profile_document` wrote."""
     sensitivity = document["sensitivity"]
     return dict(document["sensitivity_profile"]) | {"sensitivity": None if sensitivity is None else tuple(sensitivity)}
 

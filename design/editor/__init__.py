@@ -77,7 +77,7 @@ class EditSession:
         self._max_failures = spec.section(SearchSettings).max_failures
         self._provenance["settings"] = {"pad": self._pad_settings.model_dump(mode="json")}
         check_replaceable(out, self._provenance, force=force)
-        self._known = sha256(out) if out.is_file() else ""  # digest of the file that a save may replace
+        self._replaceable_sha256 = sha256(out) if out.is_file() else ""  # of the file that a save may replace
         if source is None:
             share = np.linspace(0, 1, STRAIGHT_KNOTS + 2)[:, None]
             paths = tuple(line[0] + share * (line[-1] - line[0]) for line in pad.knots)
@@ -146,11 +146,11 @@ class EditSession:
         """Write the pad to `out`, atomically, and return the new view; `body` is ignored."""
         with self._lock:
             if self.out.is_file():
-                is_known = sha256(self.out) == self._known
-                if not is_known or not (self._force or not self.unsaved or not find_dependents(self.out)):
+                is_foreign = sha256(self.out) != self._replaceable_sha256
+                if is_foreign or (self.unsaved and not self._force and find_dependents(self.out)):
                     self.out = free_name(self.out)
             self._to_morphology(self._provenance).save(self.out)
-            self._known, self._saved = sha256(self.out), self._history.paths
+            self._replaceable_sha256, self._saved = sha256(self.out), self._history.paths
             self._saved_message = f"saved to {self.out}"
             return self._update(0, 1)
 
@@ -222,9 +222,9 @@ class EditSession:
 
     @cached_property
     def _constants(self) -> dict[str, Any]:
-        """What does not depend on the paths: the pad, its pressed positions, and straight fibres beside it."""
+        """The part of a view that does not depend on the paths: the pad, the presses, and errors of straight fibres."""
         straight = Morphology.straight(self._layout)
-        low, high = (straight.to_mm(corner) for corner in self._pad_settings.sensed)
+        sensed_mm = straight.to_mm(np.array(self._pad_settings.sensed))
         positions_mm = straight.to_mm(self._presses)
         return {
             "ready": True,
@@ -236,7 +236,7 @@ class EditSession:
             "unit_mm": self._layout.unit_mm,
             "mirrored": False,
             "deep_family": int(self._pad_settings.deep_family == "vertical"),
-            "sensed_mm": [*low.tolist(), *high.tolist()],
+            "sensed_mm": sensed_mm.ravel().tolist(),
             "keep_out_mm": self._pad_settings.keep_out_corners_mm,
             "positions_mm": positions_mm.round(3).tolist(),
             "cell_mm": [_lattice_step(column) for column in positions_mm.T],
@@ -252,7 +252,7 @@ class EditSession:
 
 
 def free_name(path: Path) -> Path:
-    """Return the first of NAME.json, NAME-2.json, NAME-3.json, ... that does not exist."""
+    """Return the first of NAME.json, NAME-2.json, ... that does not exist."""
     names = (path.with_stem(f"{path.stem}{f'-{number}' * (number > 1)}") for number in count(1))
     return next(name for name in names if not os.path.lexists(name))
 

@@ -17,12 +17,10 @@ from padforge.design.kernels.pchip import population_slopes
 from padforge.design.morphology import Array, Morphology, assemble_knots, split_axes
 from padforge.design.settings import Layout
 
-_ROUNDING = 1e-6  # gap, relative to the width, up to which two intervals of a line are one stretch
 FOLD = np.pi / 2  # gaps along a fibre from which its points keep the gap: half a turn of a circle one gap wide
 # range of headings that cannot fold: chords within an angle a of a line are at least cos a times the arc
 UNFOLDED = 2 * np.arccos(1 / FOLD)
 SPARE_LENGTH = 1e-4  # length of all spare knots of a fibre, grid units: far below what can be printed
-_TRIAL_POSITIONS = np.array([0.15, 0.3, 0.5, 0.7, 0.85])  # positions on a span at which a knot is tried
 _LEVEL_TOLERANCE = 1e-9  # rises below this are none: positions in a file in pitches are right to rounding
 _TINY = 1e-30  # divides in position of the length of a segment whose ends coincide
 
@@ -34,7 +32,7 @@ def _hermite(pad: Morphology) -> tuple[Array, Array, Array]:
 
 
 def slopes(pad: Morphology) -> Array:
-    """Compute the PCHIP slopes at the knots, across per along; shape (F, N + 2)."""
+    """Compute the PCHIP slopes at the knots, change across per change along the axis; shape (F, N + 2)."""
     return _hermite(pad)[2]
 
 
@@ -89,12 +87,11 @@ def flatten(pad: Morphology, tolerance: float) -> list[Array]:
     tolerance = check_float("tolerance", tolerance, 1e-8, 1e6)
     curves = beziers(pad)
     second = np.linalg.norm(np.diff(curves, 2, axis=2), axis=3).max(axis=2)
-    counts = np.maximum(1, np.ceil(np.sqrt(0.75 * second / tolerance))).astype(int)
-    steps = counts.ravel()
+    steps = np.maximum(1, np.ceil(np.sqrt(0.75 * second / tolerance))).astype(int).ravel()
     starts = np.cumsum(steps) - steps  # all spans at once: many take no longer than a few
     u = (np.arange(steps.sum()) - np.repeat(starts, steps)) / np.repeat(steps, steps)
     points = cubic(np.repeat(curves.reshape(-1, 4, 2), steps, axis=0), u)
-    fibres = np.split(points, starts.reshape(counts.shape)[1:, 0])
+    fibres = np.split(points, starts.reshape(second.shape)[1:, 0])
     return [np.vstack([line, spans[-1, -1:]]) for line, spans in zip(fibres, curves, strict=True)]
 
 
@@ -119,7 +116,7 @@ class Crossing:
 def crossings(pad: Morphology, tolerance: float = 1e-4, across: bool = True) -> list[Crossing]:
     """Find every crossing of two fibres, ordered by fibre and position.
 
-    Fibres that touch or run along each other cross in the middle of what they share.
+    Fibres that touch or run along each other cross in the middle of the common stretch.
 
     Args:
         pad: the fibres.
@@ -183,7 +180,7 @@ def refine(knots: Array, count: int, layout: Layout) -> Array:
 
 
 def add_spare_knots(paths: Sequence[Array], layout: Layout) -> Array:
-    """Give all fibres (n, 2) the same number of knots (F, n, 2) by adding spare ones that do not change the curve."""
+    """Give all fibres (n, 2) the same number of knots (F, n, 2) by adding spare ones that do not change the curves."""
     n_knots = max(map(len, paths))
     return np.stack([_add_spares(path, layout.family(i), n_knots - len(path)) for i, path in enumerate(paths)])
 
@@ -201,7 +198,6 @@ def remove_spare_knots(knots: Array, layout: Layout) -> list[Array]:
 
 
 def _add_spares(path: Array, axis: int, count: int) -> Array:
-    """Return a fibre with `count` more knots."""
     if not count:
         return path
     at = _find_level_knot(path[:, axis], path[:, 1 - axis])
@@ -214,7 +210,7 @@ def _add_spares(path: Array, axis: int, count: int) -> Array:
 
 
 def _find_level_knot(along: Array, across: Array) -> int | None:
-    """Find the level knot, not next to an end, with the most room behind it; None if there is none."""
+    """Find the knot where the curve is level, not next to an end, with the most room behind it; None if none is."""
     rise, room = np.diff(across), np.diff(along)
     if not rise.any():
         return int(np.argmax(room))
@@ -232,7 +228,8 @@ def _insert_knot_on_curve(path: bytes, axis: int) -> Array:
     along, across = knots[:, axis], knots[:, 1 - axis]
     curve = PchipInterpolator(along, across)
     spans = sorted({0, 1, len(along) - 3, len(along) - 2} & set(range(len(along) - 1)))
-    positions = np.concatenate([along[k] + (along[k + 1] - along[k]) * _TRIAL_POSITIONS for k in spans])
+    trials = np.array([0.15, 0.3, 0.5, 0.7, 0.85])  # positions on a span at which a knot is tried
+    positions = np.concatenate([along[k] + (along[k + 1] - along[k]) * trials for k in spans])
     dense = np.concatenate([np.linspace(along[k], along[k + 1], 33) for k in spans])
     best, least = along, np.inf
     for position in positions:
@@ -273,7 +270,7 @@ def common_stretches(lines: Sequence[Array], others: Sequence[Array], width: flo
     order = np.lexsort((near[:, 2], pair))
     pair, offset, begin, end = pair[order], offset[order], near[order, 2], near[order, 3]
     until = np.maximum.accumulate(end + offset)
-    is_new = np.append(True, begin[1:] + offset[1:] > until[:-1] + _ROUNDING * width)[: len(pair)]
+    is_new = np.append(True, begin[1:] + offset[1:] > until[:-1] + 1e-6 * width)[: len(pair)]  # but for rounding
     first = np.flatnonzero(is_new)
     last = np.append(first, len(pair))[1:] - 1
     line, other = np.divmod(pair[first], len(others))
@@ -286,10 +283,7 @@ def _concatenate(lines: Sequence[Array]) -> tuple[Array, NDArray[np.int_]]:
 
 
 def extreme_headings(slopes: Array) -> Array:
-    """Return headings (..., 2 n + 1), rad, at ends of spans and extremes of their slopes (..., n, 3) inside.
-
-    They are monotone between these.
-    """
+    """Return headings (..., 2 n + 1), rad, at ends and extremes of spans of slopes (..., n, 3): monotone in between."""
     pairs = np.stack([slopes[..., 0], quadratic(slopes, _stationary(slopes))], axis=-1)
     return np.arctan(np.concatenate([pairs.reshape(*pairs.shape[:-2], -1), slopes[..., -1:, 2]], axis=-1))
 
@@ -420,7 +414,7 @@ def _closest_fraction(start: Array, step: Array, low: Array | float, high: Array
 
 
 def _stationary(slopes: Array) -> Array:
-    """Return the parameter within 0..1 of the extremum of quadratic Beziers (..., 3); any if there is none inside."""
+    """Return the parameter of the extremum of quadratic Beziers (..., 3), or any within 0..1 if none is inside."""
     first, second = slopes[..., 0] - slopes[..., 1], slopes[..., 2] - slopes[..., 1]
     bend = first + second
     return np.clip(np.divide(first, bend, out=np.zeros_like(bend), where=bend != 0), 0, 1)

@@ -21,13 +21,8 @@ if TYPE_CHECKING:
 
 MAX_BYTES = 2**22  # size of a drawing; drawings of fibres are far smaller
 MAX_COORDINATE = 1e6  # largest absolute coordinate, in units of the drawing
-FLATNESS = 1e-5  # largest distance of curve and polyline, relative to the size of the curve
-
-_MAX_REASON = 120
 _FIBRES = re.compile(r"(fibre|fiber|horizontal|vertical)", re.IGNORECASE)
 JOIN_MM = 0.01  # distance of ends that are joined, as programs round where pieces of a line meet
-_COINCIDENT = 1e-6  # distance of ends that are one point, relative to the size of the drawing
-_MAX_NAMED = 3
 
 
 @dataclass(frozen=True)
@@ -47,7 +42,7 @@ class DrawnPlan:
 
     unit_mm: float = 1.0  # of the drawing
     unit: str = "mm"  # name of the unit that the file states
-    notes: list[str] = field(default_factory=list)  # assumptions that were made, and what was left out
+    notes: list[str] = field(default_factory=list)  # assumptions about the drawing, and omitted curves
     curves: list[DrawnCurve] = field(default_factory=list)
     n_hidden: int = 0
 
@@ -62,7 +57,7 @@ class DrawnPlan:
 
     @property
     def border(self) -> Array | None:
-        """Low and high corner (2, 2) of what is named "pad"; None if nothing is."""
+        """Low and high corner (2, 2) of the curves named "pad"; None if there are none."""
         outlines = [curve.points for curve in self.curves if _is_pad(curve)]
         if not outlines:
             return None
@@ -83,7 +78,7 @@ class DrawnPlan:
                 raise InputError(f"{curve.name}: closed, expected a curve from one border of the pad to the other")
         if named and others:
             layers = dict.fromkeys(next(filter(_FIBRES.match, curve.groups)) for curve in named)
-            where = ", ".join(map(short_repr, list(layers)[:_MAX_NAMED]))
+            where = ", ".join(map(short_repr, list(layers)[:3]))
             self.notes.append(f"open curves outside of {where}, which are left out: {len(others)}")
         return list(_join(named or others, JOIN_MM / self.unit_mm))
 
@@ -93,15 +88,14 @@ def _is_pad(curve: DrawnCurve) -> bool:
 
 
 def _join(curves: list[DrawnCurve], tolerance: float) -> Iterator[DrawnCurve]:
-    """Join curves whose ends coincide, or are no farther apart than the tolerance, where nothing coincides."""
+    """Join curves whose ends coincide or, where they coincide with no other, are within the tolerance."""
     if not curves:
         return
     # 1. end 2 k is the start of curve k, end 2 k + 1 its end: which other end is each one joined to?
     ends = np.array([curve.points[end] for curve in curves for end in (0, -1)])
-    coincident = _COINCIDENT * max(float(np.ptp(ends, axis=0).max()), 1e-9)
+    coincident = 1e-6 * max(float(np.ptp(ends, axis=0).max()), 1e-9)  # relative to the size of the drawing
     partners = _pair_ends(ends, np.arange(len(ends)), coincident, curves)
-    free = np.setdiff1d(np.arange(len(ends)), list(partners))
-    gaps = _pair_ends(ends, free, tolerance, curves)
+    gaps = _pair_ends(ends, np.setdiff1d(np.arange(len(ends)), list(partners)), tolerance, curves)
     partners |= gaps
     # 2. walk from every free end to the other end of its chain
     remaining = set(range(len(curves)))
@@ -128,7 +122,7 @@ def _join(curves: list[DrawnCurve], tolerance: float) -> Iterator[DrawnCurve]:
 
 
 def _pair_ends(ends: Array, candidates: Ints, tolerance: float, curves: Sequence[DrawnCurve]) -> dict[int, int]:
-    """Return the other end within the tolerance of each of the candidates that has one."""
+    """Return, for each candidate that has one, the other end within the tolerance."""
     from scipy.spatial import KDTree
 
     if len(candidates) < 2:
@@ -150,22 +144,20 @@ def _pair_ends(ends: Array, candidates: Ints, tolerance: float, curves: Sequence
 
 def _shorten(error: Exception) -> str:
     """Return a library's message in one line of limited length."""
-    return " ".join(str(error).split())[:_MAX_REASON] or type(error).__name__
+    return " ".join(str(error).split())[:120] or type(error).__name__
 
 
 def _flatten(path: "BezierPath") -> Array:
-    """Flatten a path of Bezier curves to a polyline (n, 2)."""
+    """Flatten a path of Bezier curves to a polyline (n, 2), within 1e-5 of its size."""
     control = np.array([vertex.xyz for vertex in path.control_vertices()])
     if not (np.abs(control) <= 1e3 * MAX_COORDINATE).all():  # a matrix may still scale it down
         raise InputError(f"coordinates that are no numbers or beyond {MAX_COORDINATE:g}")
-    distance = FLATNESS * max(float(np.ptp(control, axis=0).max()), 1e-12)
+    distance = 1e-5 * max(float(np.ptp(control, axis=0).max()), 1e-12)
     return np.array([vertex.xyz[:2] for vertex in path.flattening(distance, segments=16)])
 
 
 _MM_PER_PIXEL = 25.4 / 96
 _TEMPLATES = {"symbol", "mask", "marker"}  # drawn only where they are used
-_CONTAINERS = {"a", "switch"}
-_LENGTHS = ("mm", "cm", "in", "pt", "pc", "m")
 _LABEL = "{http://www.inkscape.org/namespaces/inkscape}label"
 
 
@@ -180,11 +172,11 @@ def read_svg(path: Path) -> DrawnPlan:
         if _kind(tree) != "svg":
             raise InputError(f"{path}: the root is <{_kind(tree)}>, expected <svg>")
         _adapt_tree(tree)
-        if not tree.get("width", "%").endswith(_LENGTHS) or "viewBox" not in tree.attrib:
+        if not tree.get("width", "%").endswith(("mm", "cm", "in", "pt", "pc", "m")) or "viewBox" not in tree.attrib:
             drawing.unit = "pixels of 1/96 inch, as it states no other unit"
         # Internal entities, as Illustrator declares them, are replaced by expat, which limits them.
         root: Any = SVG.parse(io.BytesIO(ElementTree.tostring(tree)), on_error="raise", parse_display_none=True)
-        # the drawing's own origin is the one that was drawn from, not the corner of the viewBox
+        # positions count from the origin of the drawing's coordinates, not from the corner of the viewBox
         to_pixels = Matrix(root.viewbox_transform)
         to_file = ~to_pixels
         origin = to_pixels.point_in_matrix_space((0, 0))
@@ -210,14 +202,14 @@ def _kind(element: Element) -> str:
 
 
 def _adapt_tree(tree: Element) -> None:
-    """Make groups of containers that svgelements does not know, those of templates within <defs>: not drawn.
+    """Replace containers that svgelements does not know by groups, and put templates, which are not drawn, into <defs>.
 
-    A path without data, such as that of a blank, gets empty ones.
+    A path without data, such as that of a blank, gets an empty `d`.
     """
     for parent in list(tree.iter()):
         namespace = tree.tag.removesuffix("svg")
         for number, child in enumerate(parent):
-            if _kind(child) in _TEMPLATES | _CONTAINERS:
+            if _kind(child) in _TEMPLATES | {"a", "switch"}:
                 if _kind(child) in _TEMPLATES:
                     parent[number] = Element(f"{namespace}defs")
                     parent[number].append(child)
@@ -229,13 +221,13 @@ def _adapt_tree(tree: Element) -> None:
 def _iterate_shapes(
     container: Any, groups: tuple[str, ...], is_hidden: bool
 ) -> Iterator[tuple[Any, tuple[str, ...], bool]]:
-    """Iterate over the lines, in order, with the names of all that contains each, and whether it is hidden."""
+    """Iterate over the shapes, in order, with the names of their groups and their own, and whether they are hidden."""
     from svgelements import Group, Path, Polygon, Polyline, Rect, SimpleLine, Use
 
     for element in container:
         attributes = element.values["attributes"]
         names = (*groups, attributes.get("id", ""), attributes.get(_LABEL, ""))
-        # What a group does not display, nothing in it can; what it makes invisible, something in it may show.
+        # "display" hides all that a group contains, while "visibility" may be overridden within it
         is_none = is_hidden or element.values.get("display") == "none" or element.values.get("opacity") == "0"
         if isinstance(element, Group | Use):
             yield from _iterate_shapes(element, names, is_none)
@@ -266,14 +258,10 @@ def _flatten_shape(shape: Any) -> Iterator[tuple[Array, bool]]:
         yield _flatten(path), isinstance(segments[-1], Close)
 
 
-_KINDS = ("LINE", "ARC", "LWPOLYLINE", "POLYLINE", "SPLINE", "ELLIPSE")
-_MAX_DEPTH = 8  # of blocks in blocks
-
-
 def read_dxf(path: Path) -> DrawnPlan:
     """Read the curves of a DXF's modelspace and of blocks inserted there, in $INSUNITS or mm.
 
-    Hatches, dimensions and text are ignored, and what is on a layer that is off or frozen.
+    Hatches, dimensions and text are ignored, and so are entities on layers that are off or frozen.
     """
     import ezdxf
     from ezdxf import path as paths
@@ -308,15 +296,15 @@ def read_dxf(path: Path) -> DrawnPlan:
 
 
 def _iterate_entities(entities: Iterable[Any], inserts: tuple[str, ...]) -> Iterator[tuple[int, Any, tuple[str, ...]]]:
-    """Iterate over the curves of a layout and of the blocks inserted in it, with their numbers and layers.
+    """Iterate over the curves of a layout and of the blocks inserted in it, to a depth of 8, with numbers and layers.
 
-    The layers of a curve in a block are also those of the block references, whose layer it has where its own is 0.
+    A curve in a block is also on the layers of the references to the block, and on these alone if its own is 0.
     """
     for number, entity in enumerate(entities, 1):
         layer = str(entity.dxf.layer)
         layers = inserts if layer == "0" and inserts else (*inserts, layer)
-        if entity.dxftype() == "INSERT" and len(inserts) < _MAX_DEPTH:
+        if entity.dxftype() == "INSERT" and len(inserts) < 8:
             for reference in entity.multi_insert():
                 yield from _iterate_entities(reference.virtual_entities(), layers)
-        elif entity.dxftype() in _KINDS:
+        elif entity.dxftype() in ("LINE", "ARC", "LWPOLYLINE", "POLYLINE", "SPLINE", "ELLIPSE"):
             yield number, entity, layers

@@ -16,12 +16,9 @@ from padforge.design.settings import Layout
 
 READERS = {".svg": read_svg, ".dxf": read_dxf}
 MAX_KNOTS = 64  # inner knots of a fibre, as of `[search] knots`
-MAX_CURVES_PER_FIBRE = 8  # beyond, messages on single curves would not help
 _FAMILIES = "horizontal", "vertical"
 _MAX_BACKTRACK_MM = 2e-4  # largest step backwards along the axis: files are rounded
-_MARGIN_MM = 1.0  # beyond this margin across the pad, curves are leads to its other sides, which are ignored
-_ASPECT_TOLERANCE = 2e-3  # largest relative difference in aspect ratio of the drawn border and the pad
-_FIT_SHARE = 0.8  # tolerance of the fit, relative to the stated one: the fit measures its misfit at samples only
+_MARGIN_MM = 1.0  # curves farther beyond the pad than this are leads to its other sides, which are ignored
 _FLATNESS_MM = 1e-3  # tolerance to which curves are compared
 _SCALES = {
     72 / 96: "points of 1/72 inch that were taken for 1/96 inch",
@@ -38,7 +35,7 @@ _SCALES = {
     300 / 96: "pixels of 1/96 inch that were drawn with 300 dots an inch",
     25.4 / 72: "it states points and was drawn in mm",
 }
-"""Sizes of a drawing relative to the pad that programs make of others' units, and what they come from."""
+"""Sizes of a drawing relative to the pad where a program takes its unit for another one, and the likely cause."""
 _SCALE_TOLERANCE = 0.03
 
 
@@ -74,9 +71,10 @@ class _FibrePath:
 def import_plan(path: Path, layout: Layout, tolerance_mm: float) -> ImportedPlan:
     """Import a drawing: one curve a fibre, each a function of the coordinate along its axis.
 
-    The curves are those whose layer, group or name begins with fibre, horizontal or vertical, or all open curves. The
-    border is what is named pad. Without one the drawing is positioned where the ends fit best: its origin in the middle
-    or in a corner of the pad, or the middle of its curves in the middle. What lies beyond the pad is ignored.
+    The curves are those whose layer, group or name begins with fibre, horizontal or vertical, or else all open curves.
+    The border is the curve named pad. Without one the drawing is positioned where the ends fit best: with its origin in
+    the middle or in a corner of the pad, or with the middle of its curves in the middle. Leads beyond the pad are
+    ignored.
     """
     reader = READERS.get(path.suffix.lower())
     if reader is None:
@@ -87,7 +85,7 @@ def import_plan(path: Path, layout: Layout, tolerance_mm: float) -> ImportedPlan
         if not curves:
             hidden = f" but {drawing.n_hidden} hidden ones" if drawing.n_hidden else ""
             raise InputError(f"there is no open curve in it{hidden}")
-        if len(curves) > MAX_CURVES_PER_FIBRE * layout.fibres:
+        if len(curves) > 8 * layout.fibres:  # so many that messages on single curves would not help
             hint = "put these into a layer or group whose name begins with fibre"
             raise InputError(f"it has {len(curves)} open curves, expected {layout.fibres}, one a fibre; {hint}")
         try:
@@ -105,7 +103,7 @@ def import_plan(path: Path, layout: Layout, tolerance_mm: float) -> ImportedPlan
 
 
 def _describe_scale(drawing: DrawnPlan, curves: Sequence[DrawnCurve], layout: Layout) -> str:
-    """Say how large a drawing is that has another size than the pad, and what that may come from; else ""."""
+    """Describe the size of a drawing that differs from the pad's, and its likely cause; "" if they agree."""
     if drawing.border is not None:
         return ""
     drawn_mm = np.ptp(np.vstack([curve.points for curve in curves]), axis=0) * drawing.unit_mm
@@ -119,12 +117,12 @@ def _describe_scale(drawing: DrawnPlan, curves: Sequence[DrawnCurve], layout: La
 
 
 def _place_curves(drawing: DrawnPlan, curves: Sequence[DrawnCurve], layout: Layout) -> tuple[list[_FibrePath], str]:
-    """Return the curves on the pad, and a description of how the drawing was positioned."""
+    """Place the curves on the pad; return them, and a description of how the drawing was positioned."""
     size = np.array(layout.size_mm)
     if (border := drawing.border) is not None:
-        width, height = border[1] - border[0]
-        ratio = (border[1] - border[0]) / size
-        if not (ratio > 0).all() or abs(ratio[0] / ratio[1] - 1) > _ASPECT_TOLERANCE:
+        width, height = drawn = border[1] - border[0]
+        ratio = drawn / size
+        if not (ratio > 0).all() or abs(ratio[0] / ratio[1] - 1) > 2e-3:
             shape = f"{size[0]:g} by {size[1]:g} mm"
             raise InputError(f"pad is drawn {width:g} by {height:g}, expected the shape of {shape}")
         lines = [(curve.points - border.mean(axis=0)) / ratio for curve in curves]
@@ -206,7 +204,7 @@ def _assign_to_family(curve: DrawnCurve, line: Array, family: int, layout: Layou
 
 
 def _match_fibres(paths: Sequence[_FibrePath], layout: Layout, tolerance_mm: float) -> list[_FibrePath]:
-    """Return one path for each fibre, with its ends within the tolerance."""
+    """Return the path of each fibre, in the order of the fibres; refuse ends beyond the tolerance."""
     by_fibre: dict[int, _FibrePath] = {}
     for path in paths:
         family = layout.family(path.fibre)
@@ -235,7 +233,7 @@ def _fit_paths(paths: Sequence[_FibrePath], layout: Layout, tolerance_mm: float)
     for fibre, path in enumerate(paths):
         family, line = layout.family(fibre), path.points.copy()
         line[[0, -1], 1] = (layout.levels[fibre] - middle[1 - family]) * layout.unit_mm
-        knots_mm = fit_knots(line, _FIT_SHARE * tolerance_mm, MAX_KNOTS)
+        knots_mm = fit_knots(line, 0.8 * tolerance_mm, MAX_KNOTS)  # less, since the fit measures its misfit at samples
         knots = (knots_mm if family == 0 else knots_mm[:, ::-1]) / layout.unit_mm + middle
         knots[[0, -1], family] = 0, layout.extent[family]
         knots[[0, -1], 1 - family] = layout.levels[fibre]

@@ -10,9 +10,6 @@ from padforge.design.morphology import MARGIN, Array, Morphology, assemble_knots
 from padforge.design.paths.curves import refine
 from padforge.design.settings import PadSettings, RulesSettings
 
-_CLEARANCE = 1.15  # of a passing fibre, relative to the rules': a PCHIP curve leaves the polygon of its knots
-_LENGTH = 1.5  # length of the transition to a lane, relative to the shortest one whose bends keep the rules
-
 
 def keep_outs(pad: PadSettings) -> list[Polygon]:
     """Return the polygons of `[pad] keep_out_mm`, round holes too, in grid units from the pad's corner."""
@@ -48,29 +45,31 @@ def is_outside(positions: NDArray[np.float64], pad: PadSettings) -> NDArray[np.b
 
 
 class _Passage:
-    """How one family passes one keep-out, a box (2, 2): lanes beside it that fibres enter and leave smoothly."""
+    """Lanes on which the fibres of a family pass a keep-out, a box (2, 2), and which they enter and leave smoothly."""
 
     def __init__(self, box: Array, family: int, pad: PadSettings, rules: RulesSettings) -> None:
         layout = pad.layout
         unit, width = layout.unit_mm, layout.extent[1 - family]
-        clearance = _CLEARANCE * rules.keep_out_mm / unit + MARGIN
+        # more than the rules', since a PCHIP curve leaves the polygon of its knots
+        clearance = 1.15 * rules.keep_out_mm / unit + MARGIN
         (self.begin, low), (self.end, high) = box[:, [family, 1 - family]] + np.array([[-clearance], [clearance]])
         gap, border = max(rules.min_gap_mm / unit, MARGIN), rules.border_mm / unit
         levels = layout.levels[layout.families[family]]
-        # 1. how many fibres pass below and above: by their levels, as far as there is room
+        # 1. numbers of fibres that pass below and above: by their levels, as far as there is room
         room = np.maximum([low - border, width - high - border], 0)
         capacity = np.where(room > 0, 1 + room // (1.1 * gap), 0).astype(int)
         below = min(int((levels < (low + high) / 2).sum()), capacity[0])
         below = max(below, min(capacity[0], len(levels) - capacity[1]))
         above = len(levels) - below
-        # 2. their lanes
+        # 2. lanes of the fibres
         spacing = np.minimum(2 * gap, room / np.maximum([below - 1, above - 1], 1))
         self.lanes = levels.copy()
         self.lanes[:below] = np.minimum(levels[:below], low - spacing[0] * np.arange(below)[::-1])
         self.lanes[below:] = np.maximum(levels[below:], high + spacing[1] * np.arange(above))
-        # 3. transitions: a cubic with zero end slopes that rises by h over a length l has curvature 6 h / l^2
+        # 3. transitions, half as long again as the rules need: a cubic with zero end slopes that rises by h over a
+        # length l has curvature 6 h / l^2
         rise = float(np.abs(self.lanes - levels).max(initial=0))
-        length = max(_LENGTH * np.sqrt(6 * rise * rules.min_mean_bend_radius_mm / unit), rise)
+        length = max(1.5 * np.sqrt(6 * rise * rules.min_mean_bend_radius_mm / unit), rise)
         available = self.begin, layout.extent[family] - self.end  # the search has to mend a steeper transition
         self.transitions = [max(min(length, limit), MARGIN) for limit in available]
         self.marks = [self.begin - self.transitions[0], self.begin, self.end, self.end + self.transitions[1]]

@@ -12,11 +12,8 @@ from padforge.design.kernels.pchip import pchip_slopes
 from padforge.design.morphology import Array, Ints
 
 SAMPLES = 700  # samples of a polyline
-_MAX_ROUNDS = 20  # fits, each within the room between the knots of the last
-_MIN_GAIN = 0.01  # relative gain in squared misfit from which another fit follows
 _MAX_STEP = 0.4  # largest shift of a knot along the axis in one fit, as a share of the way to its neighbour
 _TINY = 1e-12  # room of a knot that has none: bounds must differ
-_MAX_CANDIDATES = 4  # knots whose removal is tried, those with the smallest misfit first
 _SUPPORT = 3  # spans on either side of a knot that may depend on it, while it moves within one
 _MIN_SPAN = 2e-3  # smallest distance of knots along the axis, as a share of the curve's extent
 
@@ -105,12 +102,12 @@ def _insert_knots(samples: Array, knots: Array, misfit: Array, tolerance: float,
 
 
 def _optimise(samples: Array, weight: Array, knots: Array) -> Array:
-    """Move the inner knots along and across by non-linear least squares, again and again while they gain by it."""
+    """Move the inner knots along and across by fits within the room between them, while the misfit falls by 1 %."""
     cost = np.inf
-    for _ in range(_MAX_ROUNDS if len(knots) > 2 else 0):
+    for _ in range(20 if len(knots) > 2 else 0):
         fit = _fit_within_room(samples, weight, knots)
         knots = np.vstack([knots[:1], fit.x.reshape(-1, 2), knots[-1:]])
-        if fit.cost > (1 - _MIN_GAIN) * cost:
+        if fit.cost > 0.99 * cost:
             break
         cost = fit.cost
     return knots
@@ -143,11 +140,10 @@ def _fit_within_room(samples: Array, weight: Array, knots: Array) -> Any:
 
 
 def _remove_redundant(samples: Array, weight: Array, knots: Array, tolerance: float) -> Array:
-    """Remove knots that the others do not need."""
     while len(knots) > 2:
         fewer = [np.delete(knots, k, axis=0) for k in range(1, len(knots) - 1)]
         fewer.sort(key=lambda trial: _misfit(samples, weight, trial).max())
-        for trial in fewer[:_MAX_CANDIDATES]:
+        for trial in fewer[:4]:  # of the knots whose removal makes the smallest misfit
             optimised = _optimise(samples, weight, trial)
             if _misfit(samples, weight, optimised).max() <= tolerance:
                 knots = optimised

@@ -13,18 +13,13 @@ from typing import Self
 import torch
 from torch import Tensor
 
-MAX_STALLED_STEPS = 3
-"""Steps in a row without a new best on validation that end the training."""
-RIDGE = 1e-5
-"""Penalty of squared output weights per sample: keeps them finite where neurons are alike."""
-INITIAL_DAMPING = 3.0
-"""In units of the mean curvature: high, since small first steps lead to smoother networks."""
-MIN_DAMPING_FACTOR = 0.2
-"""Least factor by which an accepted step lowers the damping."""
+MAX_STALLED_STEPS = 3  # steps in a row without a new best on validation that end the training
+RIDGE = 1e-5  # penalty of squared output weights per sample: keeps them finite where neurons are alike
+INITIAL_DAMPING = 3.0  # in units of the mean curvature: high, since small first steps lead to smoother networks
+MIN_DAMPING_FACTOR = 0.2  # least factor by which an accepted step lowers the damping
 MIN_DAMPING, MAX_DAMPING = 1e-15, 1e10
 MIN_GRADIENT = 1e-7
-BLOCK = 64
-"""Columns of a symmetric product computed at once."""
+BLOCK = 64  # columns of a symmetric product computed at once
 
 Samples = tuple[Tensor, Tensor]
 """Scaled inputs (S, Q, D) and targets (S, A, Q, O)."""
@@ -35,8 +30,8 @@ def train_batch(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Train every network from its hidden weights until validation stalls, or no step lowers its loss.
 
-    Returns:
-        Hidden (S, D + 1, H) and output weights (S, H + 1, O) that did best on `validation`, and (S,) accepted steps.
+    Returned are the hidden (S, D + 1, H) and output weights (S, H + 1, O) that did best on `validation`, and the number
+    of accepted steps (S,).
     """
     batch = _Batch.start(hidden, training, validation)
     best = batch.fit.hidden.clone(), batch.fit.output.clone()
@@ -57,7 +52,7 @@ class _Rows:
     """Tensors that have a row for each network."""
 
     def rows(self, index: Tensor) -> Self:
-        """Return those of the networks at `index`."""
+        """Return the rows of the networks at `index`."""
         parts = (getattr(self, field.name) for field in fields(self))
         return type(self)(*(part.rows(index) if isinstance(part, _Rows) else part[index] for part in parts))
 
@@ -240,7 +235,7 @@ def dual_matrix(x: Tensor, fit: ProjectedFit) -> Tensor:
 
 
 def _nearest_targets(outputs: Tensor, targets: Tensor) -> tuple[Tensor, Tensor]:
-    """Return those of the targets (S, A, Q, O) nearest to the outputs (S, Q, O), and the errors."""
+    """Return the nearest of A targets (S, A, Q, O) to each output (S, Q, O), and the errors."""
     errors = outputs[:, None] - targets
     if targets.shape[1] == 1:
         return targets[:, 0], errors[:, 0]

@@ -16,17 +16,14 @@ from padforge.common.validation import InputError, check_int
 from padforge.design.contact import serpentine_presses, signals
 from padforge.design.morphology import Array, Morphology
 from padforge.design.objectives.fibre_loss import failure_subsets
-from padforge.design.paths.keep_outs import is_outside
 from padforge.design.published.levenberg_marquardt import train_batch
-from padforge.design.settings import MAX_FIBRES, PUBLISHED_CONTACT, Contact, PadSettings, Rectangle, between_fibres
+from padforge.design.settings import MAX_FIBRES, PUBLISHED_CONTACT, Contact, Rectangle, between_fibres
 
 EPOCHS = 1000
 TRAINING_SHARE, VALIDATION_SHARE = 0.7, 0.15
 """Shares of the samples; the rest is the test set of the published split."""
-JITTER = 5 / 49
-"""Greatest shift of a press off its serpentine, grid units, as published."""
-BATCH = 14
-"""Networks trained at once by a core, which gains nothing from more; a GPU takes all of a level."""
+JITTER = 5 / 49  # greatest shift of a press off its serpentine, grid units, as published
+BATCH = 14  # networks trained at once by a core, which gains nothing from more; a GPU trains all of a level at once
 _FIRST_CALL = Lock()
 """Torch loads the linear algebra of a GPU at its first call, which fails where two threads make it at once."""
 
@@ -52,7 +49,7 @@ class RangeScaler:
         return np.divide(values - self.middle, self.half, out=np.zeros(values.shape), where=self.half > 0)
 
     def inverse_transform(self, scaled: Array) -> Array:
-        """Return scaled values (Q, D) in their own units."""
+        """Return scaled values (Q, D) in the units before scaling."""
         return self.middle + self.half * scaled
 
 
@@ -83,18 +80,18 @@ def fit_batch(
 ) -> list[Network]:
     """Train S networks of one shape at once by Levenberg-Marquardt with early stopping.
 
-    Of the samples 70 % are for training, 15 % for validation, 15 % are left out. A network depends on its `rng` and its
-    samples, beyond rounding on no other one of the batch, and is that of the step that did best on validation.
+    70 % of the samples are for training, 15 % for validation, and 15 % are left out. The weights are those of the step
+    that did best on validation. Except for rounding, a network depends on its samples and its generator alone, and on
+    no other network of the batch.
 
     Args:
         inputs: finite samples of S networks (S, Q, D), or (Q, D) that all of them share.
         targets: shape (Q, O), shared.
-        rngs: S sources of the splits and of the first weights.
+        rngs: S generators of the splits and of the first weights.
         hidden: neurons of the hidden layer.
         epochs: most steps of a network.
         validation: inputs (S, C, D) and targets (C, O); if given, all samples are for training.
         alternatives: targets (A, Q, O) as valid as `targets`: a sample counts by the nearest one.
-
     """
     inputs = np.broadcast_to(inputs, (len(rngs), *inputs.shape[-2:]))
     options = targets[None] if alternatives is None else np.concatenate([targets[None], alternatives])
@@ -173,12 +170,12 @@ def localisation_error(
 ) -> list[FailureError]:
     """Evaluate the published localizer, trained afresh for every set of failed fibres (paper, evaluation).
 
-    Errors are of presses that were never trained on; the paper's own figures are over all presses, those trained on
-    included, and so are lower. Networks are trained side by side, one thread a core; results do not depend on how many.
+    Errors are those of presses that were never trained on; the figures of the paper include training presses, and so
+    are lower. Networks are trained in parallel, one thread a core; results do not depend on the number of cores.
 
     Args:
         pad: the fibres.
-        contact: what a press does to them; PUBLISHED_CONTACT if None.
+        contact: contact model; PUBLISHED_CONTACT if None.
         n_failed: numbers of failed fibres; those that would leave no fibre are left out.
         seed: of the jitter, the test presses, the splits and the networks' first weights.
         hidden: neurons of a network.
@@ -193,15 +190,28 @@ def localisation_error(
     if side**2 != presses:
         raise InputError(f"presses is {presses}, allowed is a square number from 4")
     contact, fibres = or_default("contact", contact, Contact, PUBLISHED_CONTACT), len(pad.knots)
-    levels = [number for number in n_failed if check_int("n_failed", number, 0, 2 * MAX_FIBRES) < fibres]
-    counts = [math.comb(fibres, number) if subsets is None else subsets for number in levels]
-    failures = [failure_subsets(fibres, number, count) for number, count in zip(levels, counts, strict=True)]
+    numbers = [number for number in n_failed if check_int("n_failed", number, 0, 2 * MAX_FIBRES) < fibres]
+    counts = [math.comb(fibres, number) if subsets is None else subsets for number in numbers]
+    failures = [failure_subsets(fibres, number, count) for number, count in zip(numbers, counts, strict=True)]
     simulated = SimulatedPresses.simulate(pad, side, test, seed, lambda positions: signals(pad, positions, contact))
-    return simulated.failure_errors(failures, hidden)
+
+    def mean_errors(batch: list[FailureSet]) -> Array:
+        networks = simulated.fit(batch, hidden)
+        return np.array([simulated.test_errors(*pair).mean() for pair in zip(networks, batch, strict=True)])
+
+    batches = [batch for level in failures for batch in split_batches(level)]
+    with one_thread():
+        means = dict(run_tasks((i, partial(mean_errors, batch)) for i, batch in enumerate(batches)))
+    errors = np.concatenate([np.empty(0), *(means[i] for i in range(len(batches)))])
+    levels = np.split(errors, np.cumsum([len(sets) for sets in failures[:-1]], dtype=int))
+    return [
+        FailureError(len(sets[0]), len(level), float(level.mean()), float(level.std()), float(level.max()))
+        for sets, level in zip(failures, levels, strict=False)
+    ]
 
 
 def split_batches(failures: Sequence[FailureSet]) -> list[list[FailureSet]]:
-    """Return sets of failed fibres in parts whose networks are trained at once."""
+    """Split sets of failed fibres into batches whose networks are trained at once."""
     size = BATCH if best_device() == "cpu" else len(failures)
     return [list(failures[begin : begin + size]) for begin in range(0, len(failures), size)]
 
@@ -218,41 +228,15 @@ class SimulatedPresses:
 
     @classmethod
     def simulate(
-        cls,
-        pad: Morphology,
-        side: int,
-        test: int,
-        seed: int,
-        respond: Callable[[Array], Array],
-        size: PadSettings | None = None,
+        cls, pad: Morphology, side: int, test: int, seed: int, respond: Callable[[Array], Array]
     ) -> "SimulatedPresses":
         """Simulate a serpentine of `side`^2 training presses, and `test` uniformly drawn test presses.
 
-        `respond` gives the signals (Q, F) for positions (Q, 2), grid units. `size` says what is pressed, without
-        keep-outs; if None, what lies between the outermost fibres.
+        They lie between the outermost fibres. `respond` gives the signals (Q, F) for positions (Q, 2), grid units.
         """
-        rectangle = between_fibres(pad.layout) if size is None else size.sensed
+        rectangle = between_fibres(pad.layout)
         training, fresh = training_presses(rectangle, side, seed), fresh_presses(rectangle, test, seed)
-        if size is not None:
-            training, fresh = (positions[is_outside(positions, size)] for positions in (training, fresh))
         return cls(training, respond(training), fresh, respond(fresh), seed)
-
-    def failure_errors(self, failures: Sequence[Sequence[FailureSet]], hidden: int) -> list[FailureError]:
-        """Train and test networks of `hidden` neurons for every set of failed fibres, sorted by their number."""
-
-        def mean_errors(batch: list[FailureSet]) -> Array:
-            networks = self.fit(batch, hidden)
-            return np.array([self.test_errors(*pair).mean() for pair in zip(networks, batch, strict=True)])
-
-        batches = [batch for level in failures for batch in split_batches(level)]
-        with one_thread():
-            means = dict(run_tasks((i, partial(mean_errors, batch)) for i, batch in enumerate(batches)))
-        errors = np.concatenate([np.empty(0), *(means[i] for i in range(len(batches)))])
-        levels = np.split(errors, np.cumsum([len(sets) for sets in failures[:-1]], dtype=int))
-        return [
-            FailureError(len(sets[0]), len(level), float(level.mean()), float(level.std()), float(level.max()))
-            for sets, level in zip(failures, levels, strict=False)
-        ]
 
     def fit(self, failures: Sequence[FailureSet], hidden: int, repeat: int = 0) -> list[Network]:
         """Train a network on the working fibres for each set of failed fibres of one size.

@@ -34,9 +34,6 @@ from padforge.design.settings import (
     between_fibres,
 )
 
-MIN_ENTROPY = 1e-9
-"""Joint entropy that formula (5) divides by, bits, of a pad that no press touches: it has none."""
-
 
 def quantize(signals: Array, levels: int = LEVELS) -> Array:
     """Return signals (Q, C) as converter levels: columns scaled to their range, rounded up; 0 where they have none."""
@@ -52,7 +49,7 @@ def joint_entropy(levels: Array) -> float:
 
 
 def idle_share(signals: Array) -> float:
-    """Return the share of signals (Q, C), changes from rest, that are 0: of presses in which a fibre is idle."""
+    """Return the share of signals (Q, C), changes from rest, that are 0: the fibre is idle in these presses."""
     return float((signals == 0).mean()) if signals.size else 0.0
 
 
@@ -145,12 +142,11 @@ def published_terms(
 ) -> list[PublishedTerms]:
     """Compute the terms of formula (5) for every pad of a population.
 
-    The objective has the `entropy` of "families", as the published code does, or the "joint" one of all fibres, as the
-    paper's formula.
-
-    The pads are a morphology, or knots (P, F, N + 2, 2) of a `layout`, by default as many horizontals as verticals, the
-    default pitch apart. `presses` (Q, 2) are in an order of neighbours, by default the 49 published ones. Signals have
-    so many `samples` a fibre, as C has, and are rounded up to so many `levels`.
+    The entropy is that of either family, summed, as in the published code ("families"), or that of all fibres, as in
+    the paper's formula ("joint"). The pads are a morphology, or knots (P, F, N + 2, 2) of a `layout`, by default of as
+    many horizontals as verticals, the default pitch apart. Each of the `presses` (Q, 2) is a neighbour of the one
+    before; by default they are the 49 published ones. Signals and C are computed from `samples` points per fibre, and
+    signals are rounded up to `levels` levels.
     """
     if weights is not WEIGHTS and check_array("weights", weights, 1e12).shape != (3,):
         raise InputError(f"weights are {short_repr(weights)}, expected three numbers: alpha, beta, gamma")
@@ -173,7 +169,7 @@ def published_terms(
     map_chunks(work, len(along), min_chunk=8)
 
     def objective(families: float, z: float, c: float, joint: float) -> float:
-        information = 1 + families if entropy == "families" else max(joint, MIN_ENTROPY)
+        information = 1 + families if entropy == "families" else max(joint, 1e-9)  # 0 bits if no press touches a fibre
         return alpha / information + beta * z + gamma * c
 
     return [PublishedTerms(h, z, c, objective(h, z, c, j), j) for h, z, c, j in terms.tolist()]
@@ -190,7 +186,7 @@ def published_objective(
 
     Args:
         pad: the fibres.
-        contact: what a press does to a fibre; PUBLISHED_CONTACT if None.
+        contact: contact model; PUBLISHED_CONTACT if None.
         presses: in an order of neighbours; the 49 published ones if None; shape (Q, 2).
         samples: points per fibre of the quantised signals and of C.
         weights: alpha, beta, gamma.

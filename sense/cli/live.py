@@ -15,10 +15,8 @@ from padforge.sense.cli.options import FOLDER, redrawn_lines
 from padforge.sense.cli.rig import check_rig, rig_option
 
 if TYPE_CHECKING:
-    from padforge.sense.health.health_model import HealthModel
     from padforge.sense.live.outputs import OutputStream
     from padforge.sense.live.pipeline import Estimate, Event
-    from padforge.sense.localizer.model import LocalizerModel
     from padforge.sense.rig.streams import ReadingStream
 
 PORT = 8321
@@ -91,19 +89,26 @@ def live(
     """
     from padforge.sense.formats.import_export import open_recording
     from padforge.sense.live.outputs import LivePage, MessageBuilder, broadcast
+    from padforge.sense.live.pad_sensor import load_health, open_board
     from padforge.sense.live.pipeline import Live
     from padforge.sense.localizer.model import LocalizerModel
-    from padforge.sense.rig.streams import stream_recording
+    from padforge.sense.rig.streams import is_pad_mirrored, stream_board, stream_recording
+    from padforge.sense.settings import RigSettings
 
     check_rig(rig)
     localizer = LocalizerModel.load(model)
     with ExitStack() as stack:
         if replay is None:
-            stream, mirrored = _stream_rig(stack, rig, model, localizer, spec)
+            options = load_spec(spec).section(RigSettings)
+            mirrored = is_pad_mirrored(model, options)
+            board = stack.enter_context(closing(open_board(rig, model, options, localizer.fibres)))
+            stream = stream_board(board, localizer.rate_hz)
         else:
             recording = open_recording(replay)
             stream, mirrored = stream_recording(recording, speed), recording.mirrored
-        pipeline = Live(localizer, rate_hz=stream.rate_hz, fibres=stream.fibres, health=_load_health(model))
+        if (health := load_health(model)) is None:
+            echo(f"{model}: health was not learnt, so no faulty fibre will be detected", err=True)
+        pipeline = Live(localizer, rate_hz=stream.rate_hz, fibres=stream.fibres, health=health)
         page = stack.enter_context(LivePage(port, host=output["host"], token=output["token"]))
         if replay is None and rig == "simulated":
             echo("touches are simulated, at random positions; --rig shows those of a real pad", err=True)
@@ -136,20 +141,6 @@ def live(
     context.exit(int(pipeline.is_other_pad))
 
 
-def _stream_rig(
-    stack: ExitStack, rig: str, model: Path, localizer: "LocalizerModel", spec: Path | None
-) -> "tuple[ReadingStream, bool]":
-    """Return the readings of a board, which `stack` closes, and whether the pad lies with its tracks up."""
-    from padforge.sense.live.pad_sensor import open_board
-    from padforge.sense.rig.streams import is_pad_mirrored, stream_board
-    from padforge.sense.settings import RigSettings
-
-    options = load_spec(spec).section(RigSettings)
-    mirrored = is_pad_mirrored(model, options)
-    board = stack.enter_context(closing(open_board(rig, model, options, localizer.fibres)))
-    return stream_board(board, localizer.rate_hz), mirrored
-
-
 def _open_outputs(
     stack: ExitStack,
     stream: "ReadingStream",
@@ -179,16 +170,6 @@ def _open_outputs(
     return outputs, addresses
 
 
-def _load_health(model: Path) -> "HealthModel | None":
-    """Load the health model in the folder of a model; print a line if there is none."""
-    from padforge.sense.live.pad_sensor import load_health
-
-    health = load_health(model)
-    if health is None:
-        echo(f"{model}: health was not learnt, so no faulty fibre will be detected", err=True)
-    return health
-
-
 class EventPrinter:
     """Prints events: all as JSON, or as text without the estimates that add little to the last one of their press."""
 
@@ -212,15 +193,15 @@ class EventPrinter:
     def _is_news(self, estimate: "Estimate") -> bool:
         """Return whether to print an estimate, and remember it if so."""
         latest = self._latest
-        is_news = (
+        if (
             latest is None
             or latest.press != estimate.press
             or estimate.final
             or estimate.is_sharper_than(latest)
             or estimate.has_moved_from(latest)
-        )
-        self._latest = estimate if is_news else latest
-        return is_news
+        ):
+            self._latest = estimate
+        return self._latest is estimate
 
 
 def view_lines(view: dict[str, Any]) -> list[str]:

@@ -13,9 +13,6 @@ from padforge.common.validation import InputError
 from padforge.sense.cli.options import (
     FILE,
     FOLDER,
-    METHODS,
-    PARTS,
-    SPLITS,
     fibre_indices,
     fibres_option,
     max_failures_option,
@@ -31,13 +28,15 @@ from padforge.sense.cli.options import (
 @recording_argument
 @click.option(
     "--method",
-    type=click.Choice(METHODS),
+    type=click.Choice(["ensemble", "published"]),
     help="ensemble: one localizer for all failed fibres; published: the network of the paper.",
 )
 @click.option(
     "--morphology", type=FILE, help="The pad as planned: morphology.json or published .mat, for up to 500 presses."
 )
-@click.option("--test-split", "split", type=click.Choice(SPLITS), help="How test presses are chosen.")
+@click.option(
+    "--test-split", "split", type=click.Choice(["random", "chronological"]), help="How test presses are chosen."
+)
 @click.option(
     "--time-budget",
     type=common.FiniteRange(min=0, min_open=True),
@@ -46,7 +45,7 @@ from padforge.sense.cli.options import (
 )
 @click.option(
     "--without",
-    type=click.Choice(PARTS),
+    type=click.Choice(["health", "figures", "moments"]),
     multiple=True,
     help="Leave out the health of the fibres, the figures, or the errors by moment; may be given several times.",
 )
@@ -77,8 +76,8 @@ def calibrate(
     error_map.png, error_by_loss.png and error_by_moment.png. Exit 1 if the recording is doubtful: units that cannot be
     right, or presses that cannot lie where it says.
 
-    --morphology says what few presses do not, of a pad whose fibres are on the channels in the order of its plan, and
-    that is pressed at positions from its middle.
+    With few presses, --morphology adds the responses that the plan predicts. The fibres must be on the channels in the
+    order of the plan, and positions must count from the middle of the pad.
 
     A time budget is that of the training. On top come radii and errors, which may take as long as a training, and what
     --without leaves out: health most of all. A budget in which nothing can be learnt is refused, and a line says when
@@ -148,7 +147,7 @@ def _parse_moment(context: click.Context, param: click.Parameter, value: str | N
     "moment",
     metavar="MOMENT",
     callback=_parse_moment,
-    help="What is known then: 0.3s after the touch, end of the press, or lift+0.25s; all of it by default.",
+    help="Use readings until then: 0.3s after the touch, end of the press, or lift+0.25s (default: all readings).",
 )
 @common.out_option(what="CSV file of positions, places.csv", file=True)
 @common.profile_option

@@ -14,16 +14,12 @@ from padforge.common.command_line import echo
 from padforge.common.validation import InputError
 
 if TYPE_CHECKING:
-    from padforge.sense.arrays import Indices
     from padforge.sense.health.domain_shift import DomainShift
     from padforge.sense.health.fault_detector import FaultDetector, FibreFault
-    from padforge.sense.localizer.model import Localization, LocalizerModel
+    from padforge.sense.localizer.model import Localization
     from padforge.sense.recording.recording import Recording
 
 
-METHODS = ("ensemble", "published")
-SPLITS = ("random", "chronological")
-PARTS = ("health", "figures", "moments")  # optional parts of a calibration
 FILE = click.Path(path_type=Path, dir_okay=False)
 FOLDER = click.Path(path_type=Path, file_okay=False)
 
@@ -56,7 +52,7 @@ def fibre_indices(numbers: Sequence[int], fibres: int) -> tuple[int, ...]:
 
 
 def read_recording(path: Path) -> "Recording":
-    """Open a recording; print a line on stderr if its end is torn off, or parts of the file are omitted."""
+    """Open a recording; print a line on stderr if its end is torn off, or if it omits parts of the file."""
     from padforge.sense.formats.import_export import open_recording
 
     recording = open_recording(path)
@@ -108,17 +104,17 @@ class Prediction(NamedTuple):
 def predict_despite_faults(
     model: Path, recording: "Recording", failed: Sequence[int] = (), moment: tuple[str, float] | None = None
 ) -> Prediction:
-    """Localize all presses, with faulty fibres masked from their first bad press on (`FibreFault.since`).
+    """Localize all presses by the models in a folder, with faulty fibres masked from their first bad press on.
 
-    Args:
-        model: folder of the models.
-        recording: presses to localize.
-        failed: numbers of further fibres to mask, from 1.
-        moment: "touch" or "lift" and the time since, s, to use only readings until then; None for complete presses.
+    The fibres of the numbers `failed`, from 1, are masked, too. If there is a `moment`, "touch" or "lift" and the time
+    since then, s, only readings until this moment are used.
     """
     from padforge.sense.health.domain_shift import detect_shifts
     from padforge.sense.health.fault_detector import FaultDetector, has_health, mask_faults
     from padforge.sense.localizer.model import LocalizerModel
+    from padforge.sense.localizer.moments import Moment
+    from padforge.sense.recording.frames import framed
+    from padforge.sense.signals.press_detection import first_readings
 
     localizer = LocalizerModel.load(model)
     detector = FaultDetector.load(model) if has_health(model) else None
@@ -129,27 +125,18 @@ def predict_despite_faults(
     faults = detector.predict(recording) if detector and not is_other_pad else []
     fibre_mask = mask_faults(faults, len(recording.down_command), localizer.fibres)
     if moment is not None:
-        presses = localizer.scaled_features(recording, _until(localizer, recording, *moment))
+        if localizer.features != "windows":
+            raise InputError(f"--at is given: the localizer is of method {localizer.method}, expected ensemble")
+        frames, (since, time_s) = framed(recording), moment
+        count, commands = round(time_s * frames.rate_hz), (frames.down_command, frames.up_command)
+        end = Moment("lift", count) if since == "lift" else Moment("touch", max(count, 1))
+        until = end.until(first_readings(frames.readings, frames.times_s, *commands), frames.up_command)
+        presses = localizer.scaled_features(recording, until)
     localization = localizer.localize(replace(presses, fibre_mask=presses.fibre_mask & fibre_mask), excluded)
     fibre_mask[:, list(excluded)] = False
     has_shifts = detector is not None and not is_other_pad
     shifts = detect_shifts(localizer, detector.model_, recording, fibre_mask) if has_shifts else []
     return Prediction(localization, faults, shifts, detector, is_other_pad)
-
-
-def _until(localizer: "LocalizerModel", recording: "Recording", since: str, time_s: float) -> "Indices":
-    """Return the indices (Q,) of the first frames of the presses after a moment."""
-    from padforge.sense.localizer.moments import Moment
-    from padforge.sense.recording.frames import framed
-    from padforge.sense.signals.press_detection import first_readings
-
-    if localizer.features != "windows":
-        raise InputError(f"--at is given: the localizer is of method {localizer.method}, expected ensemble")
-    frames = framed(recording)
-    count = round(time_s * frames.rate_hz)
-    moment = Moment("lift", count) if since == "lift" else Moment("touch", max(count, 1))
-    commands = frames.down_command, frames.up_command
-    return moment.until(first_readings(frames.readings, frames.times_s, *commands), frames.up_command)
 
 
 @contextmanager

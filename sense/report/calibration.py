@@ -1,4 +1,4 @@
-"""What a calibration leaves in a folder: localizer, health models, document and figures."""
+"""Files of a calibration: localizer, health models, document and figures."""
 
 import logging
 from collections.abc import Collection
@@ -20,7 +20,6 @@ from padforge.design import Morphology
 from padforge.sense.health.fault_detector import HEALTH_FILES, FaultDetector
 from padforge.sense.localizer.calibration import calibrate, missing_target_lines
 from padforge.sense.localizer.evaluation import Evaluation
-from padforge.sense.localizer.model import LocalizerModel
 from padforge.sense.recording.recording import Recording
 from padforge.sense.settings import LocalizerSettings
 from padforge.sense.studies.fibre_loss import draw_errors_by_loss
@@ -43,22 +42,11 @@ def calibrate_into(
     on_progress: OnProgress = ignore_progress,
     force: bool = False,
 ) -> dict[str, Any]:
-    """Calibrate, and write FILES; nothing changes before all are done.
+    """Calibrate as `calibrate`, write FILES into `out`, and return the content of `calibration.json`.
 
-    What the recording does not suffice for (depth, force, health) is logged as a warning.
-
-    Args:
-        recording: with presses of known position.
-        out: folder.
-        options: of the localizer.
-        pad: as planned, see `calibrate`.
-        time_budget: seconds to train for, see `calibrate`.
-        without: parts that are left out, of "health", "figures" and "moments".
-        on_progress: as in `calibrate`, and called with (0, 0, "health") when that is learnt.
-        force: whether a localizer is replaced that other files in `out` were made from.
-
-    Returns:
-        The content of `calibration.json`.
+    No file changes before all are done. A warning is logged for each of depth, force and health that the recording does
+    not suffice for. Parts in `without` are left out: "health", "figures" or "moments". `on_progress` is also called
+    with (0, 0, "health"), and `force` replaces a localizer that other files in `out` were made from.
 
     Raises:
         InputError: as `calibrate`, `out` cannot be written, or other files were made from the localizer in it.
@@ -76,8 +64,12 @@ def calibrate_into(
     if "health" not in without:
         on_progress(0, 0, "health")
         with stage("health"):
-            detector = _fit_detector(recording, model, options.seed)
-    # Those of an earlier calibration must not stay.
+            try:
+                detector = FaultDetector(seed=options.seed).fit(recording, model.test, model.provenance)
+            except InputError as error:
+                held_out = f"{len(model.test)} presses are held out"
+                _log.warning("the health of the fibres is not monitored: %s; %s", error, held_out)
+    # optional files of an earlier calibration must not stay
     with atomic_files(out, without={*HEALTH_FILES, MAP, BY_LOSS, BY_MOMENT}) as folder:
         model.save(folder)
         check_replaceable(path, folder / path.name, FILES, force)  # other settings show in the result alone
@@ -86,31 +78,17 @@ def calibrate_into(
         write_json(folder / "calibration.json", evaluation.to_dict())
         if "figures" not in without:
             with stage("figures"):
-                _draw_figures(evaluation, folder)
+                draw_test_errors(evaluation, folder / MAP)
+                figure, axes = new_figure(6.0, 4.4)
+                draw_errors_by_loss(axes, {"": evaluation}, f"One network, {evaluation.test_presses}")
+                save_figure(figure, folder / BY_LOSS)
+                if evaluation.by_moment:
+                    draw_errors_by_moment(evaluation, folder / BY_MOMENT)
     return evaluation.to_dict()
 
 
-def _fit_detector(recording: Recording, model: LocalizerModel, seed: int) -> FaultDetector | None:
-    """Fit the health models of a localizer; None, with a warning, where the recording does not suffice."""
-    try:
-        return FaultDetector(seed=seed).fit(recording, model.test, model.provenance)
-    except InputError as error:
-        held_out = f"{len(model.test)} presses are held out"
-        _log.warning("the health of the fibres is not monitored: %s; %s", error, held_out)
-        return None
-
-
-def _draw_figures(evaluation: Evaluation, folder: Path) -> None:
-    draw_error_map(evaluation, folder / MAP)
-    figure, axes = new_figure(6.0, 4.4)
-    draw_errors_by_loss(axes, {"": evaluation}, f"One network, {evaluation.test_presses}")
-    save_figure(figure, folder / BY_LOSS)
-    if evaluation.by_moment:
-        draw_errors_by_moment(evaluation, folder / BY_MOMENT)
-
-
-def draw_error_map(evaluation: Evaluation, path: Path) -> None:
-    """Draw the test presses of a calibration, true and predicted."""
+def draw_test_errors(evaluation: Evaluation, path: Path) -> None:
+    """Draw the true and the predicted positions of the test presses of a calibration."""
     pressed, predicted = (np.array(evaluation.test[name]) for name in ("pressed_mm", "predicted_mm"))
     errors = np.hypot(*(predicted - pressed).T)
     figure, axes = new_figure(6.4, 5.6)
@@ -130,7 +108,7 @@ def draw_error_map(evaluation: Evaluation, path: Path) -> None:
 
 
 def draw_errors_by_moment(evaluation: Evaluation, path: Path) -> None:
-    """Draw the error while a press is read, by time since touch and since lift, and how one comes into focus."""
+    """Draw errors by time since the touch and since the lift, and the shrinking radius of a single press."""
     figure = Figure(figsize=(11.0, 4.0), layout="constrained")
     touch, lift, focus = figure.subplots(1, 3)
     for axes in (touch, lift, focus):

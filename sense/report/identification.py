@@ -1,4 +1,4 @@
-"""What an identification leaves in a folder (twin, document, figures), its lines and its section of the report."""
+"""Files of an identification (twin, document, figures), its printed lines and its section of the report."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, replace
@@ -20,11 +20,11 @@ from padforge.design.paths.curves import flatten
 from padforge.design.settings import Contact
 from padforge.sense.recording.recording import Recording
 from padforge.sense.twin.doubts import find_doubts, offset_mm
-from padforge.sense.twin.identification import Identification, MeasuredContact, identify_pad
+from padforge.sense.twin.identification import Identification, identify_pad
 
 FORMAT = "padforge-identification/1"
 CHANNEL_HEAD = ["channel", "fibre", "or", "gain (mV/%)", "noise (mV)", "explained", "lateral offset (mm)"]
-COMMAND, TWIN = "padforge sense identify", "twin.json"
+TWIN = "twin.json"
 
 
 def identify_into(
@@ -38,26 +38,18 @@ def identify_into(
     on_progress: OnProgress = ignore_progress,
     force: bool = False,
 ) -> dict[str, Any]:
-    """Identify a pad, and write twin.json, identification.json and two figures; nothing changes before all are done.
+    """Identify a pad as `identify`, write the twin and figures into `out`, and return `identification.json`.
 
-    Args:
-        recording: presses at known positions.
-        pad: as planned.
-        out: folder.
-        seed: of what is drawn.
-        contact: as `identify`.
-        inputs: files whose digests become part of the provenance.
-        on_progress: called with (steps done, total, what is being done).
-        force: whether a twin is replaced that other files in `out` were made from.
-
-    Returns:
-        The document.
+    No file changes before all are done. The digests of the files `inputs` become part of the provenance, and `force`
+    replaces a twin that other files in `out` were made from.
 
     Raises:
         InputError: as `identify`, `out` cannot be written, or other files were made from the twin in it.
     """
     check_writable(out)
-    origin = provenance(COMMAND, seed, inputs or [])  # minutes later they may differ from what was read
+    origin = provenance(
+        "padforge sense identify", seed, inputs or []
+    )  # minutes later they may differ from what was read
     check_replaceable(out / TWIN, origin, force=force)
     with stage("identify"):
         result = identify_pad(recording, pad, contact, seed, on_progress)
@@ -73,7 +65,16 @@ def identify_into(
 
 def _document(result: Identification) -> dict[str, Any]:
     """Return an identification as JSON: fibres count from 0, None where no fibre explains a channel."""
-    twin = result.twin
+    twin, contact = result.twin, None
+    if measured := result.contact:
+        best = measured.best
+        contact = {
+            "stated": measured.stated.model_dump(mode="json"),
+            **{name: getattr(best, name) for name in ("scale", "squeeze", "stretch", "scale_std", "shares_std")},
+            "explained": best.explained,
+            "explained_on_plan": measured.on_plan.explained,
+            "explained_on_plan_by_gaussian": measured.gaussian_on_plan.explained,
+        }
     channels = [asdict(channel) | {"alternative_fibres": []} for channel in twin.channels]
     for row, (offset, std, within) in enumerate(result.lateral_offsets_mm()):
         fibre = result.fit.pad.fibres[row]
@@ -90,7 +91,7 @@ def _document(result: Identification) -> dict[str, Any]:
         "channels": channels,
         "explained": float(result.explained.mean()),
         "explained_on_plan": result.explained_on_plan,
-        "contact": None if result.contact is None else _contact_document(result.contact),
+        "contact": contact,
         "noise": twin.noise,
         "frame": asdict(twin.frame),
         "sensitivity_profile": {"distance_mm": twin.distance_mm.tolist(), "weight": twin.weight.tolist()},
@@ -98,18 +99,6 @@ def _document(result: Identification) -> dict[str, Any]:
         "sensed_mm": list(twin.sensed_mm),
         "n_alternatives": len(result.alternatives),
         "doubts": find_doubts(result),
-    }
-
-
-def _contact_document(measured: MeasuredContact) -> dict[str, Any]:
-    """Return a measured contact as JSON: the keys of `[contact]`, and how much each model explains."""
-    best = measured.best
-    return {
-        "stated": measured.stated.model_dump(mode="json"),
-        **{name: getattr(best, name) for name in ("scale", "squeeze", "stretch", "scale_std", "shares_std")},
-        "explained": best.explained,
-        "explained_on_plan": measured.on_plan.explained,
-        "explained_on_plan_by_gaussian": measured.gaussian_on_plan.explained,
     }
 
 
@@ -186,12 +175,12 @@ def identification_lines(document: Mapping[str, Any], out: Path) -> list[str]:
         f" as it is; noise {document['noise']:.1%} of full scale",
         f"the pad lay {_pose(document)}",
         *_contact_lines(document),
-        *_doubt_lines(document),
+        *(f"doubtful: {doubt}" for doubt in document["doubts"]),
     ]
 
 
 def _contact_lines(document: Mapping[str, Any]) -> Iterator[str]:
-    """Yield what is measured of the contact, if it is a layer, as a user may state it in `[contact]`."""
+    """Yield the measured contact, if it is a layer, by the keys of `[contact]`."""
     if contact := document.get("contact"):
         yield (
             f"a press as [contact] with scale {contact['scale']:.2f} ± {contact['scale_std']:.2f}, squeeze"
@@ -209,20 +198,14 @@ def _channel_cells(row: Mapping[str, Any]) -> list[str]:
     if "lateral_offset_mm" in row:
         offset = f"{row['lateral_offset_mm']:.2f} ± {row['lateral_offset_std_mm']:.2f}"
         explained = [f"{row['explained']:.2f}", offset]
-    alternatives = _fibres(row["alternative_fibres"]) or "-"
+    fibre = "none" if row["fibre"] is None else str(row["fibre"] + 1)
+    alternatives = ", ".join(str(index + 1) for index in row["alternative_fibres"]) or "-"
     gain, noise = f"{row['gain_v'] * 10:.1f}", f"{row['noise_v'] * 1e3:.2f}"
-    return [str(row["channel"] + 1), _fibre(row), alternatives, gain, noise, *explained]
-
-
-def _doubt_lines(document: Mapping[str, Any]) -> Iterator[str]:
-    """Yield what makes the twin doubtful."""
-    for doubt in document["doubts"]:
-        yield f"doubtful: {doubt}"
+    return [str(row["channel"] + 1), fibre, alternatives, gain, noise, *explained]
 
 
 def identification_sections(folder: Path, document: Mapping[str, Any]) -> list[PageSection]:
     """Write the section of the report on an `identification.json` in `folder`. Raises errors as those of `sections`."""
-    channels = table(CHANNEL_HEAD, [_channel_cells(row) for row in document["channels"]])
     summary = (
         f"Identified from {document['presses']} presses: the pad lay {_pose(document)}. The twin explains"
         f" {document['explained']:.0%} of the responses to {document['held_out']} held-out presses, the plan as it is"
@@ -234,20 +217,13 @@ def identification_sections(folder: Path, document: Mapping[str, Any]) -> list[P
     ]
     body = [
         paragraph(summary),
-        *map(paragraph, [*_contact_lines(document), *_doubt_lines(document)]),
-        channels,
+        *map(paragraph, _contact_lines(document)),
+        *(paragraph(f"doubtful: {doubt}") for doubt in document["doubts"]),
+        table(CHANNEL_HEAD, [_channel_cells(row) for row in document["channels"]]),
         figures(pictures),
     ]
     result = (f"{document['explained']:.0%}", "of the responses explained by the twin")
     return [PageSection("The pad as built", body, [result])]
-
-
-def _fibre(row: Mapping[str, Any]) -> str:
-    return "none" if row["fibre"] is None else str(row["fibre"] + 1)
-
-
-def _fibres(indices: list[int]) -> str:
-    return ", ".join(str(fibre + 1) for fibre in indices)
 
 
 def _pose(document: Mapping[str, Any]) -> str:

@@ -1,7 +1,7 @@
 """Sections of the HTML report on recording, calibration, fibre loss and studies.
 
-For a document that is not as padforge writes it they raise KeyError, IndexError, TypeError, ValueError or
-AttributeError, and for a figure beside it that cannot be read InputError.
+Where a document is not as padforge writes it, they raise KeyError, IndexError, TypeError, ValueError or AttributeError;
+where a figure beside it cannot be read, InputError.
 """
 
 import json
@@ -21,13 +21,10 @@ from padforge.sense.localizer.evaluation import BUILT_PAD, reserve_lines
 from padforge.sense.recording.recording import Recording
 from padforge.sense.recording.run_directory import JOURNAL, read_journal
 
-N_WORST = 10  # sets of failed fibres that are listed
 NUMBERS = ("one", "two", "three")
 CELL = 40
 MAX_NUMBERED = 16
 """Fibres up to which cells of the chart have numbers; with more, they are too small to be read on a phone."""
-LABEL_STEP = 5  # fibres from label to label where cells have no numbers
-MAX_STRETCH = 1.7  # largest scale at which the chart is shown
 
 Errors = Mapping[tuple[int, ...], float]
 """Mean error, mm, by indices of failed fibres, ascending."""
@@ -110,16 +107,16 @@ def calibration_sections(folder: Path, document: Mapping[str, Any]) -> list[Page
         paragraph("The share of presses in which a fibre changes by less than 2 % of its range."),
         table(["fibre", *map(str, range(1, len(idle) + 1))], [["idle", *idle]]),
     ]
-    results = [
-        (f"{row['mean_mm']:.2f} mm", f"mean error on {presses}, {_failures(row['n_failed'])}")
-        for row in (rows if len(rows) == 1 else (rows[0], rows[-1]))
-    ]
+    results = []
+    for row in rows if len(rows) == 1 else (rows[0], rows[-1]):
+        failures = f"{n} fibre{'s' if n > 1 else ''} failed" if (n := row["n_failed"]) else "all fibres"
+        results.append((f"{row['mean_mm']:.2f} mm", f"mean error on {presses}, {failures}"))
     section = PageSection("Calibration", body, results)
     return [section, *([] if (folder / "fibre_loss.json").exists() else fibre_loss_sections(folder, document))]
 
 
 def _moment_errors(folder: Path, rows: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Write a table of the errors while a press is read, by time and failed fibres, and their figure."""
+    """Write a table of the errors during a press by time and number of failed fibres, and their figure."""
     if not rows:
         return []
     levels = sorted({row["n_failed"] for row in rows})
@@ -174,7 +171,7 @@ def fibre_loss_sections(folder: Path, document: Mapping[str, Any]) -> list[PageS
 
 
 def _describe_losses(errors: Errors) -> Iterator[str]:
-    """Write which sets of failed fibres are worst, in words, as a chart and as tables."""
+    """Describe the errors by set of failed fibres: the worst ones in words, all as a chart and as tables."""
     fibres = 1 + max(fibre for failed in errors for fibre in failed)
     if fibres > MAX_FIBRES:
         raise ValueError(f"fibre {fibres} failed, of at most {MAX_FIBRES}")
@@ -193,10 +190,15 @@ def _describe_losses(errors: Errors) -> Iterator[str]:
             " the column; on the diagonal, without one. Darker is worse.</figcaption></figure>"
         ]
     head = ["fibre", *("alone (mm)" if count == 1 else f"with {_fibre_count(count - 1)} more" for count in counts)]
-    rows = [[fibre + 1, *(_mean_with(errors, fibre, count) for count in counts)] for fibre in range(fibres)]
+
+    def mean_with(fibre: int, count: int) -> str:
+        values = [error for failed, error in errors.items() if len(failed) == count and fibre in failed]
+        return f"{sum(values) / len(values):.2f}" if values else "-"
+
+    rows = [[fibre + 1, *(mean_with(fibre, count) for count in counts)] for fibre in range(fibres)]
     means = [table(head, rows), paragraph("Mean error over the sets of failed fibres that a fibre is in.")]
     yield columns(*([chart] if chart else []), means)
-    ranked = sorted(errors.items(), key=lambda item: -item[1])[:N_WORST]
+    ranked = sorted(errors.items(), key=lambda item: -item[1])[:10]
     rows = [[_names(failed), f"{error:.2f}"] for failed, error in ranked if failed]
     yield collapsible("The worst sets", [table(["failed", "mean (mm)"], rows)])
 
@@ -205,17 +207,8 @@ def _worst(errors: Errors, count: int) -> tuple[int, ...]:
     return max((failed for failed in errors if len(failed) == count), key=errors.__getitem__)
 
 
-def _mean_with(errors: Errors, fibre: int, count: int) -> str:
-    values = [error for failed, error in errors.items() if len(failed) == count and fibre in failed]
-    return f"{sum(values) / len(values):.2f}" if values else "-"
-
-
 def _error_cells(row: Mapping[str, Any], *more: str) -> list[object]:
     return [row["n_failed"], row["subsets"], *(f"{row[name]:.2f}" for name in ("mean_mm", "std_mm", "max_mm", *more))]
-
-
-def _failures(count: int) -> str:
-    return "all fibres" if count == 0 else f"{count} fibre{'s' if count > 1 else ''} failed"
 
 
 def _fibre_count(count: int) -> str:
@@ -230,9 +223,7 @@ def _names(failed: Sequence[int]) -> str:
 def loss_chart(errors: Errors, fibres: int) -> str:
     """Draw an SVG triangle: the error without one fibre on its diagonal, without two below it; darker is worse.
 
-    Args:
-        errors: of sets of one and of two failed fibres, and of none if known.
-        fibres: number of fibres.
+    The errors are those of all sets of one and of two of the `fibres`, and of the empty set if known.
     """
     low, high = min(errors.values()), max(errors.values())
     numbered = fibres <= MAX_NUMBERED
@@ -240,46 +231,38 @@ def loss_chart(errors: Errors, fibres: int) -> str:
     left, top = 2 * size, 6
     width = left + fibres * CELL + size // 2
     height = top + fibres * CELL + 4 * size
-    shapes = [*_chart_labels(fibres, size, left, top), *_colour_scale(low, high, size, left, height)]
+    shapes: list[str] = []
+    for fibre in range(fibres):
+        if numbered or (fibre + 1) % 5 == 0:
+            middle = (fibre + 0.5) * CELL
+            shapes.append(_svg_text(str(fibre + 1), left - 0.7 * size, top + middle + size / 3, size))
+            shapes.append(_svg_text(str(fibre + 1), left + middle, top + fibres * CELL + 1.2 * size, size))
+    shapes += _colour_scale(low, high, size, left, height)
     for failed, error in errors.items():
-        if failed:
-            corner = left + failed[0] * CELL, top + failed[-1] * CELL
-            shapes += _chart_cell(failed, error, (error - low) / ((high - low) or 1.0), corner, numbered)
+        if not failed:
+            continue
+        x, y, share = left + failed[0] * CELL, top + failed[-1] * CELL, (error - low) / ((high - low) or 1.0)
+        shapes.append(
+            f'<rect x="{x + 1}" y="{y + 1}" width="{CELL - 2}" height="{CELL - 2}" rx="3" fill="{_shade(share)}">'
+            f"<title>without {_names(failed)}: {error:.2f} mm</title></rect>"
+        )
+        if numbered:
+            bold = ' font-weight="700"' if len(failed) == 1 else ""
+            colour = f' fill="{INK if share < 0.65 else "#ffffff"}" pointer-events="none"'
+            text = f"{error:.2f}" if error < 10 else f"{error:.1f}"
+            shapes.append(_svg_text(text, x + CELL / 2, y + CELL / 2 + 5, 14, bold + colour))
     worst = (_worst(errors, count) for count in (1, 2))
     described = "; ".join(f"worst without {_names(failed)}: {errors[failed]:.2f} mm" for failed in worst)
     label = escape(f"Error without one and without two fibres; {described}.")
     return (
-        f'<svg viewBox="0 0 {width} {height}" style="max-width:{MAX_STRETCH * width:.0f}px" role="img"'
+        f'<svg viewBox="0 0 {width} {height}" style="max-width:{1.7 * width:.0f}px" role="img"'
         f' aria-label="{label}" font-family="system-ui, sans-serif" text-anchor="middle" fill="{INK}">'
         f"{''.join(shapes)}</svg>"
     )
 
 
-def _chart_cell(
-    failed: Sequence[int], error: float, share: float, corner: tuple[int, int], numbered: bool
-) -> Iterator[str]:
-    x, y = corner
-    yield (
-        f'<rect x="{x + 1}" y="{y + 1}" width="{CELL - 2}" height="{CELL - 2}" rx="3" fill="{_shade(share)}">'
-        f"<title>without {_names(failed)}: {error:.2f} mm</title></rect>"
-    )
-    if numbered:
-        bold = ' font-weight="700"' if len(failed) == 1 else ""
-        colour = f' fill="{INK if share < 0.65 else "#ffffff"}" pointer-events="none"'
-        text = f"{error:.2f}" if error < 10 else f"{error:.1f}"
-        yield _svg_text(text, x + CELL / 2, y + CELL / 2 + 5, 14, bold + colour)
-
-
-def _chart_labels(fibres: int, size: int, left: int, top: int) -> Iterator[str]:
-    for fibre in range(fibres):
-        if fibres <= MAX_NUMBERED or (fibre + 1) % LABEL_STEP == 0:
-            middle = (fibre + 0.5) * CELL
-            yield _svg_text(str(fibre + 1), left - 0.7 * size, top + middle + size / 3, size)
-            yield _svg_text(str(fibre + 1), left + middle, top + fibres * CELL + 1.2 * size, size)
-
-
 def _colour_scale(low: float, high: float, size: int, left: int, height: int) -> Iterator[str]:
-    """Draw the colours from the least error to the greatest, in the lower left corner."""
+    """Draw the scale of colours, from the least error to the greatest, in the lower left corner."""
     y = height - 1.4 * size
     yield _svg_text(f"{low:.2f}", left + 1.3 * size, y + 0.9 * size, size)
     for step in range(5):

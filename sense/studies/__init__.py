@@ -1,1 +1,1 @@
-"""Studies: the paper's simulations for any pads, carried further; each a table, a figure and what it shows."""
+"""Studies: the simulations of the paper for any pads, and further ones; each makes a table, a figure and a text."""

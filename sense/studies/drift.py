@@ -1,4 +1,4 @@
-"""Drift: what filters and drift compensation bring, on simulated and on real recordings.
+"""Drift: the gain by filters and drift compensation, on simulated and on real recordings.
 
 The published method (paper, section V-A, figure 12 and table III) filters the readings by total variation, and gives
 the network the levels of each fibre before, in and after a press. Here every filter is combined with every kind of
@@ -44,13 +44,11 @@ HIDDEN, EPOCHS = 50, 200
 RIG = RigSettings(presses=1000)  # that records pads
 SIDE = 32  # presses along a side of the published serpentine on which idle shares are simulated
 SETTLED = 10  # readings from a command of the probe to the level, as published: 10, 30 and 50 of a cycle of 40
-SLOW_PRESSES = 15  # with the last one, over whose rest levels the median is the slow baseline
 EXCERPT_PRESSES = 5  # in the figure's excerpt of readings
 MAX_LEVELS = 400  # presses by which the figure shows the drift of a whole recording
 COLUMNS = 2  # recordings side by side whose errors are drawn
 PHASES = (("before", INK), ("pressed", ALARM), ("after", CURVES[2]))
-RAW, AS_PUBLISHED = "none", "robust TV"
-"""No filter, and the published one."""
+RAW, AS_PUBLISHED = "none", "robust TV"  # no filter, and the published one
 FILTERS: dict[str, Callable[[Array], Array]] = {
     RAW: lambda readings: readings,
     "median of 15": partial(running_median, width=15),
@@ -103,9 +101,9 @@ def drift_study(pads: Mapping[str, Morphology], recordings: Mapping[str, Recordi
 
 
 def _split(presses: Indices, seed: int) -> tuple[Indices, Indices, dict[str, Indices]]:
-    """Split presses of known position into those to train on, to stop by, and to "test" on, at random and the "last".
+    """Split presses of known position into training and validation presses, random "test" presses, and the "last" ones.
 
-    The last ones are held out first, then of the others some at random.
+    The last ones are held out first, the test presses then drawn from the others.
     """
     rng = np.random.default_rng([7, seed])
     first, last = split_presses(len(presses), "chronological", TEST_SHARE, rng)
@@ -115,9 +113,10 @@ def _split(presses: Indices, seed: int) -> tuple[Indices, Indices, dict[str, Ind
 
 
 def level_indices(readings: int, down_command: Indices, up_command: Indices) -> Indices:
-    """Return which readings (Q, 3) are the levels before, in and after each press: SETTLED from the probe's commands.
+    """Return the indices (Q, 3) of the readings that are the levels before, in and after each press.
 
-    Where a cycle is too short, it is the nearest reading that belongs neither to another phase nor to another press.
+    They are SETTLED readings from a command of the probe or, if the cycle is too short, the nearest ones that belong
+    neither to another phase nor to another press.
     """
     previous, following = np.append(0, up_command[:-1]), np.append(down_command[1:], readings)
     before = np.maximum(down_command - SETTLED, previous)
@@ -142,7 +141,7 @@ def network_inputs(
     if compensation == "baseline":
         return pressed - before
     if compensation == "slow baseline":
-        return pressed - running_median(before, SLOW_PRESSES, causal=True)
+        return pressed - running_median(before, 15, causal=True)  # of the last 15 presses
     return pressed
 
 
@@ -176,7 +175,7 @@ def _evaluate(source: Callable[[], Recording], name: str, seed: int) -> State:
 
 
 def _excerpt(times_s: Array, readings: Array, filtered: Array, down_command: Indices, up_command: Indices) -> State:
-    """Select what the figure shows of the fibre whose response varies most.
+    """Select the data of the figure, of the fibre whose response varies most.
 
     Returns:
         Index of the "fibre"; "readings" (3, W): times, s, raw and filtered readings, V; "samples" (EXCERPT_PRESSES, 3,

@@ -87,8 +87,8 @@ def fibre_loss_study(
     """Evaluate every set of failed fibres, by one localizer, by networks retrained for each set, or by both.
 
     Args:
-        recording: with presses of known position. Those that `localizer` held out are the test if it was trained on
-            this recording, else the share of them that `options` hold out.
+        recording: with presses of known position. The test presses are those that `localizer` held out if it was
+            trained on this recording, else the share that `options` hold out.
         localizer: the one network; None for retraining alone.
         retrain: whether networks are retrained for every set.
         options: split, share and seed; the defaults if None.
@@ -118,7 +118,10 @@ def fibre_loss_study(
     if retrain:
         subsets = [subset for level in levels for subset in failure_subsets(fibres, level)]
         subsets += [chosen] if chosen and chosen not in subsets else []
-        predictions = _retrain(recording, training, test, options, subsets, on_progress)
+        published = options.model_copy(update={"method": "published"})
+        tasks = [Task("", partial(train_without, subset, recording, training, test, published)) for subset in subsets]
+        states: list[Any] = compute_states(tasks, on_progress)
+        predictions = {subset: Localization(**state) for subset, state in zip(subsets, states, strict=True)}
         methods[RETRAINED] = evaluate(predictions.__getitem__)
     origin = provenance("padforge sense fibre-loss", options.seed, packages=("torch",))
     origin["inputs"] = {"recording": recording.digest, "localizer": dict(localizer.provenance) if localizer else {}}
@@ -129,7 +132,7 @@ def fibre_loss_study(
 def _evaluate(
     fibres: int, levels: range, chosen: Failed, positions_mm: Array, predict: Callable[[Failed], Localization]
 ) -> MethodErrors:
-    """Return errors by number and by set of failed fibres, and maps without the worst and the chosen ones."""
+    """Return errors by number and by set of failed fibres, and maps without the worst and the chosen sets."""
     rows, by_subset = errors_by_loss(fibres, levels, predict, positions_mm)
     worst = [
         max((row for row in by_subset if len(row["failed"]) == level), key=lambda row: row["mean_mm"])["failed"]
@@ -142,35 +145,16 @@ def _evaluate(
     return MethodErrors(rows, by_subset, maps)
 
 
-def _retrain(
-    recording: Recording,
-    training: Indices,
-    test: Indices,
-    options: settings.LocalizerSettings,
-    subsets: Sequence[Failed],
-    on_progress: OnProgress,
-) -> dict[Failed, Localization]:
-    """Predict the test presses by a network of each set of failed fibres."""
-    options = options.model_copy(update={"method": "published"})
-    tasks = [Task("", partial(train_without, failed, recording, training, test, options)) for failed in subsets]
-    states: list[Any] = compute_states(tasks, on_progress)
-    return {failed: Localization(**state) for failed, state in zip(subsets, states, strict=True)}
-
-
 def train_without(
     failed: Failed, recording: Recording, training: Indices, test: Indices, options: settings.LocalizerSettings
 ) -> State:
     """Train on the other fibres alone, and predict the test presses; independent of all other trainings."""
     remaining = np.setdiff1d(np.arange(recording.fibres), failed)
     partial_recording = replace(recording, readings=recording.readings[:, remaining])
-    rng = np.random.default_rng([options.seed, _bit_mask(failed)])
+    rng = np.random.default_rng([options.seed, sum(1 << fibre for fibre in failed)])
     localizer = fit_recording(partial_recording, training, options, rng)
     prediction = localizer.predict_features(localizer.scaled_features(partial_recording)[test])
     return {key: value for key, value in vars(prediction).items() if key != "measures"}
-
-
-def _bit_mask(failed: Failed) -> int:
-    return sum(1 << fibre for fibre in failed)
 
 
 def fibre_loss_lines(result: FibreLoss) -> list[str]:

@@ -1,4 +1,4 @@
-"""Force and shape: whether the fibres that localize a press also tell how deep and hard it is, and with what object."""
+"""Force and shape: depth, force and object of a press, estimated from the fibres that localize it."""
 
 from collections.abc import Mapping
 from dataclasses import asdict
@@ -33,8 +33,8 @@ from padforge.sense.studies.study import (
 )
 
 LOG_SCALE = 4.0
-"""Counts below which the logarithm of a reading becomes linear, since there it would be one of noise. To logarithms a
-deeper press adds, as it multiplies all signals."""
+"""Counts below which the logarithm of a reading becomes linear, since readings there are mostly noise. A deeper press
+multiplies all signals, and so adds a constant to their logarithms."""
 DEPTHS = LOW, HIGH = 0.2, 1.0  # least and greatest, as a share of the contact's depth
 MIDDLE = (LOW + HIGH) / 2
 CASES = {"depth unknown": (DEPTHS, False), "depth known": (DEPTHS, True), "one depth": ((MIDDLE, MIDDLE), False)}
@@ -56,13 +56,8 @@ def force_study(
 ) -> Study:
     """Estimate position, depth and force of presses of random depth, from the signals of a pressed layer.
 
-    An unknown depth is compared with one that is an input, and with presses of the middle depth alone.
-
-    Args:
-        pads: the pads, by label.
-        contact: a layer; presses are up to as deep, and at least a fifth as deep. `Contact()` if None.
-        sizes: of the networks and of their sets of presses.
-        seed: of every random choice.
+    Depths are 0.2 to 1 of that of the contact, `Contact()` if None. The error of the position is compared with errors
+    by networks with the depth as an input, and with those of presses of the middle depth alone.
 
     Raises:
         InputError: the contact is no layer.
@@ -70,7 +65,7 @@ def force_study(
     contact = _check_layer(contact)
     tasks = [
         Task(
-            f"{label}, noise of {_counts(noise)}, {name}",
+            f"{label}, noise of {noise:g} count{'s' * (noise != 1)}, {name}",
             partial(_estimate_depth, pad, contact, *case, noise, sizes, seed),
         )
         for label, pad in pads.items()
@@ -91,7 +86,7 @@ def force_study(
 
 
 def _check_layer(contact: Contact | None) -> Contact:
-    """Return the contact, the default one if None, if it has a depth."""
+    """Return the contact, the default one if None; refuse one that is no layer."""
     contact = contact or Contact()
     if contact.model != "layer":
         raise InputError(f"[contact] model is {contact.model}, allowed is layer: nothing else is pressed to a depth")
@@ -125,10 +120,6 @@ def _estimate_depth(
 def signed_logarithm(counts: Array) -> Array:
     """Return the logarithm of the magnitude of readings, with their sign, linear below LOG_SCALE."""
     return np.sign(counts) * np.log1p(np.abs(counts) / LOG_SCALE)
-
-
-def _counts(number: float) -> str:
-    return f"{number:g} count" if number == 1 else f"{number:g} counts"
 
 
 def _conclude_force(
@@ -238,13 +229,8 @@ def shape_study(
 ) -> Study:
     """Classify the object: tools of unknown depth, and footprints of unknown size, the position unknown too.
 
-    Tools press the layer of the contact, footprints follow the published contact: polygons of one orientation.
-
-    Args:
-        pads: the pads, by label.
-        contact: a layer, whose tools have that tool's radius and are pressed up to as deep. `Contact()` if None.
-        sizes: of the networks and of their sets of presses.
-        seed: of every random choice.
+    Tools have the radius and depths of the contact, `Contact()` if None, and press its layer. Footprints are polygons
+    of one orientation under the published contact.
 
     Raises:
         InputError: the contact is no layer.
@@ -273,7 +259,7 @@ def tool_contacts(contact: Contact) -> dict[str, Contact]:
     """Return the contact of each of TOOLS, by name.
 
     All have the radius of the contact's tool except the flat end, which has the contact radius of the dome at the
-    middle depth: they differ by the profile of what presses more than by the size.
+    middle depth: tools differ by their profile more than by their size.
     """
     layer = contact.thickness_mm, contact.base
     dome = solve_press("dome", contact.tool_radius_mm, MIDDLE * contact.depth_mm, *layer)

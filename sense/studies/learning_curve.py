@@ -1,11 +1,10 @@
-"""Learning curve: error against the number of training presses, and what recording more of them would bring.
+"""Learning curve: error against the number of training presses, and the gain by recording more of them.
 
 Localizers are trained on nested shares of the training presses and tested on the same presses. A power law with a
 floor, e(n) = c + a n^-b, describes such curves (J. Hestness et al., Deep learning scaling is predictable, empirically,
 2017) and is extrapolated to twice as many presses.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -21,7 +20,7 @@ from padforge.common.progress import OnProgress, ignore_progress
 from padforge.common.settings import or_default
 from padforge.common.validation import InputError
 from padforge.sense import settings
-from padforge.sense.arrays import Array, Indices
+from padforge.sense.arrays import Array
 from padforge.sense.localizer.calibration import fit_recording, split_presses
 from padforge.sense.localizer.evaluation import distances
 from padforge.sense.recording.recording import Recording
@@ -29,7 +28,6 @@ from padforge.sense.recording.recording import Recording
 FORMAT = "padforge-learning-curve/1"
 SHARES = (1 / 16, 1 / 8, 1 / 4, 1 / 2, 1.0)  # of the training presses
 MIN_PRESSES = 10  # training presses of the smallest localizer
-EXPONENTS = np.linspace(0.1, 1.5, 57)  # exponents b that are tried
 RESAMPLINGS = 400
 
 
@@ -67,17 +65,19 @@ def learning_curve(
     *,
     on_progress: OnProgress = ignore_progress,
 ) -> LearningCurve:
-    """Train localizers on more and more presses, and extrapolate their error.
+    """Train localizers on growing numbers of presses, and extrapolate their error.
 
     Args:
         recording: with presses of known position.
-        options: how to train; a single member is, so errors are somewhat above those of a calibration. The defaults if
-            None.
-        on_progress: called with (steps done, total, what is done beside the steps).
+        options: of the training; the defaults if None. A single member is trained, so that errors are somewhat above
+            those of a calibration.
+        on_progress: called with (steps done, total, name of work that is not counted in steps).
 
     Raises:
         InputError: too few presses for a curve.
     """
+    from padforge.sense.localizer.training import JointProgress, training_steps
+
     options = or_default("options", options, settings.LocalizerSettings)
     rng = np.random.default_rng(options.seed)
     presses = np.flatnonzero(recording.has_position)
@@ -90,8 +90,20 @@ def learning_curve(
     order = rng.permutation(training)
     sizes = [round(share * len(order)) for share in SHARES]
     options = options.model_copy(update={"members": 1, "method": "ensemble"})
-    predictions = _predict(recording, [np.sort(order[:size]) for size in sizes], test, options, on_progress)
-    errors = np.array([distances(positions_mm, recording.presses_mm[test]) for positions_mm in predictions])
+    # as many steps as in a calibration on that many presses: with one short training for all, more presses would hardly
+    # lower the error
+    joint = JointProgress([training_steps(size, options) for size in sizes], on_progress)
+
+    def test_errors(number: int) -> Array:
+        rows, rng = np.sort(order[: sizes[number]]), np.random.default_rng([options.seed, sizes[number]])
+        localizer = fit_recording(recording, rows, options, rng, partial(joint.update, number))
+        prediction = localizer.predict_features(localizer.scaled_features(recording)[test])
+        return distances(prediction.positions_mm, recording.presses_mm[test])
+
+    longest_first = reversed(range(len(sizes)))
+    with one_thread(), joint:
+        by_number = dict(run_tasks((number, partial(test_errors, number)) for number in longest_first))
+    errors = np.array([by_number[number] for number in range(len(sizes))])
     counts = np.array(sizes, dtype=float)
     fit = fit_power_law(counts, errors.mean(axis=1))
     forecast = _forecast(counts, errors, fit, rng)
@@ -113,33 +125,6 @@ def learning_curve(
     )
 
 
-def _predict(
-    recording: Recording,
-    trainings: Sequence[Indices],
-    test: Indices,
-    options: settings.LocalizerSettings,
-    on_progress: OnProgress,
-) -> list[Array]:
-    """Return the test positions (Q, 2) that a localizer predicts after each training."""
-    from padforge.sense.localizer.training import JointProgress, training_steps
-
-    # as many steps as in a calibration on that many presses: with one short training for all, most presses would seem
-    # to bring little
-    steps = [training_steps(len(training), options) for training in trainings]
-    joint = JointProgress(steps, on_progress)
-
-    def train(number: int) -> Array:
-        training = trainings[number]
-        rng = np.random.default_rng([options.seed, len(training)])
-        localizer = fit_recording(recording, training, options, rng, partial(joint.update, number))
-        return localizer.predict_features(localizer.scaled_features(recording)[test]).positions_mm
-
-    longest_first = reversed(range(len(steps)))
-    with one_thread(), joint:
-        predictions = dict(run_tasks((number, partial(train, number)) for number in longest_first))
-    return [predictions[number] for number in range(len(steps))]
-
-
 def fit_power_law(presses: Array, errors: Array) -> tuple[float, float, float]:
     """Fit c + a n^-b to errors (P,) by numbers of presses (P,): least squares of relative errors, c and a >= 0."""
 
@@ -147,7 +132,7 @@ def fit_power_law(presses: Array, errors: Array) -> tuple[float, float, float]:
         terms = np.column_stack([np.ones_like(presses), (presses / presses[-1]) ** -exponent])
         return nnls(terms / errors[:, None], np.ones_like(errors))
 
-    exponent = min(EXPONENTS.tolist(), key=lambda b: solve(b)[1])
+    exponent = min(np.linspace(0.1, 1.5, 57).tolist(), key=lambda b: solve(b)[1])
     (floor, last), _ = solve(exponent)
     return float(floor), float(last * presses[-1] ** exponent), float(exponent)
 

@@ -1,8 +1,8 @@
-"""Several contacts at once: positions of two, whichever comes first, and the number of contacts (paper, III-D, fig. 9).
+"""Several contacts at once: the positions of two, in any order, and the number of contacts (paper, III-D, fig. 9).
 
-Networks learn pairs of positions, which have no order. Four kinds of targets are compared: as published, in the order
-drawn; ordered by x; the order that the network comes nearest to, by a loss that does not care; and moments that have no
-order.
+Networks learn pairs of positions, which have no order. Four kinds of targets are compared: the published ones, in the
+order drawn; those ordered by x; those in the order nearest to the outputs, by a loss that is invariant to the order;
+and moments, which have no order.
 """
 
 from collections.abc import Callable, Mapping
@@ -41,13 +41,13 @@ MAX_CONTACTS = 3  # at once, where they are counted
 NOISE_COUNTS = 1.0
 """Noise of the readings by which contacts are counted, in counts of a 12-bit converter; positions are without it."""
 BINS = 16  # groups of equally many pairs, by the distance of the two contacts
-COUNTING = "number of contacts"  # stands for the method in rows that are not of pairs
+COUNTING = "number of contacts"  # in the column of the method, in rows that are not of pairs
 
 
 class PairTargets(NamedTuple):
-    """How networks learn pairs of contacts."""
+    """Targets of networks that learn pairs of contacts."""
 
-    encode: Callable[[Array], Array]  # from pairs (Q, 2, 2) to A equally right targets (A, Q, O)
+    encode: Callable[[Array], Array]  # from pairs (Q, 2, 2) to A equally valid targets (A, Q, O)
     decode: Callable[[Array], Array]  # from the outputs of S networks (S, T, O) to pairs (T, 2, 2)
 
 

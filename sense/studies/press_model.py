@@ -1,4 +1,4 @@
-"""What fibres respond to the presses of a study: as in the paper without noise, or as a built pad does, scattered."""
+"""Responses of fibres to the presses of a study: without noise as in the paper, or with the scatter of a built pad."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -17,8 +17,8 @@ class PressModel:
     """Contact of the presses of a study, and how responses to it scatter.
 
     Attributes:
-        contact: what a press does to a fibre. Under a shape fibres respond by exact signals, as in the paper; under a
-            layer or a profile by their relative stretch, in units of full scale.
+        contact: the contact model. Under a shape, responses are exact signals, as in the paper; under a layer or a
+            profile they are the relative stretch of fibres, in units of full scale.
         scatter: of the responses under a layer or a profile.
     """
 

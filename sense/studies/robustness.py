@@ -32,7 +32,7 @@ RULES = {"published": signals_quantized, "exact": signals}
 MIN_NETWORKS = 16
 """Networks of a level: where there are fewer sets of failed fibres, each is trained several times, since the error of a
 single network depends on its first weights."""
-MAX_SETS = 1024  # of failed fibres of a size that are evaluated; of more, a sample is drawn
+MAX_SETS = 1024  # sets of failed fibres of one size that are evaluated; if there are more, a sample is drawn
 Respond = Callable[[Morphology, Array], Array]
 HIDDEN, TEST = 50, 2000  # neurons of a network, and fresh presses to test on
 SIDE = 33  # cells along a side of an error map
@@ -50,14 +50,8 @@ def robustness_study(
 ) -> Study:
     """Evaluate networks that are retrained for every set of failed fibres, as published, with error maps.
 
-    Args:
-        pads: the pads, by label.
-        contact: what a press does to a fibre; PUBLISHED_CONTACT if None.
-        rule: one of RULES, by which signals are computed.
-        max_failures: most fibres that fail at once; at least one is left.
-        presses: to train on, a square number.
-        failed: indices of fibres without which errors are mapped too, however many; none if empty.
-        seed: of every random choice.
+    The contact is PUBLISHED_CONTACT if None, and `rule` one of RULES. Up to `max_failures` fibres fail at once, and at
+    least one is left. Errors are also mapped without all fibres of the indices `failed`, if there are any.
 
     Raises:
         InputError: `presses` is no square number, or a pad has none of the `failed` fibres, or no others.

@@ -2,9 +2,9 @@
 
 The published method learns from a serpentine of presses and is evaluated on those presses themselves. "Spread" and
 "shared" learn from presses spread over the whole surface and are evaluated on fresh ones. The inputs of "spread" are
-each fibre's share of its family's signal, of which the position is an almost linear function at any size. For "shared"
-the largest signals tell the tile, and one network for all tiles, given the fibres of it and its neighbours, the
-position in it: neither its size nor its error need grow with the surface.
+each fibre's share of its family's signal, of which the position is an almost linear function at any size. In "shared"
+the tile is that of the largest signals, and one network for all tiles estimates the position in it from the fibres of
+the tile and its neighbours: neither the size of the network nor its error need grow with the surface.
 """
 
 import math
@@ -25,14 +25,7 @@ from padforge.design.published.networks import fit_batch, fresh_presses, trainin
 from padforge.design.settings import Rectangle, between_fibres
 from padforge.sense.arrays import Array
 from padforge.sense.studies.press_model import PUBLISHED_PRESSES, PressModel
-from padforge.sense.studies.study import (
-    Study,
-    StudyResult,
-    Task,
-    describe_pads,
-    draw_error_map,
-    label_axes,
-)
+from padforge.sense.studies.study import Study, StudyResult, Task, describe_pads, draw_error_map, label_axes
 
 TILES, MAX_GRID = (1, 2, 4, 8, 16, 32), 256
 """Tiles along a side, which are 4 to 128 fibres of the published pads, and most fibres of a family."""
@@ -52,15 +45,10 @@ def scaling_study(
     side: int = 64,
     seed: int = 0,
 ) -> Study:
-    """Evaluate surfaces of growing grids, over which each pad is repeated as a tile.
+    """Evaluate surfaces of growing grids, over which each square pad is repeated as a tile.
 
-    Args:
-        pads: square pads, by label.
-        grids: fibres of a family of the surfaces, multiples of every pad's; if empty, TILES of the smallest surface
-            that all pads tile, up to MAX_GRID.
-        press_model: contact and scatter.
-        side: root of the number of training presses.
-        seed: of every random choice.
+    The `grids` are multiples of every pad's; if empty, TILES of the smallest surface that all pads tile, up to
+    MAX_GRID. Networks are trained on `side`^2 presses.
 
     Raises:
         InputError: a pad that is no tile of a surface.
@@ -120,7 +108,7 @@ def tile_inputs(responses: Array, tile: int) -> tuple[Array, Array]:
     In each family, of `tile` fibres a tile, it is the tile with the largest sum, the middle one if all signals are 0.
     """
     windows, origins = [], []
-    for family in np.split(responses, 2, axis=1)[::-1]:  # vertical fibres tell x, horizontal ones y
+    for family in np.split(responses, 2, axis=1)[::-1]:  # x depends on vertical fibres, y on horizontal ones
         sums = family.reshape(len(family), -1, tile).sum(axis=2)
         number = np.where(sums.any(axis=1), sums.argmax(axis=1), sums.shape[1] // 2)
         padded = np.pad(family, ((0, 0), (tile, tile)))
@@ -150,7 +138,7 @@ def _evaluate(tile: Morphology, grid: int, method: str, press_model: PressModel,
     inputs, origins = network_inputs(training)
     valid = np.ones(len(training), dtype=bool)
     if method == SHARED and grid > tile.grid:
-        # the tile is unknown where a family is silent, and nothing can be learnt from a position in a wrong one
+        # the tile is unknown where a family does not respond, and positions in a wrong tile teach nothing
         valid = np.all([part.any(axis=1) for part in np.split(inputs, 2, axis=1)], axis=0)
     rng = np.random.default_rng([8, seed])
     network = fit_batch(inputs[valid], (training - origins)[valid], [rng], HIDDEN, EPOCHS)[0]

@@ -1,8 +1,8 @@
-"""Sensitivity to what presses: other tools and depths than the pad was trained with (paper, figure 6).
+"""Sensitivity to the pressing object: tools and depths other than those of the training (paper, figure 6).
 
-A layer is pressed by tools of half to one and a half times the radius, half to one and a half times as deep, in mm.
-Responses scatter as on a built pad, since exact ones would locate even a press that fibres hardly feel. For a shape the
-objects are the published ones, in grid units, and responses have no noise.
+A layer is pressed by tools of 0.5 to 1.5 times the radius, to 0.5 to 1.5 times the depth of the contact, in mm.
+Responses scatter as on a built pad, since exact ones would localize even a press that fibres hardly respond to. In
+place of a shape, the objects are the published ones, in grid units, and responses have no noise.
 """
 
 import math
@@ -35,7 +35,7 @@ SCATTER = SearchSettings().response_scatter
 
 
 class _Objects(NamedTuple):
-    """How the objects of a contact model differ, are named and judged."""
+    """Fields, names and errors of the objects of a contact model."""
 
     size: str  # field of `Contact` that is their size
     other: str  # the other field that differs
@@ -60,19 +60,22 @@ _OBJECTS = {
 
 
 def sensitivity_study(pads: Mapping[str, Morphology], *, contact: Contact | None = None, seed: int = 0) -> Study:
-    """Compare errors for what presses, by networks trained with the same or with something else.
+    """Compare errors by object that presses, of networks trained with that object or with another one.
 
-    Args:
-        pads: the pads, by label.
-        contact: a layer, about whose tool and depth others are tried; or a shape, which is replaced by the published
-            ones. `Contact()` if None.
-        seed: of every random choice.
+    The objects differ in tool radius and depth about those of the contact, if it is a layer, as `Contact()` is; in
+    place of a shape they are the published ones.
 
     Raises:
         InputError: the contact is a profile.
     """
     contact = contact or Contact()
-    sizes, others = _values(contact)
+    if contact.model == "layer":
+        sizes = [factor * contact.tool_radius_mm for factor in FACTORS]
+        others = [depth for factor in FACTORS if (depth := factor * contact.depth_mm) < contact.thickness_mm]
+    elif contact.model == "shape":
+        sizes, others = list(RADII), list(SIDES)
+    else:
+        raise InputError(f"[contact] model is {contact.model}, allowed are layer and shape: only they have a size")
     kind = _OBJECTS[contact.model]
     objects = [
         contact.model_copy(update={kind.size: size, kind.other: other}) for other, size in product(others, sizes)
@@ -95,16 +98,6 @@ def sensitivity_study(pads: Mapping[str, Morphology], *, contact: Contact | None
     }
     conclude = partial(_conclude, dict(pads), objects, settings)
     return Study("sensitivity", "Sensitivity to the object that presses", settings, tasks, conclude, _draw)
-
-
-def _values(contact: Contact) -> tuple[list[float], list[float]]:
-    """Return the sizes of the objects, and their depths or shapes."""
-    if contact.model == "shape":
-        return list(RADII), list(SIDES)
-    if contact.model != "layer":
-        raise InputError(f"[contact] model is {contact.model}, allowed are layer and shape: only they have a size")
-    depths_mm = [factor * contact.depth_mm for factor in FACTORS]
-    return [factor * contact.tool_radius_mm for factor in FACTORS], [d for d in depths_mm if d < contact.thickness_mm]
 
 
 def _name(contact: Contact) -> str:

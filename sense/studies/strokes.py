@@ -36,16 +36,7 @@ def strokes_study(
     options: LocalizerSettings | None = None,
     seed: int = 0,
 ) -> Study:
-    """Follow strokes by localizers that were trained on presses of the same simulated pads.
-
-    Args:
-        pads: the pads, by label.
-        contact: how they are pressed; `Contact()` if None.
-        presses: in the recording of the training.
-        strokes: of each speed.
-        options: of the training; the defaults if None.
-        seed: of every random choice.
-    """
+    """Follow `strokes` strokes of each speed by localizers trained on `presses` presses of the same simulated pads."""
     contact = contact or Contact()
     rig = RigSettings(presses=presses, seed=seed)
     options = (options or LocalizerSettings()).model_copy(update={"seed": seed})
@@ -73,7 +64,7 @@ def _follow_strokes(
         rng = np.random.default_rng([rig.seed, number])
         strokes = simulate_strokes(pad, rig, contact, speed, n_strokes, rng)
         recorded = strokes.recording
-        # As a command comes before its touch, which a stroke begins with.
+        # a command precedes the touch, with which a stroke begins
         down_command = recorded.down_command - round(TOUCH_DELAY_S * rig.rate_hz)
         predict = partial(_predict, model, recorded.readings, down_command, recorded.up_command)
         for reading in range(strokes.positions_mm.shape[1]):
@@ -102,7 +93,7 @@ def _conclude(labels: list[str], rig: RigSettings, states: list[State]) -> Study
     for label, state in zip(labels, states, strict=True):
         means = state["errors"].mean(axis=2)
         curves[label] = means.tolist()
-        settled = slice(means.shape[1] // 5, None)  # the first readings of a touch tell little of anything
+        settled = slice(means.shape[1] // 5, None)  # the first readings of a touch have little information
         for number, speed in enumerate(SPEEDS_MM_S):
             rows.append(
                 {

@@ -1,4 +1,4 @@
-"""Frame of all studies: tasks in parallel, results as table, figure and text, pads by name."""
+"""Common parts of all studies: tasks in parallel, results as table, figure and text, pads by name."""
 
 import csv
 import hashlib
@@ -34,13 +34,13 @@ NAMED = re.compile(r"(square|(optimised)|(random|optimised|genetic)-([1-9]\d?))(
 
 @dataclass(frozen=True)
 class Sizes:
-    """How many presses the networks of a study learn from and are tested on, and how large they are."""
+    """Numbers of training and test presses of a study, and sizes of its networks."""
 
     presses: int
     test: int
     hidden: int = 50  # neurons
     epochs: int = 200
-    members: int = 3  # of an ensemble: where training happens to end varies, and would hide what pads differ by
+    members: int = 3  # networks of an ensemble: errors of single ones vary by more than pads differ
 
 
 @dataclass(frozen=True)
@@ -68,8 +68,8 @@ class Study:
     title: str
     settings: dict[str, Any]  # all that its results depend on, as JSON
     tasks: Sequence[Task]
-    conclude: Callable[[list[State]], StudyResult]  # from the results of the tasks, in their order
-    draw: Callable[[Mapping[str, Any]], "Figure"]  # from the document
+    conclude: Callable[[list[State]], StudyResult]  # takes the results of the tasks, in their order
+    draw: Callable[[Mapping[str, Any]], "Figure"]  # takes the document
 
 
 def run(
@@ -80,17 +80,10 @@ def run(
     executor: Executor | None = None,
     on_progress: OnProgress = ignore_progress,
 ) -> dict[str, Any]:
-    """Run a study, and write NAME.json, NAME.csv, NAME.png and NAME.md.
+    """Run a study, write NAME.json, NAME.csv, NAME.png and NAME.md into the folder `out`, and return the document.
 
-    Args:
-        study: tasks and what is made of them.
-        out: folder.
-        jobs: parallel tasks; one a core, or as many as the executor has, if None.
-        executor: such as a cluster's; the threads of this machine if None.
-        on_progress: called with (tasks done, total, name of the last one).
-
-    Returns:
-        The document: "format", "title", "text", "rows", "settings", "provenance" and the result's `extra`.
+    Tasks run in `executor`, such as a cluster's, or else in threads; `jobs` at once, by default as many as there are
+    workers. `on_progress` is called with (tasks done, total, name of the last one).
 
     Raises:
         InputError: the folder cannot be written.
@@ -162,16 +155,14 @@ def _markdown(document: Mapping[str, Any], figure: str) -> str:
 def load_pads(names: Sequence[str], seed: int, layout: Layout = PUBLISHED_PAD.layout) -> dict[str, Morphology]:
     """Load or make pads, by the labels of tables and figures; raises InputError for unknown names and a label twice.
 
-    Args:
-        names: files, `square`, `random-N`, `optimised`, `optimised-N` or `genetic-N` (`square@8`: with a grid of 8).
-        seed: of random pads and searches.
-        layout: of pads without a file; one with another grid has its pitch.
+    A name is a file, `square`, `random-N`, `optimised`, `optimised-N` or `genetic-N` (`square@8`: with a grid of 8).
+    Pads without a file have the layout, or another grid with its pitch.
     """
     return _label([(name, *_load_pad(name, seed, layout)) for name in names])
 
 
 def load_recordings(names: Sequence[str]) -> dict[str, Recording]:
-    """Load recordings as `open_recording`, by label; raises InputError as it does, and for a label twice."""
+    """Load recordings by label; raises InputError as `open_recording`, and for a label twice."""
     from padforge.sense.formats.import_export import open_recording
 
     paths = [Path(name) for name in names]
@@ -180,7 +171,7 @@ def load_recordings(names: Sequence[str]) -> dict[str, Recording]:
 
 
 def _label(parts: Sequence[tuple[str, str, Any]]) -> dict[str, Any]:
-    """Return objects by label, from the user's names, labels and objects."""
+    """Return objects by label, from tuples of the user's name, label and object."""
     labelled: dict[str, Any] = {}
     for name, label, part in parts:
         # Matplotlib typesets mathematics between $, and leaves labels that begin with _ out of legends.
@@ -233,7 +224,7 @@ def describe_pads(pads: Mapping[str, Morphology]) -> dict[str, Any]:
 
 
 def read_counts(signals: Array, training: int, noise_counts: float, rng: np.random.Generator) -> Array:
-    """Read signals (Q, C) with a noisy 12-bit converter, in whole counts; a silent fibre reads its noise.
+    """Read signals (Q, C) with a noisy 12-bit converter, in whole counts; a fibre without signal reads noise.
 
     Full scale is the largest magnitude of a fibre's signal in the first `training` presses. Readings begin at 0 unless
     there are negative signals.
@@ -269,12 +260,12 @@ def classification_scores(confusions: Array) -> dict[str, float]:
 
 
 def failed_label(failed: Sequence[int]) -> str:
-    """Title of a result without some fibres."""
+    """Return the title of a result without some fibres."""
     return f"without {'+'.join(str(fibre + 1) for fibre in failed)}" if failed else "all fibres"
 
 
 def label_axes(axes: Any, title: str = "", grid: Literal["", "x", "y"] = "", **labels: Any) -> None:
-    """Set limits and labels of axes as `axes.set`, a title, and lines of a grid across one axis."""
+    """Set limits and labels as `axes.set`, a title, and grid lines across one axis."""
     axes.set(**labels)
     if title:
         axes.set_title(title, loc="left", color=INK, fontsize=10)

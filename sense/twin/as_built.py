@@ -27,8 +27,8 @@ N_ELEMENTS, N_COARSE = 160, 48  # elements of a fibre, and of one where wirings 
 FLAT_TOLERANCE = 1e-3  # tolerance of the polyline that elements lie on, grid units
 N_SPLINES = 12  # splines of a profile
 SPLINE_STEP = 0.48
-"""Their distance, as a share of the standard deviation of the Gaussian profile that fits best. A layer's strains go out
-to more than five of these; a profile that ends before makes a fit shrink the pad to reach as far."""
+"""Distance of these splines, as a share of the standard deviation of the Gaussian profile that fits best. Strains of a
+layer reach more than five standard deviations; a profile that ends before makes a fit shrink the pad to compensate."""
 N_OFFSET, N_SENSITIVITY = 12, 8  # splines of a fibre's lateral offset, for x and for y, and of its log-sensitivity
 N_SHARED, N_CHANNEL = 4 + 2 * N_SPLINES, 2 + 2 * N_OFFSET + N_SENSITIVITY
 """Parameters that all channels share (transform and two profiles), and those of each channel."""
@@ -199,7 +199,7 @@ class AsBuiltPad:
 
     @property
     def max_distance(self) -> float:
-        """Distance from which on a press is not felt, grid units."""
+        """Distance from which on a fibre does not respond to a press, grid units."""
         return (N_SPLINES + 1) * self.step
 
     @property
@@ -276,7 +276,7 @@ class AsBuiltPad:
         return pad
 
     def fit_gains(self, responses: Responses) -> "AsBuiltPad":
-        """Fit gains and rests alone, by linear least squares, so that a fit of all does not diverge."""
+        """Fit gains and rests alone, by linear least squares: a start from which a fit of all does not diverge."""
         values, volts = self.values.copy(), self.predict(responses.positions_mm)
         for channel, (gain, rest_v, *_) in enumerate(self.channel_values):
             valid = responses.valid[:, channel]

@@ -26,7 +26,7 @@ from padforge.sense.twin.responses import Responses
 PRIOR_STD = np.append(TRANSFORM_STD, [0.3, 0.5])
 """Prior standard deviations: those of the transform, of log `scale` (from the stated one) and of the share."""
 STEPS = np.array([0.01, 0.3, 0.3, 0.01, 0.02, 0.02])
-"""Steps of the differences by the same: elements are so long that the strains' edge makes shorter ones noisy."""
+"""Steps of the finite differences: with shorter ones the edge of the strains, which elements are long for, is noise."""
 BOUNDS = (math.log(0.1), 0.0), (math.log(10.0), 1.0)  # least and largest log `scale` and share, as in `[contact]`
 TOLERANCE = 1e-4  # relative change of the objective at which a fit has converged
 MAX_EVALUATIONS = 20
@@ -34,7 +34,7 @@ MAX_EVALUATIONS = 20
 
 @dataclass(frozen=True)
 class ContactFit:
-    """What presses say about a contact; `scale`, `squeeze` and `stretch` as in `[contact]`."""
+    """A contact fitted to presses; `scale`, `squeeze` and `stretch` as in `[contact]`."""
 
     scale: float
     squeeze: float  # squeeze + stretch is that of the stated contact, since gains take up any other
@@ -114,7 +114,7 @@ class _Signals:
     def __call__(self, values: Array, positions_mm: Array) -> Array:
         turn, *shift, plan_scale, log_scale, share = values.tolist()
         transform = PlanTransform(self._pad.mirrored, math.degrees(turn), (shift[0], shift[1]), plan_scale)
-        # a press that is wider is one on a pad that is smaller
+        # a wider press is the same as a smaller pad
         width = math.exp(log_scale)
         presses = np.ascontiguousarray(self._pad.plan.to_grid(transform.to_plan(positions_mm)) / width)
         signals = np.zeros((len(presses), len(self._channels)))

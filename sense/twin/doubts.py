@@ -12,16 +12,15 @@ MAX_UNEXPLAINED, MAX_UNEXPLAINED_MEAN = 0.10, 0.025
 """Share of the variance of held-out responses that a smooth function of the position may explain beyond the twin: of a
 channel, and mean over channels. From 250 presses of the right pad they are up to 0.08 and 0.02, if fibres bend much."""
 MAX_TURN_DEG, MIN_SCALE = 10.0, 0.8
-"""How far a pad may lie off a quarter turn, and its scale, or the inverse, be below 1: the plan of another pad is
-rotated and shrunk until it fits."""
+"""Largest rotation from a quarter turn, and smallest scale or inverse scale: the plan of another pad is rotated and
+shrunk until it fits."""
 MAX_OFFSET_MM, MAX_OFFSET = 3.0, 0.5
-"""How far a fibre may lie beside its plan, rms in mm and in grid units, whichever is less. Pads are laid to a
-millimetre or two, and beyond half a pitch the plan of another fibre is nearer."""
+"""Largest rms lateral offset of a fibre, in mm and in grid units, whichever is less. Fibres are laid to a millimetre or
+two, and beyond half a pitch the plan of another fibre is nearer."""
 SAME_PLAN_MM, LAID_MM = 1.0, 1.2
-"""How far apart, rms, two wirings plan the fibres of a pad that no press tells apart, and how far, rms, all fibres lie
-beside their plan at most: a fibre is laid to a millimetre. Straight fibres are planned where those of the pad turned
-over are, and the wiring is then as stated; but fibres that are not straight fit a straight plan eight ways alike, too.
-"""
+"""Two wirings are the same if all fibres lie within the second rms lateral offset of their plan, as laid fibres do, and
+the planned fibres within the first rms distance of each other. Straight fibres have one plan for the pad as it is and
+turned over, which no press tells apart. But fibres that are not straight fit a straight plan eight ways alike, too."""
 
 
 def find_doubts(result: Identification) -> list[str]:
@@ -80,7 +79,7 @@ def _other_wirings(result: Identification) -> Iterator[str]:
     built = result.fit.pad
     planned_mm = planned_paths_mm(built.plan, built.transform, built.fibres)
 
-    def apart_mm(other: Wiring) -> float:
+    def distance_mm(other: Wiring) -> float:
         paths_mm = planned_paths_mm(built.plan, other.transform, other.fibres)
         # a fibre may run either way
         squares = [((planned_mm - paths) ** 2).sum(axis=2).mean(axis=1) for paths in (paths_mm, paths_mm[:, ::-1])]
@@ -88,11 +87,11 @@ def _other_wirings(result: Identification) -> Iterator[str]:
 
     beside_mm = np.concatenate([offset[within] for offset, _, within in result.lateral_offsets_mm()])
     is_laid = np.sqrt((beside_mm**2).mean()) <= LAID_MM
-    others = [other for other in result.alternatives if not (is_laid and apart_mm(other) <= SAME_PLAN_MM)]
+    others = [other for other in result.alternatives if not (is_laid and distance_mm(other) <= SAME_PLAN_MM)]
     if not others:
         return
-    say = "pose or wiring explains" if len(others) == 1 else "poses or wirings explain"
-    yield f"{len(others)} other {say} the presses nearly as well"
+    explain = "pose or wiring explains" if len(others) == 1 else "poses or wirings explain"
+    yield f"{len(others)} other {explain} the presses nearly as well"
     for row, fibre in enumerate(built.fibres):
         if read := sorted({other.fibres[row] + 1 for other in others} - {fibre + 1}):
             fibres = " or ".join(map(str, read))

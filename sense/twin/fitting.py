@@ -1,7 +1,7 @@
 """Fit of an as-built pad to responses: maximum a posteriori by Levenberg-Marquardt, and the scatter of its residuals.
 
-Residuals are Gaussian with a standard deviation of each channel's own. A plan is right to a millimetre or so until
-presses say otherwise: lateral offsets and log-sensitivities are smooth Gaussian curves along each fibre, whose standard
+Residuals are Gaussian, with one standard deviation for each channel. The prior is that fibres lie within a millimetre
+or so of the plan: lateral offsets and log-sensitivities are smooth Gaussian curves along each fibre, whose standard
 deviations are estimated with everything else by maximum evidence (D. J. C. MacKay, Neural Computation 4, 1992).
 """
 
@@ -50,7 +50,7 @@ class Priors:
     lateral_offset_mm: float = 0.0
     log_sensitivity: float = 0.0
     angular: bool = False  # whether the response may depend on the angle between fibre and press
-    pose: bool = True  # whether the plan transform is fitted; else it stays
+    pose: bool = True  # whether the plan transform is fitted
 
     def free_mask(self, channels: int) -> Mask:
         """Return which of `AsBuiltPad.values` are fitted."""
@@ -94,7 +94,7 @@ def fit_as_built(
         block, change, proposal = hessian[np.ix_(free, free)], np.zeros(len(gradient)), None
         while proposal is None and damping < MAX_DAMPING:
             change[free] = cho_solve(cho_factor(block + damping * np.diag(np.diag(block))), gradient[free])
-            proposal = current.moved(change)
+            proposal = current.at_step(change)
             if proposal.value >= current.value:
                 damping, proposal = 4 * damping, None
         if proposal is None:
@@ -141,8 +141,8 @@ class _Objective:
         self._precision, self._deviation = self._prior()
         self.value = self._evaluate()
 
-    def moved(self, step: Array) -> "_Objective":
-        """Return the objective of the pad `step` further on."""
+    def at_step(self, step: Array) -> "_Objective":
+        """Return the objective of the pad with `step` added to its parameters."""
         pad = self.pad.with_values(self.pad.values + step)
         return _Objective(pad, self._responses, self.priors, self._noise_inflation, self.noise)
 
@@ -215,12 +215,12 @@ class _Objective:
 
 
 def estimate_scatter(pad: AsBuiltPad, responses: Responses, noise_v: Array) -> TwinScatter:
-    """Estimate which part of the scatter of responses grows with them.
+    """Estimate the part of the scatter of responses that grows with them.
 
-    Half the squared difference of the residuals of two neighbouring presses is their variance, whatever smooth
-    function of position is left in them: floor^2 + share^2 x^2 for responses x, a straight line over x^2. Where
-    channels share a part of it, products of their differences are common share^2 x_c x_c'. Too few presses give
-    constant noise. `noise_v` (C,) is the standard deviation of each channel's total scatter.
+    Half the squared difference of the residuals of two neighbouring presses is their variance, since a smooth function
+    of the position cancels: floor^2 + share^2 x^2 for responses x, a straight line over x^2. If channels have a part of
+    it in common, products of their differences are common share^2 x_c x_c'. Too few presses give constant noise.
+    `noise_v` (C,) is the standard deviation of each channel's total scatter.
     """
     valid = np.flatnonzero(responses.valid.all(axis=1))
     if len(valid) < 2 * MIN_PAIRS:
@@ -236,7 +236,7 @@ def estimate_scatter(pad: AsBuiltPad, responses: Responses, noise_v: Array) -> T
         weight = 1 / (floor + share * response.ravel() ** 2).clip(1e-3)
         design_matrix = np.column_stack([np.ones(response.size), response.ravel() ** 2])
         (floor, share), _ = nnls(weight[:, None] * design_matrix, weight * variance.ravel())
-    # where the variance grows otherwise than by its square, in all it is that of the noise
+    # scale the sum to the variance of the noise, from which it differs if variances do not grow with squares
     total = floor + share * float(np.mean(response**2))
     floor, share = (part / total if total > 0 else part for part in (floor, share))
     above = np.triu_indices(response.shape[1], 1)
@@ -252,7 +252,7 @@ def estimate_scatter(pad: AsBuiltPad, responses: Responses, noise_v: Array) -> T
 
 
 def gain_wander(pad: AsBuiltPad, responses: Responses) -> float:
-    """Estimate how far the gains of channels wander between blocks of presses in their order, beyond chance."""
+    """Estimate the standard deviation of gains between blocks of successive presses, beyond that by chance."""
     expected = pad.predict(responses.positions_mm) - pad.channel_values[:, 1]
     volts = np.where(responses.valid, responses.volts - pad.channel_values[:, 1], expected)
     blocks = len(volts) // WANDER_PRESSES

@@ -4,9 +4,9 @@
 2. Channels that respond to the position at all are live: a Gaussian process explains them better than noise.
 3. Wirings and poses are searched for on the plan; each of the best is fitted as built, and the most probable one taken.
 4. It is fitted to all presses, with an angular term if held-out presses ask for one.
-5. Presses are split into their parts, and each is fitted on the same paths; with it how presses take away what remains
-   of earlier ones, and how responses scatter.
-6. How wide a press is, and how much of it is stretch, is measured on its fibres by the layer it is believed to be.
+5. Presses are split into their parts, and each is fitted on the same paths; so are the removal of the residues of
+   earlier presses, and the scatter of responses.
+6. The width of a press, and its share of stretch, are measured by fitting the layer that it is believed to be.
 """
 
 from dataclasses import dataclass, replace
@@ -58,23 +58,24 @@ N_CANDIDATES, N_COMPARED = 4, 250
 """Wirings that are fitted beside the images of the best, and presses by which they are compared: residuals are
 correlated over about half a grid unit, so that more presses would count the same evidence twice."""
 LOG_ODDS_IN_ORDER, LOG_ODDS_POSE = 15.0, 4.0
-"""Prior log odds of channels in the order of the plan, and of a pad that lay as planned. Half of the belief in either
-among 6! wirings and 8 poses would be 7 and 2; they count twice, as presses do, whose residuals are correlated. They are
-less than MIN_LOG_ODDS together, so that a wiring that fits as well as the stated one is an alternative."""
-N_CONTACT = 400  # presses that a contact is fitted to, for the same reason
+"""Prior log odds of channels in the order of the plan, and of a pad that lay as planned. A belief of one half in the
+stated one of 6! wirings and of 8 poses has log odds of 7 and 2; they are doubled, as the evidence of presses, whose
+residuals are correlated, counts double. Their sum is less than MIN_LOG_ODDS, so that a wiring that fits as well as the
+stated one is an alternative."""
+N_CONTACT = 400  # presses that a contact is fitted to: the residuals of more are correlated
 FIRST_PRIORS = Priors(lateral_offset_mm=1.0, log_sensitivity=0.2)
 MIN_LOG_BAYES_FACTOR = 10.0  # from which on a channel is live
 MIN_LOG_ODDS = 20.0  # from which on another wiring is ruled out
 SAME_LOG_EVIDENCE = 1.0  # difference of log evidence below which two fits are equally good
 MIN_ANGULAR_GAIN = 0.01  # share of the variance of held-out responses that an angular term must explain
-MAP_STRIDE = 3  # every such node of the maps of residuals is kept: they change over several
+MAP_STRIDE = 3  # subsampling of the maps of residuals, which change over several nodes
 MIN_MATCH = 0.25
 """Share of the variance that the best wiring must explain on the plan, else the recording is of another pad."""
 
 
 @dataclass(frozen=True)
 class MeasuredContact:
-    """The contact that a pad was believed to be pressed by, against its presses."""
+    """Fits of the stated contact to the presses on a pad."""
 
     stated: Contact  # a layer, pressed as deep as the recording says if it does
     as_built: ContactFit  # of the fibres as built, which a profile without direction was fitted with
@@ -83,7 +84,7 @@ class MeasuredContact:
 
     @property
     def best(self) -> ContactFit:
-        """The fit that explains more: fibres as built fit their profile, planned ones do not fit what deviates."""
+        """The fit that explains more: paths as built were fitted with another profile, planned ones do not deviate."""
         return max(self.as_built, self.on_plan, key=lambda fit: fit.explained)
 
 
@@ -109,9 +110,9 @@ class Identification:
     held_out: Responses
 
     def lateral_offsets_mm(self) -> list[tuple[Array, Array, Mask]]:
-        """Compute how far each live channel's fibre lies to the left of its plan.
+        """Compute for each live channel the lateral offset of its fibre from the plan, to the left, mm.
 
-        Returned are, for each, offset and standard deviation (F,) of its elements, mm, and a mask of those pressed.
+        Returned are the offset of each element (F,), its standard deviation, and a mask of the pressed elements.
         """
         built, unit_mm = self.fit.pad, self.pad.unit_mm
         pressed = built.plan.to_grid(built.transform.to_plan(self.training.positions_mm))
@@ -128,64 +129,52 @@ class Identification:
     @property
     def twin(self) -> Twin:
         """The pad as a twin, without provenance."""
-        built, unit_mm = self.fit.pad, self.pad.unit_mm
+        built = self.fit.pad
+        response = self._part(built)
         paths_mm: list[Array | None] = [None] * len(self.pad.knots)
-        sensitivities: list[Array | None] = list(paths_mm)
         channels = [TwinChannel(c, None, 0.0, float(noise_v), 0.0) for c, noise_v in enumerate(self.noise_v)]
-        fibre_lengths = lengths(self.pad)
         for row, channel in enumerate(self.live.tolist()):
-            path, sensitivity = built.path(row)
-            fibre, mean = built.fibres[row], sensitivity.mean()
+            fibre, path = built.fibres[row], built.path(row)[0]
             ends = [1.5 * path[:1] - 0.5 * path[1:2], (path[1:] + path[:-1]) / 2, 1.5 * path[-1:] - 0.5 * path[-2:-1]]
-            paths_mm[fibre], sensitivities[fibre] = self.pad.to_mm(np.vstack(ends)), sensitivity / mean
-            gain_v = float(built.channel_values[row, 0] * mean * fibre_lengths[fibre])
-            explained = float(self.explained[row])
+            paths_mm[fibre] = self.pad.to_mm(np.vstack(ends))
+            gain_v, explained = float(response.gains_v[channel]), float(self.explained[row])
             channels[channel] = replace(channels[channel], fibre=fibre, gain_v=gain_v, explained=explained)
-        parts = {name: self._part(fit.pad, len(channels)) for name, fit in self.parts.items()}
-        distance, weight, angular_weight = _sample_profile(built)
         pressed = built.transform.to_plan(self.training.positions_mm)
         return Twin(
             morphology=self.pad,
             channels=tuple(channels),
             frame=built.transform,
-            distance_mm=distance * unit_mm,
-            weight=weight,
+            distance_mm=response.distance_mm,
+            weight=response.weight,
             as_built_mm=tuple(paths_mm),
             noise=self.noise,
             sensed_mm=tuple(np.ptp(pressed, axis=0).tolist()),
             presses=len(self.training),
-            angular_weight=angular_weight,
-            sensitivity=tuple(sensitivities),
+            angular_weight=response.angular_weight,
+            sensitivity=response.sensitivity,
             readings=self.readings,
             scatter=self.scatter,
-            parts=parts,
+            parts={name: self._part(fit.pad) for name, fit in self.parts.items()},
             residual=self.residual,
         )
 
-    def _part(self, built: AsBuiltPad, channels: int) -> TwinPart:
-        """Return a part of a press, of a pad whose fibres lie as those of `fit`."""
+    def _part(self, built: AsBuiltPad) -> TwinPart:
+        """Return the response of the pad to a press, or to a part of one."""
         sensitivities: list[Array | None] = [None] * len(self.pad.knots)
-        gains_v = np.zeros(channels)
+        gains_v, fibre_lengths = np.zeros(len(self.noise_v)), lengths(self.pad)
         for row, channel in enumerate(self.live.tolist()):
             fibre, sensitivity = built.fibres[row], built.path(row)[1]
             sensitivities[fibre] = sensitivity / sensitivity.mean()
-            gains_v[channel] = built.channel_values[row, 0] * sensitivity.mean() * lengths(self.pad)[fibre]
-        distance, weight, angular_weight = _sample_profile(built)
-        return TwinPart(distance * self.pad.unit_mm, weight, gains_v, angular_weight, tuple(sensitivities))
-
-
-def _sample_profile(pad: AsBuiltPad) -> tuple[Array, Array, Array | None]:
-    """Return distances (PROFILE_POINTS,), grid units, up to where weights are negligible, and w and v there.
-
-    v is None where the response does not depend on the angle.
-    """
-    fine = np.linspace(0, pad.max_distance, 400)
-    felt = np.flatnonzero(np.abs(pad.profile(fine)).max(axis=0) > MIN_WEIGHT)
-    distance = np.linspace(0, min(fine[felt[-1]] * (1 + 1 / PROFILE_POINTS), pad.max_distance), PROFILE_POINTS)
-    weights = pad.profile(distance)
-    weights[:, -1] = 0.0
-    weight, angular_weight = weights / np.abs(weights[0]).max()
-    return distance, weight, angular_weight if angular_weight.any() else None
+            gains_v[channel] = built.channel_values[row, 0] * sensitivity.mean() * fibre_lengths[fibre]
+        # the profile, up to where its weights are negligible
+        fine = np.linspace(0, built.max_distance, 400)
+        end = fine[np.flatnonzero(np.abs(built.profile(fine)).max(axis=0) > MIN_WEIGHT)[-1]]
+        distance = np.linspace(0, min(end * (1 + 1 / PROFILE_POINTS), built.max_distance), PROFILE_POINTS)
+        weights = built.profile(distance)
+        weights[:, -1] = 0.0
+        weight, angular_weight = weights / np.abs(weights[0]).max()
+        angular = angular_weight if angular_weight.any() else None
+        return TwinPart(distance * self.pad.unit_mm, weight, gains_v, angular, tuple(sensitivities))
 
 
 def identify(
@@ -200,9 +189,10 @@ def identify(
     Args:
         recording: presses at known positions over most of the pad; of several depths, the most common one is used.
         pad: as planned.
-        contact: what the pad is believed to be pressed by; `Contact()` if None. The twin does not depend on it.
-        seed: of what is drawn.
-        on_progress: called with (steps done, total, what is being done).
+        contact: the contact by which the pad is believed to be pressed; `Contact()` if None. The twin does not depend
+            on it.
+        seed: of the random split and samples of presses.
+        on_progress: called with (steps done, total, name of the stage).
 
     Returns:
         The twin, without provenance.
@@ -246,8 +236,7 @@ def identify_pad(
         raise InputError(
             f"{len(live)} channels of the recording respond to presses, the pad has {len(pad.knots)} fibres"
         )
-    held_out_rows = np.flatnonzero(held_out_mask)
-    training, held_out = responses.select(rows, live), responses.select(held_out_rows, live)
+    training, held_out = responses.select(rows, live), responses.select(np.flatnonzero(held_out_mask), live)
     compared = training.select(np.arange(min(N_COMPARED, len(training))))
 
     # 3. Wiring
@@ -271,7 +260,7 @@ def identify_pad(
 
     # 6. Contact
     on_plan = replace(best.on_plan.pad, plan=plan)
-    measured = _measure_contact(_as_deep(contact, recording), fit.pad, on_plan, training, held_out)
+    measured = _measure_contact(contact, recording, fit.pad, on_plan, training, held_out)
     noise_v = np.nan_to_num(noise_v)
     held = parts["held"].pad if parts else fit.pad
     noise_v[live] = estimate_noise(held.residuals(pressed), pad.unit_mm)
@@ -279,13 +268,15 @@ def identify_pad(
     if readings:  # which contains that of gains that wander
         scatter = replace(scatter, share=float(np.sqrt(max(scatter.share**2 - readings.gain_wander**2, 0))))
     smooth = np.column_stack([gps[channel].predict(held_out.positions_mm / pad.unit_mm) for channel in live])
+    likeliest_on_plan = max((candidate.on_plan for candidate in candidates), key=lambda fit: fit.log_evidence)
+    planned = fit_as_built(replace(likeliest_on_plan.pad, plan=plan), training, Priors()).pad
     full_scale_v = np.abs(fit.pad.predict(training.positions_mm) - fit.pad.channel_values[:, 1]).max(axis=0)
     return Identification(
         pad=pad,
         fit=fit,
         live=live,
         explained=held_out.explained_variance(fit.pad.predict(held_out.positions_mm)),
-        explained_on_plan=_explained_on_plan(candidates, plan, training, held_out),
+        explained_on_plan=float(held_out.explained_variance(planned.predict(held_out.positions_mm)).mean()),
         explained_smooth=held_out.explained_variance(smooth),
         noise_v=noise_v,
         noise=float(noise_v[live].mean() / full_scale_v.mean()),
@@ -332,11 +323,6 @@ class _FittedWiring:
         """Logarithm of its probability, up to a constant."""
         return self.fit.log_evidence + self.log_prior
 
-    @property
-    def turn_deg(self) -> float:
-        """How far the pad lay turned, from 0 to 180."""
-        return abs(self.fit.pad.transform.turn_deg)
-
 
 def _fit_candidates(
     plan: PadPlan,
@@ -359,10 +345,8 @@ def _fit_candidates(
             as_built = fit_as_built(on_plan.pad, compared, FIRST_PRIORS)
             is_unturned = not wiring.transform.mirrored and abs(as_built.pad.transform.turn_deg) < 45
             log_prior = LOG_ODDS_IN_ORDER * (wiring.fibres == tuple(live.tolist())) + LOG_ODDS_POSE * is_unturned
-            key, candidate = (
-                (wiring.transform.mirrored, wiring.fibres),
-                _FittedWiring(wiring, on_plan, as_built, log_prior),
-            )
+            key = wiring.transform.mirrored, wiring.fibres
+            candidate = _FittedWiring(wiring, on_plan, as_built, log_prior)
             if key not in candidates or candidates[key].log_posterior < candidate.log_posterior:
                 candidates[key] = candidate
         return max(candidates.values(), key=lambda candidate: candidate.log_posterior)
@@ -385,18 +369,9 @@ def _fit_candidates(
 
     def rank(candidate: _FittedWiring) -> tuple[float, float]:
         is_best = candidate.log_posterior > best.log_posterior - SAME_LOG_EVIDENCE
-        return candidate.turn_deg if is_best else 360.0, -candidate.log_posterior
+        return abs(candidate.fit.pad.transform.turn_deg) if is_best else 360.0, -candidate.log_posterior
 
     return sorted(candidates.values(), key=rank)
-
-
-def _explained_on_plan(
-    candidates: list[_FittedWiring], plan: PadPlan, training: Responses, held_out: Responses
-) -> float:
-    """Return the mean explained variance of the most probable pad that lies on its plan, fitted to all presses."""
-    best = max((candidate.on_plan for candidate in candidates), key=lambda fit: fit.log_evidence)
-    pad = fit_as_built(replace(best.pad, plan=plan), training, Priors()).pad
-    return float(held_out.explained_variance(pad.predict(held_out.positions_mm)).mean())
 
 
 def _fit_all(pad: AsBuiltPad, training: Responses, on_progress: OnProgress) -> AsBuiltFit:
@@ -425,23 +400,24 @@ def _noise_inflation(pad: AsBuiltPad, responses: Responses) -> Array:
     return np.sqrt((noise_var + systematic_var * repeats) / (noise_var + systematic_var))
 
 
-def _as_deep(contact: Contact, recording: Recording) -> Contact | None:
-    """Return a layer pressed as deep as a recording says, if it does; None if that cannot be, or it is no layer."""
+def _measure_contact(
+    contact: Contact,
+    recording: Recording,
+    as_built: AsBuiltPad,
+    on_plan: AsBuiltPad,
+    training: Responses,
+    held_out: Responses,
+) -> MeasuredContact | None:
+    """Fit a layer to a pad as built, and for comparison to the pad as planned, as well as a Gaussian.
+
+    The layer is pressed as deep as the recording says, if it does. None if it is thinner, or the contact is no layer.
+    """
     depths_mm = recording.actual_depths_mm[recording.has_position]
     depths_mm = depths_mm[depths_mm > 0]
     depth_mm = float(np.median(depths_mm)) if len(depths_mm) else contact.depth_mm
     if contact.model != "layer" or depth_mm >= contact.thickness_mm:
         return None
-    return contact.model_copy(update={"depth_mm": depth_mm})
-
-
-def _measure_contact(
-    contact: Contact | None, as_built: AsBuiltPad, on_plan: AsBuiltPad, training: Responses, held_out: Responses
-) -> MeasuredContact | None:
-    """Fit a layer to a pad as built, and for comparison to the pad as planned, as well as a Gaussian."""
-    if contact is None:
-        return None
-
+    contact = contact.model_copy(update={"depth_mm": depth_mm})
     training = training.select(np.arange(min(N_CONTACT, len(training))))
 
     def fit(pad: AsBuiltPad, contact: Contact) -> ContactFit:
@@ -457,7 +433,7 @@ def _measure_contact(
 
 
 def _fit_part(fit: AsBuiltFit, training: Responses) -> AsBuiltFit:
-    """Fit a part of a press, to which the fibres lie where they do to the response."""
+    """Fit a part of a press to fibres that lie where the fit of the response has put them."""
     start = fit.pad.fit_gains(training)
     priors = replace(fit.priors, lateral_offset_mm=0.0, pose=False)
     return fit_as_built(start, training, priors, _noise_inflation(start, training))
@@ -466,13 +442,13 @@ def _fit_part(fit: AsBuiltFit, training: Responses) -> AsBuiltFit:
 def _residual_maps(
     parts: PressParts[Responses], fits: dict[str, AsBuiltFit], live: Indices, training: Mask
 ) -> TwinResidual:
-    """Return the smooth function of the position that is left in the parts of presses."""
+    """Return the smooth function of the position in the residuals of the parts of presses."""
     positions, middle_mm, half_mm = normalize(parts.held.positions_mm)
     valid = parts.held.valid[training][:, live]
     residuals = []
     for name, fit in fits.items():
         part: Responses = getattr(parts, name)
-        # what they are far from any fibre counts to it
+        # without the rest of the channel, so that the response far from any fibre belongs to the residual
         stretched = fit.pad.predict(part.positions_mm[training]) - fit.pad.channel_values[:, 1]
         residuals.append(part.volts[training][:, live] - stretched)
     maps = smooth_maps(positions[training], np.stack(residuals, axis=2), valid)[::MAP_STRIDE, ::MAP_STRIDE]

@@ -1,9 +1,10 @@
-"""The parts of each press (held response, onset, creep, what remains), separated by how they show in its windows.
+"""Separation of each press into its parts: held response, onset, creep, and the residue that it leaves behind.
 
-The windows of a press are linear in its four parts, and in what it takes away of the residues of earlier presses; how
-each shows in them follows from the viscoelastic model by which presses are simulated. What is taken away follows from
-what remained of those presses, so both are estimated in turn. Two presses at nearly the same place differ by it alone:
-so the share that is taken away, and the distance over which, are those by which such pairs differ least.
+The windows of a press are linear in its four parts, and in the residues of earlier presses that it removes; the kernels
+by which each shows in them follow from the viscoelastic model that presses are simulated by. Removed residues depend on
+those that earlier presses left, so parts and removed residues are estimated in turn. Two presses at nearly the same
+position differ by removed residues alone: the share that a press removes, and the distance over which it does, are
+those that make such pairs most alike.
 """
 
 from dataclasses import dataclass
@@ -30,27 +31,18 @@ from padforge.sense.simulation.pad_model import (
 from padforge.sense.simulation.residual_indentation import replaced_residues
 from padforge.sense.twin.responses import Responses, near_pairs, normalize
 
-N_ROUNDS = 3
-"""Times that parts and what is taken away are estimated in turn."""
-HELD = 0.9
-"""Share of the held response from which on a window shows it."""
-DELAYS = 5
-"""Delays over their range that the windows are averaged over."""
+N_ROUNDS = 3  # times that parts and removed residues are estimated in turn
+HELD = 0.9  # share of the held response from which on a window shows it
+DELAYS = 5  # delays over their range that the windows are averaged over
 BOUNDS = {"memory": (0.0, 1.0), "memory_mm": (1.0, 30.0), "hysteresis_s": (2.0, 100.0)}
-"""Of what is fitted to pairs of presses, settings of `[rig]`."""
-MAX_TOUCH_S = 1.0
-"""Largest `touch_s` of `[rig]`, of a recording of readings that are longer apart."""
-SINGLE = 5
-"""Windows of the touch that are one reading long."""
-FIRST_MEMORY, FIRST_MEMORY_MM = 0.7, 9.0
-"""Values from which that search starts."""
-N_SEARCHED, MAX_EVALUATIONS = 1500, 40
-"""Presses that it looks at, the last ones, and values that it tries in each round."""
+"""Bounds of the settings of `[rig]` that are fitted to pairs of presses."""
+SINGLE = 5  # windows of the touch that are one reading long
+N_SEARCHED, MAX_EVALUATIONS = 1500, 40  # presses of that fit, the last ones, and its evaluations in each round
 
 
 @dataclass(frozen=True)
 class SplitPresses:
-    """Parts of Q presses in all channels, without what they take away of earlier residues."""
+    """Parts of Q presses in all channels, without the earlier residues that they remove."""
 
     parts: PressParts[Responses]
     pressed: Responses  # mean while the probe rests in the silicone
@@ -72,9 +64,10 @@ def split_presses(recording: Recording, training: Mask, hysteresis_s: float) -> 
     cycle = Cycle(2 * int(np.median(up - down)), recording.rate_hz)
 
     def smoothed(windows: Array) -> Array:
-        return interpolate(smooth_maps(positions[training], windows[training], valid[training]), positions)
+        maps = smooth_maps(positions[training], windows[training], valid[training])
+        return interpolate_grid(maps.reshape(*maps.shape[:2], -1), positions).reshape(windows.shape)
 
-    rig = RigSettings(hysteresis_s=hysteresis_s, memory=FIRST_MEMORY, memory_mm=FIRST_MEMORY_MM)
+    rig = RigSettings(hysteresis_s=hysteresis_s, memory=0.7, memory_mm=9.0)  # where the fit of the memory starts
     kernels, replaced, parts = part_kernels(cycle, rig), np.zeros(valid.shape), np.empty((4, *valid.shape))
     is_held = kernels[0] >= min(HELD, kernels[0].max())
     pressed = timed[:, :, is_held].mean(axis=2)
@@ -89,15 +82,17 @@ def split_presses(recording: Recording, training: Mask, hysteresis_s: float) -> 
         replaced, kernels = replaced_residues(*presses, rig), part_kernels(cycle, rig)
     pressed = pressed - kernels[4, is_held].mean() * replaced
     held, onset, creep, after = (Responses(positions_mm, part, valid) for part in parts)
-    touch_s = min(_surface_s(positions_mm, timed, is_held) / recording.rate_hz, MAX_TOUCH_S)
+    # at most the greatest value of `[rig]`, which readings that are far apart would exceed
+    touch_s = min(_touch_std(positions_mm, timed, is_held) / recording.rate_hz, 1.0)
     fitted = {name: getattr(rig, name) for name in BOUNDS} | {"touch_s": touch_s}
     return SplitPresses(PressParts(held, onset, creep, after), Responses(positions_mm, pressed, valid), fitted)
 
 
-def _surface_s(positions_mm: Array, windows: Array, is_held: Mask) -> float:
-    """Return how far the time of the touch varies over the pad, standard deviation in readings.
+def _touch_std(positions_mm: Array, windows: Array, is_held: Mask) -> float:
+    """Return the standard deviation over the pad of the time of the touch, in readings.
 
-    It is when the channel that responds most reaches half of its response: what varies less between neighbours.
+    The touch is when the channel that responds most reaches half of its response. The variance between neighbouring
+    presses, which is noise, is subtracted.
     """
     held = windows[:, :, is_held].mean(axis=2)
     rows = np.arange(len(windows))
@@ -114,7 +109,7 @@ def _surface_s(positions_mm: Array, windows: Array, is_held: Mask) -> float:
 
 
 def _fit_memory(presses: tuple[Array, ...], pressed: Array, training: Mask, rig: RigSettings) -> RigSettings:
-    """Fit how presses, as in `replaced_residues`, take away residues, by responses (Q, C) at nearly the same place."""
+    """Fit how presses, as in `replaced_residues`, remove residues, by responses (Q, C) at nearly the same position."""
     last = slice(-N_SEARCHED, None)
     positions_mm, touch_s, release_s, residues, held = (values[last] for values in presses)
     rows = np.flatnonzero(training[last])
@@ -123,21 +118,22 @@ def _fit_memory(presses: tuple[Array, ...], pressed: Array, training: Mask, rig:
     scale = np.array([0.2, 2.0, 0.2 * rig.hysteresis_s])
     start = np.array([getattr(rig, name) for name in BOUNDS])
 
-    def at(values: Array) -> RigSettings:
+    def to_settings(values: Array) -> RigSettings:
         return rig.model_copy(update=dict(zip(BOUNDS, np.clip(values, low, high).tolist(), strict=True)))
 
     def misfit(values: Array) -> float:
-        residual = pressed[last] - replaced_residues(positions_mm, touch_s, release_s, residues, held, at(values))
+        removed = replaced_residues(positions_mm, touch_s, release_s, residues, held, to_settings(values))
+        residual = pressed[last] - removed
         squares = np.square(residual[first] - residual[second]).mean(axis=0)
         return float(np.log(np.maximum(squares, MIN_SCALE_V**2)).sum())
 
     simplex = np.vstack([start, start - np.diag(scale * np.where(start - scale > low, 1, -1))])
     options = {"maxfev": MAX_EVALUATIONS, "initial_simplex": simplex, "xatol": np.inf, "fatol": 1e-3}
-    return at(minimize(misfit, start, method="Nelder-Mead", options=options).x)
+    return to_settings(minimize(misfit, start, method="Nelder-Mead", options=options).x)
 
 
 def part_kernels(cycle: Cycle, rig: RigSettings) -> Array:
-    """Compute how 1 V of each part, and of what is taken away, shows in the windows of a press; shape (5, F)."""
+    """Compute the windows of a press by 1 V of each part, and of removed residues; shape (5, F)."""
     unit, out = np.zeros((5, 2, 5)), []
     unit[:, 0] = np.eye(5)
     share = (np.arange(DELAYS) + 0.5) / DELAYS
@@ -156,11 +152,6 @@ def part_kernels(cycle: Cycle, rig: RigSettings) -> Array:
 def smooth_maps(positions: Array, windows: Array, valid: Mask) -> Array:
     """Fit smooth functions of the position, within [-1, 1], to windows (Q, C, F); on a grid (S, S, C, F)."""
     return ResponseModel.fit(positions, windows, np.empty((*windows.shape[:2], 0)), valid).table
-
-
-def interpolate(maps: Array, positions: Array) -> Array:
-    """Interpolate maps (S, S, C, F) at positions (Q, 2); shape (Q, C, F)."""
-    return interpolate_grid(maps.reshape(*maps.shape[:2], -1), positions).reshape(len(positions), *maps.shape[2:])
 
 
 def _split(windows: Array, residual: Array, kernels: Array) -> Array:

@@ -1,7 +1,7 @@
 """Search for the wiring and pose of a pad: which fibre each channel reads, and how the pad lay under the arm.
 
 Transforms on a grid are tried, each scored by correlations of responses with those of a Gaussian profile on the plan,
-and the best are refined. Where fibres run nearly straight, correlations may miss the right one. It is then one of the
+and the best are refined. If fibres run nearly straight, correlations may miss the right one. It is then one of the
 `images` of the best by the symmetries of straight fibres, or the one that is `as_stated`.
 """
 
@@ -126,9 +126,9 @@ def _centred(transform: PlanTransform, responses: Responses, unit_mm: float) -> 
 
 
 def images(wiring: Wiring, layout: Layout) -> list[Wiring]:
-    """Return the other wirings by which a pad of straight fibres would respond as by this one.
+    """Return the other wirings under which a pad of straight fibres would respond alike.
 
-    They are those of the pad mirrored, turned by half, or by quarters if it is square.
+    These are the wirings of the pad mirrored, rotated by 180 degrees, or by 90 if it is square.
     """
     middles_mm = (layout.levels - np.repeat(layout.extent[::-1], layout.counts) / 2) * layout.unit_mm
     families = np.repeat([0, 1], layout.counts)
@@ -150,9 +150,9 @@ def images(wiring: Wiring, layout: Layout) -> list[Wiring]:
 
 
 def planned_paths_mm(plan: PadPlan, transform: PlanTransform, fibres: tuple[int, ...]) -> Array:
-    """Return where the fibres that channels read were planned under the arm (C, E, 2), mm from the middle of the pad.
+    """Return the planned paths (C, E, 2) of the fibres that channels read, mm from the middle of the pad under the arm.
 
-    The pad is taken to have lain in whole quarter turns, so that poses which differ as plans do not are the same.
+    Shift and scale are omitted and rotations rounded to quarter turns, so that poses which differ by less are the same.
     """
     mirrored, turn_deg = transform.mirrored, 90.0 * round(transform.turn_deg / 90)
     from_plan = PlanTransform(mirrored, turn_deg if mirrored else -turn_deg)  # the inverse of such a transform
@@ -161,7 +161,6 @@ def planned_paths_mm(plan: PadPlan, transform: PlanTransform, fibres: tuple[int,
 
 
 def _refine(scorer: _Scorer, wiring: Wiring, unit_mm: float) -> Wiring:
-    """Return the best wiring near one."""
     start, unit = wiring.transform, FIRST_STEPS * [1, unit_mm, unit_mm, 1, 1]
 
     def evaluate(change: Array) -> Wiring:
