@@ -1,12 +1,11 @@
 """Recordings from and to bags of ROS 2: bags that `export_bag` wrote, and any others by a mapping of their topics.
 
-The library rosbags reads and writes them. A file without its end is refused; `ros2 bag reindex` and `mcap recover`
-repair it.
+The library rosbags reads and writes them. A file without its end is refused; `ros2 bag reindex` or `mcap recover`
+repairs it.
 """
 
 import re
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
 from heapq import merge
@@ -19,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from padforge.common.files import UNFINISHED, atomic_files, check_file, reraise_write_error
-from padforge.common.validation import InputError, short_repr
+from padforge.common.validation import InputError, naming_file, short_repr
 from padforge.sense.arrays import MAX_BYTES, Array, Indices, check_numbers
 from padforge.sense.formats import ros_messages
 from padforge.sense.formats.annotations import ModelAnnotations, check_export
@@ -32,7 +31,6 @@ from padforge.sense.formats.columns import (
     join_names,
     match_columns,
     matches,
-    naming_file,
     order_notes,
     parse_columns,
 )
@@ -56,9 +54,7 @@ from padforge.sense.recording.recording import NOTE, Recording
 from padforge.sense.recording.run_directory import STATE_COLUMNS
 
 SUFFIXES = (".mcap", ".db3", ".bag")
-METADATA = "metadata.yaml"
-"""The file that makes a folder a rosbag2 bag."""
-
+METADATA = "metadata.yaml"  # a folder with this file is a rosbag2 bag
 QUANTITIES = ("fibres", "positions", "x", "y", "depth", "reached", "force", "press")
 """Quantities that topics may hold."""
 _NUMBERS = ("Float32", "Float64", "Int8", "Int16", "Int32", "Int64", "UInt8", "UInt16", "UInt32", "UInt64")
@@ -86,24 +82,21 @@ _TYPES: dict[str, Mapping[str, tuple[str, ...]]] = {
     "force": _FORCES | _SCALARS,
     "press": {"std_msgs/msg/Bool": ("data",)},
 }
-"""Types of messages that may hold a quantity, and the paths of its numbers in them."""
+"""Types of messages that may contain a quantity, and the paths of its numbers in them."""
 _Arrays = list[tuple[ColumnEntry, NDArray[Any]]]
 
 
 class BagContent(NamedTuple):
-    """The topics of a bag that were asked for and have messages, and the types of all topics, by name."""
+    """Content of a bag, by the names of topics."""
 
-    topics: dict[str, RawMessages]
-    types: dict[str, str]
+    topics: dict[str, RawMessages]  # requested topics that have messages
+    types: dict[str, str]  # types of all topics
 
 
 def read_bag(path: Path, is_wanted: Callable[[str], bool], limit: int | None = None) -> BagContent:
-    """Read messages of a bag: a file of `SUFFIXES`, or a folder of such with METADATA.
+    """Read the messages of the topics of a bag for which `is_wanted` is true, at most `limit` of each topic.
 
-    Args:
-        path: of the file or folder.
-        is_wanted: whether a topic is asked for, by its name.
-        limit: number of messages that are read of a topic; by default all.
+    A bag is a file of `SUFFIXES`, or a folder of such files with METADATA.
     """
     from rosbags.highlevel import AnyReader
 
@@ -111,13 +104,13 @@ def read_bag(path: Path, is_wanted: Callable[[str], bool], limit: int | None = N
         check_file(path, MAX_BYTES)
     topics = dict[str, RawMessages]()
     store = load_typestore(f"{path}: a bag of ROS")
-    with _one_line_errors(path), AnyReader([path], default_typestore=store) as reader:
-        types = {connection.topic: connection.msgtype for connection in reader.connections}
-        store = reader.typestore  # of the bag's own definitions
-        deserialize = store.deserialize_cdr if reader.is2 else store.deserialize_ros1
-        # None at all would be all topics.
-        if wanted := [connection for connection in reader.connections if is_wanted(connection.topic)]:
-            for connection, stamp, message in reader.messages(wanted):
+    try:
+        with AnyReader([path], default_typestore=store) as reader:
+            types = {connection.topic: connection.msgtype for connection in reader.connections}
+            store = reader.typestore  # has the definitions in the bag
+            deserialize = store.deserialize_cdr if reader.is2 else store.deserialize_ros1
+            wanted = [connection for connection in reader.connections if is_wanted(connection.topic)]
+            for connection, stamp, message in reader.messages(wanted) if wanted else ():  # [] would be all topics
                 if connection.topic not in topics:
                     decode = partial(deserialize, typename=connection.msgtype)
                     topics[connection.topic] = RawMessages(connection.msgtype, decode, [], [])
@@ -125,18 +118,12 @@ def read_bag(path: Path, is_wanted: Callable[[str], bool], limit: int | None = N
                 if limit is None or len(topic.stamps) < limit:
                     topic.stamps.append(stamp)
                     topic.messages.append(bytes(message))
-    return BagContent(topics, types)
-
-
-@contextmanager
-def _one_line_errors(path: Path) -> Iterator[None]:
-    try:
-        yield
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror or error})") from error
     except Exception as error:  # rosbags raises many kinds on files that are cut off
         reason = " ".join(f"{error or type(error).__name__}".replace(str(path), path.name).split())[:200]
         raise InputError(f"{path}: no bag, or cut off or damaged ({reason})") from error
+    return BagContent(topics, types)
 
 
 def import_bag(path: str | Path, columns: str = "", presses: Arrays = ()) -> Recording:
@@ -144,15 +131,15 @@ def import_bag(path: str | Path, columns: str = "", presses: Arrays = ()) -> Rec
 
     Args:
         path: file of `SUFFIXES`, or rosbag2 folder.
-        columns: topics of each quantity, as `fibres=/skin/readings,positions=/probe,force=/wrench`, or fields of their
-            messages, as `fibres=/synced.measurements.data`; times are those at which messages were logged, a press or
-            position holds until the next message, and positions without a unit are m. Without it, the bag is one that
-            `export_bag` wrote.
-        presses: of a table of their own, as `read_presses` returns them.
+        columns: mapping of topics, such as `fibres=/skin/readings,positions=/probe,force=/wrench`, or of fields of
+            their messages, such as `fibres=/synced.measurements.data`; times are those at which messages were logged, a
+            press or position holds until the next message, and positions are in m by default. Without it, the bag is
+            one that `export_bag` wrote.
+        presses: presses from a separate table, see `read_presses`.
     """
     path, columns = check_import(path, columns)
     load_typestore(f"{path}: a bag of ROS")
-    with np.errstate(all="ignore"):  # damaged numbers are refused afterwards
+    with np.errstate(all="ignore"):  # damaged numbers are refused later
         if columns:
             return _import_mapped(path, columns, presses)
         check_no_presses(path, presses)
@@ -160,7 +147,7 @@ def import_bag(path: str | Path, columns: str = "", presses: Arrays = ()) -> Rec
 
 
 def _import_exported(path: Path) -> Recording:
-    """Read a bag that was exported: exactly as it was if all messages still agree, else as the messages say."""
+    """Read an exported bag: the exact recording if all messages agree with it, otherwise that of the messages."""
     number_topics = (READINGS, PRESSED, PLACE, REACHED, FORCE)
     raw, types = read_bag(path, {*number_topics, RECORDING}.__contains__)
     if READINGS not in raw:
@@ -184,7 +171,7 @@ def _import_exported(path: Path) -> Recording:
 
 
 def _restore(text: str, topics: Mapping[str, TopicSeries]) -> Recording | None:
-    """Return the exact recording of the text in a bag; None if its messages say something else."""
+    """Return the exact recording in the text of a bag; None if its messages differ from it."""
     restored = ros_messages.from_text(text, topics[READINGS].values)
     if restored is None:
         return None
@@ -198,7 +185,7 @@ def _restore(text: str, topics: Mapping[str, TopicSeries]) -> Recording | None:
 
 
 def _to_arrays(topics: Mapping[str, TopicSeries]) -> _Arrays:
-    """Return what the messages of an exported bag say by themselves."""
+    """Return the arrays in the messages of an exported bag, for `assemble_recording`."""
     stamps, readings = topics[READINGS]
     arrays: _Arrays = [(ColumnEntry("time", ""), stamps / 1e9), (ColumnEntry("fibres", READINGS), readings)]
     if PRESSED not in topics:
@@ -230,7 +217,7 @@ def _commands(down: Indices, up: Indices) -> _Arrays:
 
 
 def _find_commands(pressed: TopicSeries, readings: Indices) -> tuple[Indices, Indices]:
-    """Return the (Q,) stamps at which presses begin and end; the first reading is before all presses.
+    """Return the stamps (Q,) at which presses begin, after the first reading, and end.
 
     A press that is held at the end of the bag ends with its last reading.
     """
@@ -247,10 +234,10 @@ def _find_commands(pressed: TopicSeries, readings: Indices) -> tuple[Indices, In
 
 def _import_mapped(path: Path, columns: str, presses: Arrays) -> Recording:
     entries = parse_columns(columns, QUANTITIES)
-    # A topic has no point in its name: what follows one is the path of a field in its messages.
+    # The name of a topic has no point; after a point follows the path of a field in its messages.
     topics = [entry.name.partition(".")[0] for entry in entries]
     raw, types = read_bag(path, lambda name: any(matches(name, re.sub(r"\[.*", "", topic)) for topic in topics))
-    names = sorted(types)  # bags list topics as they were discovered, each bag in another order
+    names = sorted(types)  # the order in a bag is arbitrary
     arrays: _Arrays = []
     with naming_file(path):
         matched = match_columns([entry for entry in entries if "." not in entry.name], names)
@@ -283,7 +270,7 @@ def _import_mapped(path: Path, columns: str, presses: Arrays) -> Recording:
 
 
 def _decode_entry(entry: ColumnEntry, field: str, raw: Mapping[str, RawMessages]) -> TopicSeries:
-    """Return the numbers of a topic, of a type that may hold the quantity, or of a field of its messages."""
+    """Return the numbers of a topic, if its type may contain the quantity, or of a field of its messages."""
     name, types = entry.name, _TYPES[entry.quantity]
     what = f"{entry.quantity} is {short_repr(name)}"
     if name not in raw:
@@ -304,7 +291,7 @@ def _decode_entry(entry: ColumnEntry, field: str, raw: Mapping[str, RawMessages]
 
 
 def _number_fields(topic: RawMessages) -> dict[str, int]:
-    """Return the paths of numbers in the messages of a topic, and how many numbers the first message has in each."""
+    """Return the paths of numbers in the first message of a topic, and the number of numbers at each."""
     fields = dict[str, int]()
 
     def visit(value: Any, path: str) -> None:
@@ -322,7 +309,7 @@ def _number_fields(topic: RawMessages) -> dict[str, int]:
 
 
 def describe_bag(path: Path) -> list[str]:
-    """Return what the topics of a bag hold, each in a line, with the fields of their messages."""
+    """Return a line for each topic of a bag, with the fields of its messages."""
     load_typestore(f"{path}: a bag of ROS")
     topics, types = read_bag(path, lambda name: True, limit=1)
     lines = []
@@ -335,10 +322,10 @@ def describe_bag(path: Path) -> list[str]:
 
 
 def _hold(stamps: Indices, values: Array, clock: Indices) -> Array:
-    """Return the (R, ...) last of (n, ...) values at or before each of (R,) readings; NaN before the first."""
+    """Return the last of the values (n, ...) at or before each reading; shape (R, ...), NaN before the first value."""
     last = np.searchsorted(stamps, clock, side="right") - 1
     if len(stamps) == len(clock) and np.array_equal(stamps, clock):
-        return values  # also where stamps repeat
+        return values  # also if stamps repeat
     held = values[np.maximum(last, 0)]
     held[last < 0] = np.nan
     return held
@@ -350,10 +337,10 @@ def export_bag(
     """Write a recording as an MCAP file of ROS 2, atomically; importing it gives the same numbers.
 
     Args:
-        recording: to write.
-        path: of the file.
-        annotations: of a model, for the topics of touches and health.
-        states: (n, 10) of an arm, by `STATE_COLUMNS`; its poses become a topic.
+        recording: recording to write.
+        path: path of the file.
+        annotations: predictions of a model, for the topics of touches and health.
+        states: states of an arm, by `STATE_COLUMNS`, whose poses become a topic; shape (n, 10).
     """
     path = check_export(recording, path, annotations)
     if states is not None:
