@@ -106,8 +106,8 @@ class Table:
         dates: dict[int, list[str]] = {column: [] for column in columns if column in dialect.dates}
         words: dict[int, dict[int, str]] = {column: {} for column in columns}  # invalid cells by column and line
         torn: list[tuple[int, int]] = []  # lines with a wrong number of values, and that number
-        n_headers, last = 0, 0
         garbled: list[int] = []
+        n_headers = last = 0
         for line, row in _split(_iterate_lines(self.path, self.encoding, garbled=garbled), dialect.separator):
             if line < dialect.first:
                 continue
