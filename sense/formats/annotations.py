@@ -21,25 +21,15 @@ class FaultAnnotation:
 
 @dataclass(frozen=True)
 class ModelAnnotations:
-    """Predictions for Q presses.
+    """Predictions for Q presses."""
 
-    Attributes:
-        positions_mm: positions; shape (Q, 2).
-        std_mm: their standard deviations; shape (Q, 2).
-        r90_mm: radius that contains the true position in 90 % of presses; shape (Q,).
-        depths_mm: depths, NaN if the model predicts none; shape (Q,).
-        depths_r90_mm: half width of the 90 % interval of the depth; shape (Q,).
-        faults: faults in the order of presses; None if the model has no health model.
-        dead: indices of fibres that never responded.
-    """
-
-    positions_mm: Array
-    std_mm: Array
-    r90_mm: Array
-    depths_mm: Array
-    depths_r90_mm: Array
-    faults: Sequence[FaultAnnotation] | None = None
-    dead: Sequence[int] = ()
+    positions_mm: Array  # shape (Q, 2)
+    std_mm: Array  # standard deviations of the positions; shape (Q, 2)
+    r90_mm: Array  # radius that contains the true position in 90 % of presses; shape (Q,)
+    depths_mm: Array  # NaN if the model predicts none; shape (Q,)
+    depths_r90_mm: Array  # half width of the 90 % interval of the depth; shape (Q,)
+    faults: Sequence[FaultAnnotation] | None = None  # in the order of presses; None if there is no health model
+    dead: Sequence[int] = ()  # indices of fibres that never responded
 
 
 def check_export(recording: object, path: object, annotations: object = None) -> Path:

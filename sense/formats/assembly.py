@@ -45,24 +45,17 @@ WRAPS_S = (2**32 / 1e6, 2**32 / 1e3, 2**16 / 1e3, 2**16 / 1e6, 86400.0, 43200.0)
 class ForeignArrays:
     """The content of a file, read by a mapping.
 
-    Attributes:
-        path: path of the file, for messages.
-        arrays: `time` and `press` have R values; `fibres` is (R, C), (C, R), (R,) or frames (R, h, w), in one array or
-            several; `positions` is (n, 2) or (2, n), and x and y are (n,), for n readings or presses.
-        source: source of the recording, without the names of its fibres.
-        notes: a line for each omission in reading.
-        line_number: returns the number of the line of a row, for messages; by default rows are named, from 0.
-        is_own: whether padforge wrote the file, so that positions are exact and every line is a reading.
-        is_held: whether values hold until the next one, so that a position does not tell when the pad is pressed.
+    Of the arrays, `time` and `press` have R values; `fibres` is (R, C), (C, R), (R,) or frames (R, h, w), in one array
+    or several; `positions` is (n, 2) or (2, n), and x and y are (n,), for n readings or presses.
     """
 
     path: Path
     arrays: Arrays
-    source: Mapping[str, Any]
-    notes: list[str] = field(default_factory=list)
-    line_number: Callable[[int], int] | None = None
-    is_own: bool = False
-    is_held: bool = False
+    source: Mapping[str, Any]  # source of the recording, without the names of its fibres
+    notes: list[str] = field(default_factory=list)  # a line for each omission in reading
+    line_number: Callable[[int], int] | None = None  # returns the line of a row, for messages; by default rows, from 0
+    is_own: bool = False  # whether padforge wrote the file, so that positions are exact and every line is a reading
+    is_held: bool = False  # whether values hold until the next one, so that positions do not tell when presses end
 
 
 def assemble_recording(content: ForeignArrays, presses: Arrays = ()) -> Recording:

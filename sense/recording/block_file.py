@@ -36,13 +36,8 @@ def block_dtype(fibres: int) -> np.dtype[np.void]:
 class BlockWriter:
     """Appends rows to a file: full blocks at once, the remaining rows at `flush`.
 
-    A failed write adds nothing; the next one overwrites its remains.
-
-    Args:
-        file: file open for writing in place.
-        fibres: number of fibres C.
-        blocks: number of blocks in the file.
-        rows: number of rows in the file.
+    A failed write adds nothing; the next one overwrites its remains. The file is open for writing in place, and has
+    `blocks` blocks of `rows` rows in all.
     """
 
     def __init__(self, file: BinaryIO, fibres: int, blocks: int = 0, rows: int = 0) -> None:

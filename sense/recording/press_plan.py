@@ -24,15 +24,10 @@ PositionTest = Callable[[Array], Mask]  # returns which positions (Q, 2), mm, ma
 
 @dataclass(frozen=True)
 class PressPlan:
-    """Presses to be made.
+    """Presses to be made."""
 
-    Attributes:
-        positions_mm: positions (Q, 2) from the pad's centre.
-        depths_mm: depths (Q,) below the pad's surface, > 0.
-    """
-
-    positions_mm: Array
-    depths_mm: Array
+    positions_mm: Array  # from the pad's centre; shape (Q, 2)
+    depths_mm: Array  # below the pad's surface, > 0; shape (Q,)
 
     def __post_init__(self) -> None:
         positions = check_numbers(self.positions_mm, np.float64, "positions of the plan")
@@ -67,7 +62,7 @@ class PressPlan:
 
 
 def fit_pad_settings(pad: Morphology, pad_settings: PadSettings | None = None) -> PadSettings:
-    """Return `[pad]`, or the default, for the layout of a pad; raise InputError if keep-outs leave too little of it."""
+    """Return `[pad]`, or the default, for the layout of a pad; InputError if keep-outs leave too little of it."""
     pad_settings = or_default("size", pad_settings, PadSettings).for_layout(pad.layout)
     if pad_settings.keep_out_mm:
         import shapely

@@ -291,14 +291,10 @@ class PressSelection:
     """A selection of presses, `recording[presses]`, for cross-validation.
 
     It has the readings of all presses, since earlier presses influence later ones.
-
-    Attributes:
-        recording: the recording.
-        presses: indices of the selected presses; shape (S,).
     """
 
     recording: Recording
-    presses: Indices
+    presses: Indices  # indices of the selected presses; shape (S,)
 
     @property
     def presses_mm(self) -> Array:
@@ -343,11 +339,7 @@ def check_replaceable(path: Path) -> None:
 
 
 def detect_commands(readings: Array, times_s: Array, source: Mapping[str, Any]) -> tuple[Indices, Indices]:
-    """Detect the presses in readings (R, C) and return their down and up commands (Q,).
-
-    Raises:
-        InputError: the readings are invalid, or have no press.
-    """
+    """Detect the presses in readings (R, C), at least one, and return their down and up commands (Q,)."""
     from padforge.sense.signals.press_detection import detect_presses, estimate_commands
 
     placeholder = np.array([1])

@@ -1,8 +1,7 @@
 """Recording by hand: a person is asked to press targets, and the presses are detected in the readings.
 
-The order of the targets has short distances, and covers the whole pad every few presses. A rejected press is recorded
-at an unknown position, since it influences the readings of the next presses. The view of a session is JSON, for the
-page (`live/pages/hand.html`), and a few lines of text for the terminal.
+A rejected press is recorded at an unknown position, since it influences the readings of the next presses. The view of a
+session is JSON, for the page (`live/pages/hand.html`), and a few lines of text for the terminal.
 """
 
 from collections import deque
@@ -130,15 +129,9 @@ class HandPhase(StrEnum):
 
 
 def press_responses(readings: Array, down_command: int, up_command: int) -> Array:
-    """Return the mean responses of a press in the second and in the last quarter of its hold.
+    """Return the mean responses (2, C) of a press in the second and in the last quarter of its hold, V; 0 if missing.
 
-    Args:
-        readings: readings (n, C), V, NaN where missing.
-        down_command: index of the reading at which the press began.
-        up_command: index of the reading at which it ended.
-
-    Returns:
-        Differences (2, C) from the baseline before the press, V; 0 where missing.
+    They are relative to the baseline before the press, in the readings (n, C), V, NaN where missing.
     """
     quarter = max((up_command - down_command) // 4, 1)
     early, last = down_command + quarter, up_command - 1  # the last reading may show the release
@@ -188,13 +181,7 @@ class PressValidator:
         return ""
 
     def is_untouched(self, volts: Array, before: Array, held_s: float) -> bool:
-        """Return whether nothing touches the pad although a touch was detected.
-
-        Args:
-            volts: present readings (C,).
-            before: readings (C,) before the touch.
-            held_s: time since the touch.
-        """
+        """Return whether nothing touches the pad although a touch was detected, by readings (C,) now and before it."""
         # 1. The readings equal those before the touch: it was a false detection, or the release was missed.
         if held_s > RELEASE_S and self.relative_response(volts - before) < MIN_RESPONSE:
             return True
@@ -221,12 +208,9 @@ class PressValidator:
 
 
 class PressSequence:
-    """Targets to press one after the other, each until a press of it is accepted.
+    """Targets (Q, 2) to press one after the other, each until a press of it is accepted.
 
-    Args:
-        targets_mm: positions (Q, 2).
-        hold_s: time for which a press is to be held, and for which the pad is to recover after it.
-        now_s: time of the start.
+    A press is to be held for `hold_s`, and the pad is to recover from it for the same time.
     """
 
     def __init__(self, targets_mm: Array, hold_s: float, now_s: float) -> None:
@@ -316,15 +300,7 @@ class PressSequence:
 
 
 class HandSession:
-    """A session of recording by hand.
-
-    Args:
-        recorder: recorder of the session, new or resumed.
-        n_fibres: number of fibres C.
-        targets_mm: positions (Q, 2), in their order.
-        hold_s: see `PressSequence`.
-        n_done: presses of the plan made in earlier sessions.
-    """
+    """A session of recording by hand, of targets (Q, 2) in their order, after `n_done` presses of earlier sessions."""
 
     def __init__(self, recorder: Recorder, n_fibres: int, targets_mm: Array, hold_s: float, n_done: int = 0) -> None:
         self._recorder, self._n_fibres, self._n_done = recorder, n_fibres, n_done

@@ -41,15 +41,10 @@ def build_pad(plan: Morphology, rig: RigSettings) -> "BuiltPad":
 
 @dataclass(frozen=True)
 class BuiltPad:
-    """Fibres of a pad as built.
-
-    Attributes:
-        paths: paths of the fibres.
-        sensitivities: sensitivity along the axis of each fibre, uniform if None; shapes (F, SAMPLES).
-    """
+    """Fibres of a pad as built."""
 
     paths: Morphology
-    sensitivities: PressParts[Array] | None = None
+    sensitivities: PressParts[Array] | None = None  # along the axis of each fibre, shapes (F, SAMPLES); None is uniform
 
     @cached_property
     def _lengths(self) -> Array:
