@@ -55,7 +55,7 @@ class ForeignArrays:
     notes: list[str] = field(default_factory=list)  # a line for each omission in reading
     line_number: Callable[[int], int] | None = None  # returns the line of a row, for messages; by default rows, from 0
     is_own: bool = False  # whether padforge wrote the file, so that positions are exact and every line is a reading
-    is_held: bool = False  # whether values hold until the next one, so that positions do not tell when presses end
+    is_held: bool = False  # whether values hold until the next one, so that a position does not mean a press
 
 
 def assemble_recording(content: ForeignArrays, presses: Arrays = ()) -> Recording:

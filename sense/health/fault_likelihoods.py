@@ -50,7 +50,7 @@ class FaultLikelihoods:
     constant_share: Array  # share of presses in which the fibre is constant; shape (C,)
     step_filters: Array  # matched filters of a step; shape (C, S, TRACE), 1/V
     rest_autocorr: Array  # correlation of the rest's residual with that of the press before, of all fibres; shape (1,)
-    innovation_std: Array  # standard deviation of what does not correlate; shape (1,)
+    innovation_std: Array  # standard deviation of the uncorrelated part of that residual; shape (1,)
 
     @classmethod
     def fit(
@@ -106,7 +106,7 @@ class FaultLikelihoods:
         noise_shift = np.log(NOISE_FACTOR) / self.log_noise_std
         log_noise = (_log_noise(traces, self.noise_v) - self.log_noise_mean) / self.log_noise_std
         common = [constant, *self._response_llrs(targets, mean, std), _shift_llr(log_noise, noise_shift)]
-        # The residual of the rest decays slowly by itself: only its innovation is evidence of an offset.
+        # The residual of the rest decays slowly also without a fault: only its innovation is evidence of an offset.
         offset_residual = ((targets - mean) / self._calibrated(std))[..., -1]
         innovation = (offset_residual - self.rest_autocorr * _previous(offset_residual)) / self.innovation_std
         step = self.largest_step(traces)
@@ -204,7 +204,7 @@ def _shift_llr(value: Array, shift: Array | float) -> Array:
 
 
 def cusum_update(height: Array, llr_continuing: Array, llr_onset: Array) -> Array:
-    """Update cumulative sums by a press: the fault was present before, or begins now, or there is none (0)."""
+    """Update cumulative sums by a press, at which the fault was present before, begins, or is absent (0)."""
     return np.maximum(np.maximum(height + llr_continuing, llr_onset), 0.0)
 
 

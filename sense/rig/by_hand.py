@@ -24,7 +24,7 @@ from padforge.sense.rig.devices import Board, RigFault
 from padforge.sense.rig.streams import HISTORY, SLACK, RingBuffer, stream_board
 from padforge.sense.signals.press_detection import RELEASE_DELAY_S, TOUCH_DELAY_S, PressDetector
 
-KIND = "hand"  # kind of source of such a recording, whose depths are unknown
+KIND = "hand"  # kind of source of a recording by hand, whose depths are unknown
 # A uniform plan is ordered by short distances within rounds of this many targets. Each round covers the whole pad, so
 # that a session may end early, and drift with time is not confused with position.
 ROUND = 25

@@ -406,7 +406,7 @@ def emit(events: Any, count: Any, down: bool, reading: int) -> int:
 
 @kernel(inline="always")
 def classify_change(fibres: Any, pad: Any, time_s: float, settled: bool, events: Any, count: Any) -> int:
-    """Classify a change under way, as soon as it is clear what it is; return the number of events."""
+    """Classify the present change, if its class is clear by now; return the number of events."""
     has_direction = pad.n_presses >= MIN_PRESSES and pad.agreement > MIN_AGREEMENT
     agreement = _agreement(fibres) if has_direction else 1.0
     projection = _projection(fibres, fibres.press_step)  # -1 if the step of the press is taken back
@@ -438,7 +438,7 @@ def _set_press_step(fibres: Any, keep: float) -> None:
 @kernel(inline="always")
 def commit_change(fibres: Any, pad: Any, time_s: float, events: Any, count: Any) -> int:
     """Change the state by a change that has settled; return the number of events."""
-    if pad.change == Change.TOUCH and _projection(fibres, fibres.peak_step) < 0.5:  # a tap, released meanwhile
+    if pad.change == Change.TOUCH and _projection(fibres, fibres.peak_step) < 0.5:  # a tap, which has been released
         pad.state = State.REST
         return emit(events, count, False, pad.after_peak if pad.after_peak >= 0 else pad.block_first)
     if pad.change == Change.TOUCH:

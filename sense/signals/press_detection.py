@@ -68,7 +68,7 @@ class PressDetector:
             raise InputError(f"times begin at {times[0]:g} s, expected later than the last reading, {self._last_s:g} s")
         self._last_s = times[-1] if len(times) else self._last_s
         events = np.empty((2 * len(times), 2), np.int64)
-        times, rows = np.array(times), np.array(rows, order="C")  # copies: for read-only arrays it is compiled anew
+        times, rows = np.array(times), np.array(rows, order="C")  # `detect` would compile again for read-only arrays
         count = detect(self._fibres, self._pad, times, rows, self._reject_limit, self._accept_limit, events)
         return [PressEvent(bool(down), reading) for down, reading in events[:count].tolist()]
 
@@ -121,9 +121,9 @@ def align_to_detected(
 ) -> tuple[Indices, Indices]:
     """Replace commanded presses by those that a detector finds in the readings.
 
-    A probe takes up to 0.4 s from its command to the pad. Live, presses are aligned by what the readings show; a model
-    that is used so must be trained so, since a release that is off by one reading costs several millimetres.
-    A press that is not detected keeps its commands.
+    A probe takes up to 0.4 s from its command to the pad. Live presses are aligned by the readings, and a model of them
+    must be trained on presses that are aligned in the same way, since an error of one reading in the release costs
+    several millimetres. A press that is not detected keeps its commands.
     """
     presses = detect_presses(readings, times_s)
     downs, ups = estimate_commands(presses, times_s)

@@ -9,7 +9,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from padforge.design import Contact, Morphology
-from padforge.design.settings import PadSettings
 from padforge.sense.arrays import Array
 from padforge.sense.recording.press_plan import make_plan, sample_uniform
 from padforge.sense.recording.recording import Recording
@@ -33,14 +32,13 @@ def simulate_strokes(
     speed_mm_s: float,
     strokes: int,
     rng: np.random.Generator,
-    size: PadSettings | None = None,
 ) -> Strokes:
     """Simulate strokes as long as the presses of `[rig]`, on the pad that `simulate` presses with the same seed.
 
     Start and direction are random, and a stroke stays on the pad; it is slower if the pad is too small for it.
     """
     rig = rig.for_contact(contact)
-    model = model_plan(pad, contact, rig, size)
+    model = model_plan(pad, contact, rig)
     n_held = rig.readings_per_press // 2
     n_rest = rig.readings_per_press - n_held
     starts = sample_uniform(model.corners_mm, strokes, rng, model.free)
@@ -50,7 +48,7 @@ def simulate_strokes(
     paths = starts[:, None] + share[:, None] * (ends - starts)[:, None]
     depth = np.minimum((np.arange(n_held) + 1) / (rig.rate_hz * TRAVEL_S), 1.0) * rig.press_depths_mm[0]
     built = np.random.default_rng(rig.seed)
-    make_plan(pad, rig, built, size)  # `simulate` samples the presses before the pad
+    make_plan(pad, rig, built)  # `simulate` samples the presses before the pad
     positions_mm = np.concatenate([np.repeat(starts[:, None], n_rest, axis=1), paths], axis=1).reshape(-1, 2)
     depths_mm = np.tile(np.append(np.zeros(n_rest), depth), strokes)
     readings = LivePad(pad, contact, rig, rig.rate_hz, built).volts(positions_mm, depths_mm)
