@@ -90,7 +90,7 @@ def import_hdf5(path: str | Path, columns: str = "", presses: Arrays = ()) -> Re
         source = file.read_text("source")
     try:
         return Recording(**content, source=json.loads(source or ""))
-    except (InputError, ValueError) as error:
+    except ValueError as error:  # also an InputError
         raise InputError(f"{path}: {error}") from error
 
 

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from padforge.common.files import UNFINISHED, atomic_files, check_file, reraise_write_error
 from padforge.common.validation import InputError, naming_file, short_repr
 from padforge.sense.arrays import MAX_BYTES, Array, Indices, check_numbers
-from padforge.sense.formats import ros_messages
+from padforge.sense.formats import ros_messages as ros
 from padforge.sense.formats.annotations import ModelAnnotations, check_export
 from padforge.sense.formats.assembly import Arrays, ForeignArrays, assemble_recording
 from padforge.sense.formats.columns import (
@@ -35,20 +35,6 @@ from padforge.sense.formats.columns import (
     parse_columns,
 )
 from padforge.sense.formats.hdf5_mat import check_no_presses
-from padforge.sense.formats.ros_messages import (
-    ARM,
-    FORCE,
-    HEALTH,
-    PLACE,
-    PRESSED,
-    REACHED,
-    READINGS,
-    RECORDING,
-    TOPICS,
-    TOUCHES,
-    RawMessages,
-    TopicSeries,
-)
 from padforge.sense.formats.ros_writer import load_typestore, write_mcap
 from padforge.sense.recording.recording import NOTE, Recording
 from padforge.sense.recording.run_directory import STATE_COLUMNS
@@ -89,7 +75,7 @@ _Arrays = list[tuple[ColumnEntry, NDArray[Any]]]
 class BagContent(NamedTuple):
     """Content of a bag, by the names of topics."""
 
-    topics: dict[str, RawMessages]  # requested topics that have messages
+    topics: dict[str, ros.RawMessages]  # requested topics that have messages
     types: dict[str, str]  # types of all topics
 
 
@@ -98,12 +84,12 @@ def read_bag(path: Path, is_wanted: Callable[[str], bool], limit: int | None = N
 
     A bag is a file of `SUFFIXES`, or a folder of such files with METADATA.
     """
+    store = load_typestore(f"{path}: a bag of ROS")
     from rosbags.highlevel import AnyReader
 
     if not path.is_dir():
         check_file(path, MAX_BYTES)
-    topics = dict[str, RawMessages]()
-    store = load_typestore(f"{path}: a bag of ROS")
+    topics = dict[str, ros.RawMessages]()
     try:
         with AnyReader([path], default_typestore=store) as reader:
             types = {connection.topic: connection.msgtype for connection in reader.connections}
@@ -113,7 +99,7 @@ def read_bag(path: Path, is_wanted: Callable[[str], bool], limit: int | None = N
             for connection, stamp, message in reader.messages(wanted) if wanted else ():  # [] would be all topics
                 if connection.topic not in topics:
                     decode = partial(deserialize, typename=connection.msgtype)
-                    topics[connection.topic] = RawMessages(connection.msgtype, decode, [], [])
+                    topics[connection.topic] = ros.RawMessages(connection.msgtype, decode, [], [])
                 topic = topics[connection.topic]
                 if limit is None or len(topic.stamps) < limit:
                     topic.stamps.append(stamp)
@@ -138,7 +124,6 @@ def import_bag(path: str | Path, columns: str = "", presses: Arrays = ()) -> Rec
         presses: presses from a separate table, see `read_presses`.
     """
     path, columns = check_import(path, columns)
-    load_typestore(f"{path}: a bag of ROS")
     with np.errstate(all="ignore"):  # damaged numbers are refused later
         if columns:
             return _import_mapped(path, columns, presses)
@@ -148,35 +133,35 @@ def import_bag(path: str | Path, columns: str = "", presses: Arrays = ()) -> Rec
 
 def _import_exported(path: Path) -> Recording:
     """Read an exported bag: the exact recording if all messages agree with it, otherwise that of the messages."""
-    number_topics = (READINGS, PRESSED, PLACE, REACHED, FORCE)
-    raw, types = read_bag(path, {*number_topics, RECORDING}.__contains__)
-    if READINGS not in raw:
+    number_topics = (ros.READINGS, ros.PRESSED, ros.PLACE, ros.REACHED, ros.FORCE)
+    raw, types = read_bag(path, {*number_topics, ros.RECORDING}.__contains__)
+    if ros.READINGS not in raw:
         raise InputError(
-            f"{path}: has no topic {READINGS}; columns (--columns) say what other topics hold, "
+            f"{path}: has no topic {ros.READINGS}; columns (--columns) say what other topics hold, "
             f"there are {join_names(list(types))}"
         )
     notes = []
     with naming_file(path):
         for name, topic in raw.items():
-            if topic.msgtype != TOPICS[name].msgtype:
-                raise InputError(f"{name} is of {short_repr(topic.msgtype)}, expected {TOPICS[name].msgtype}")
-        topics = {name: ros_messages.decode(raw[name], TOPICS[name].paths) for name in number_topics if name in raw}
-        if RECORDING in raw:
-            if (recording := _restore(ros_messages.decode_text(raw[RECORDING]), topics)) is not None:
+            if topic.msgtype != ros.TOPICS[name].msgtype:
+                raise InputError(f"{name} is of {short_repr(topic.msgtype)}, expected {ros.TOPICS[name].msgtype}")
+        topics = {name: ros.decode(raw[name], ros.TOPICS[name].paths) for name in number_topics if name in raw}
+        if ros.RECORDING in raw:
+            if (recording := _restore(ros.decode_text(raw[ros.RECORDING]), topics)) is not None:
                 return recording
-            notes = [f"was changed since it was exported; {RECORDING} is left out"]
+            notes = [f"was changed since it was exported; {ros.RECORDING} is left out"]
         arrays = _to_arrays(topics)
     source = {"kind": "ros", "file": path.name}
     return assemble_recording(ForeignArrays(path, arrays, source, notes, is_own=True))
 
 
-def _restore(text: str, topics: Mapping[str, TopicSeries]) -> Recording | None:
+def _restore(text: str, topics: Mapping[str, ros.TopicSeries]) -> Recording | None:
     """Return the exact recording in the text of a bag; None if its messages differ from it."""
-    restored = ros_messages.from_text(text, topics[READINGS].values)
+    restored = ros.from_text(text, topics[ros.READINGS].values)
     if restored is None:
         return None
     recording, epoch_s, digest = restored
-    expected = ros_messages.to_topics(recording, epoch_s)
+    expected = ros.to_topics(recording, epoch_s)
     if expected.keys() != topics.keys() or not all(topics[name].equals(expected[name]) for name in expected):
         return None
     if recording.digest == digest:
@@ -184,13 +169,13 @@ def _restore(text: str, topics: Mapping[str, TopicSeries]) -> Recording | None:
     return replace(recording, source={**recording.source, NOTE: "readings are not those that were exported"})
 
 
-def _to_arrays(topics: Mapping[str, TopicSeries]) -> _Arrays:
+def _to_arrays(topics: Mapping[str, ros.TopicSeries]) -> _Arrays:
     """Return the arrays in the messages of an exported bag, for `assemble_recording`."""
-    stamps, readings = topics[READINGS]
-    arrays: _Arrays = [(ColumnEntry("time", ""), stamps / 1e9), (ColumnEntry("fibres", READINGS), readings)]
-    if PRESSED not in topics:
+    stamps, readings = topics[ros.READINGS]
+    arrays: _Arrays = [(ColumnEntry("time", ""), stamps / 1e9), (ColumnEntry("fibres", ros.READINGS), readings)]
+    if ros.PRESSED not in topics:
         return arrays
-    down, up = _find_commands(topics[PRESSED], stamps)
+    down, up = _find_commands(topics[ros.PRESSED], stamps)
 
     def in_presses(topic: str, column: int, factor: float = 1e3) -> Array:
         """Return the number of the last message in each press; NaN without one."""
@@ -200,15 +185,15 @@ def _to_arrays(topics: Mapping[str, TopicSeries]) -> _Arrays:
         valid = (last >= 0) & (topics[topic].stamps[last] >= down)
         return np.where(valid, topics[topic].values[last, column] * factor, np.nan)
 
-    z = in_presses(PLACE, 2)
+    z = in_presses(ros.PLACE, 2)
     downward = 1.0 if np.nansum(z) > 0 else -1.0  # z points into a pad that lay mirrored
     return [
         *arrays,
         *_commands(down, up),
-        (ColumnEntry("positions", ""), np.column_stack([in_presses(PLACE, 0), in_presses(PLACE, 1)])),
+        (ColumnEntry("positions", ""), np.column_stack([in_presses(ros.PLACE, 0), in_presses(ros.PLACE, 1)])),
         (ColumnEntry("depth", ""), np.where(downward * z > 0, downward * z, np.nan)),
-        (ColumnEntry("reached", ""), in_presses(REACHED, 2, downward * 1e3)),
-        (ColumnEntry("force", ""), in_presses(FORCE, 0, -downward)),
+        (ColumnEntry("reached", ""), in_presses(ros.REACHED, 2, downward * 1e3)),
+        (ColumnEntry("force", ""), in_presses(ros.FORCE, 0, -downward)),
     ]
 
 
@@ -216,7 +201,7 @@ def _commands(down: Indices, up: Indices) -> _Arrays:
     return [(ColumnEntry("down_command", "", 1.0), down / 1e9), (ColumnEntry("up_command", "", 1.0), up / 1e9)]
 
 
-def _find_commands(pressed: TopicSeries, readings: Indices) -> tuple[Indices, Indices]:
+def _find_commands(pressed: ros.TopicSeries, readings: Indices) -> tuple[Indices, Indices]:
     """Return the stamps (Q,) at which presses begin, after the first reading, and end.
 
     A press that is held at the end of the bag ends with its last reading.
@@ -225,7 +210,7 @@ def _find_commands(pressed: TopicSeries, readings: Indices) -> tuple[Indices, In
     was_down = np.append(False, is_down[:-1])
     down, up = pressed.stamps[is_down & ~was_down], pressed.stamps[~is_down & was_down]
     if len(up) < len(down):
-        up = np.append(up, ros_messages.stamps_at(readings, np.array([len(readings)])))
+        up = np.append(up, ros.stamps_at(readings, np.array([len(readings)])))
     valid = (down > readings[0]) & (down <= readings[-1])
     if not valid.any():
         raise InputError("press is nowhere true after the first reading")
@@ -269,7 +254,7 @@ def _import_mapped(path: Path, columns: str, presses: Arrays) -> Recording:
     return assemble_recording(ForeignArrays(path, arrays, source, order_notes(matched), is_held=True), presses)
 
 
-def _decode_entry(entry: ColumnEntry, field: str, raw: Mapping[str, RawMessages]) -> TopicSeries:
+def _decode_entry(entry: ColumnEntry, field: str, raw: Mapping[str, ros.RawMessages]) -> ros.TopicSeries:
     """Return the numbers of a topic, if its type may contain the quantity, or of a field of its messages."""
     name, types = entry.name, _TYPES[entry.quantity]
     what = f"{entry.quantity} is {short_repr(name)}"
@@ -279,18 +264,18 @@ def _decode_entry(entry: ColumnEntry, field: str, raw: Mapping[str, RawMessages]
     kind = topic.msgtype
     with naming_file(what):
         if field:
-            value = ros_messages.get_field(topic.decode(0), field)
+            value = ros.get_field(topic.decode(0), field)
             kind = getattr(value, "__msgtype__", "")
         if kind in types:
-            return ros_messages.decode(topic, [f"{field}.{path}".lstrip(".") for path in types[kind]])
+            return ros.decode(topic, [f"{field}.{path}".lstrip(".") for path in types[kind]])
         if field and not kind:
-            return ros_messages.decode(topic, [field])
+            return ros.decode(topic, [field])
         fields = join_names(list(_number_fields(topic)))
     has = f"name one of its fields as {name}.FIELD: {fields}" if fields != "nothing" else "which holds no numbers"
     raise InputError(f"{what} of {short_repr(kind)}, {has}")
 
 
-def _number_fields(topic: RawMessages) -> dict[str, int]:
+def _number_fields(topic: ros.RawMessages) -> dict[str, int]:
     """Return the paths of numbers in the first message of a topic, and the number of numbers at each."""
     fields = dict[str, int]()
 
@@ -310,7 +295,6 @@ def _number_fields(topic: RawMessages) -> dict[str, int]:
 
 def describe_bag(path: Path) -> list[str]:
     """Return a line for each topic of a bag, with the fields of its messages."""
-    load_typestore(f"{path}: a bag of ROS")
     topics, types = read_bag(path, lambda name: True, limit=1)
     lines = []
     for name in sorted(types):
@@ -348,20 +332,20 @@ def export_bag(
         if states.shape[1:] != (len(STATE_COLUMNS),):
             raise InputError(f"states have shape {states.shape}, expected (n, {len(STATE_COLUMNS)})")
     store = load_typestore(f"{path}: MCAP")
-    epoch_s = ros_messages.choose_epoch(recording.times_s)
-    topics = ros_messages.to_topics(recording, epoch_s)
+    epoch_s = ros.choose_epoch(recording.times_s)
+    topics = ros.to_topics(recording, epoch_s)
     if annotations is not None:
-        topics[TOUCHES] = ros_messages.touches(recording, annotations, epoch_s)
+        topics[ros.TOUCHES] = ros.touches(recording, annotations, epoch_s)
     if states is not None:
-        topics[ARM] = ros_messages.arm_poses(states, epoch_s)
+        topics[ros.ARM] = ros.arm_poses(states, epoch_s)
     stamps = {topic: series.stamps for topic, series in topics.items()}
-    messages = {
-        topic: ros_messages.encode(store, topic, series) for topic, series in topics.items() if len(series.stamps)
-    }
+    messages = {topic: ros.encode(store, topic, series) for topic, series in topics.items() if len(series.stamps)}
     if annotations is not None and annotations.faults is not None:
-        stamps[HEALTH], messages[HEALTH] = ros_messages.encode_health(store, recording, annotations, stamps[READINGS])
-    stamps[RECORDING] = stamps[READINGS][:1]
-    messages = {RECORDING: [ros_messages.encode_recording(store, recording, epoch_s, messages)], **messages}
+        stamps[ros.HEALTH], messages[ros.HEALTH] = ros.encode_health(
+            store, recording, annotations, stamps[ros.READINGS]
+        )
+    stamps[ros.RECORDING] = stamps[ros.READINGS][:1]
+    messages = {ros.RECORDING: [ros.encode_recording(store, recording, epoch_s, messages)], **messages}
     in_order = merge(
         *(zip(repeat(topic), stamps[topic].tolist(), messages[topic]) for topic in messages), key=itemgetter(1)
     )
