@@ -30,16 +30,6 @@ from padforge.sense.localizer import features, moments
 from padforge.sense.localizer.bayes import PREFIX, BayesianLocalizer
 from padforge.sense.localizer.features import compute_features, interpolate_gaps
 from padforge.sense.localizer.model import MEASURE_COLUMNS, UNIFORM, LocalizerModel
-from padforge.sense.localizer.moments import (
-    BAYES_STAGES,
-    EARLY_WINDOWS,
-    N_PRESS_WINDOWS,
-    PHASES,
-    SLIDE_NETWORK,
-    SLIDE_THRESHOLD,
-    Window,
-    complete_at,
-)
 from padforge.sense.localizer.network import MAX_LOG_ERROR, MIN_LOG_ERROR, Weights
 from padforge.sense.localizer.scaler import MAX_INPUT
 from padforge.sense.localizer.torch_network import EnsembleMlp, network_inputs
@@ -101,7 +91,7 @@ class _FeatureModule(nn.Module):
         until = torch.cat([down_command[1:], n_readings])
         held = torch.minimum(up_command, until)
 
-        def mean(origin: Tensor, window: Window, low: Tensor, high: Tensor) -> Tensor:
+        def mean(origin: Tensor, window: moments.Window, low: Tensor, high: Tensor) -> Tensor:
             index = torch.maximum(origin[:, None] + torch.arange(*window), low[:, None])
             return readings[torch.minimum(index, torch.minimum(high, n_readings)[:, None] - 1)].mean(dim=1)
 
@@ -131,7 +121,7 @@ def _history(readings: Tensor, down_command: Tensor) -> Tensor:
     sums = torch.cumsum(readings - readings[:1], dim=0)
     sums = torch.cat([torch.zeros_like(sums[:1]), sums])
 
-    def mean(window: Window) -> Tensor:
+    def mean(window: moments.Window) -> Tensor:
         first = torch.clamp(down_command + window[0], min=0)
         end = torch.maximum(down_command + window[1], first + 1)
         return (sums[end] - sums[first]) / (end - first)[:, None] + readings[:1]
@@ -160,7 +150,7 @@ class _BayesModule(nn.Module):
         position, summary = self._predict(0, scaled, fibre_mask)
         for number in range(1, self.n_stages):
             later = self._predict(number, scaled, fibre_mask)
-            is_later = (n_complete >= BAYES_STAGES[number])[:, None]
+            is_later = (n_complete >= moments.BAYES_STAGES[number])[:, None]
             position, summary = (torch.where(is_later, *pair) for pair in zip(later, (position, summary), strict=True))
         corrected = self.residual(torch.cat([x, summary], dim=1)[None])
         return corrected + functional.pad(position, (0, 2))
@@ -197,9 +187,9 @@ class _LocalizerModule(nn.Module):
         x = network_inputs(scaled, fibre_mask, complete)
         targets, std = self._predict(scaled, fibre_mask, x, n_complete)
         *followed, moved = self._follow(scaled, fibre_mask, complete)
-        slid = (n_complete >= N_PRESS_WINDOWS) & (moved > SLIDE_THRESHOLD)
+        slid = (n_complete >= moments.N_PRESS_WINDOWS) & (moved > moments.SLIDE_THRESHOLD)
         targets, std = (torch.where(slid[:, None], *pair) for pair in zip(followed, (targets, std), strict=True))
-        n_failed, moment = (~fibre_mask).sum(dim=1), torch.where(slid, N_PRESS_WINDOWS - 1, n_complete)
+        n_failed, moment = (~fibre_mask).sum(dim=1), torch.where(slid, moments.N_PRESS_WINDOWS - 1, n_complete)
         factors = self.interval_factors[moment, torch.clamp(n_failed, max=self.interval_factors.shape[1] - 1)]
         blind = ~fibre_mask.any(dim=1) | (n_complete == 0)  # such a press may be anywhere
         radius = torch.linalg.vector_norm(std[:, :2], dim=1)
@@ -221,7 +211,7 @@ class _LocalizerModule(nn.Module):
     def _predict(self, scaled: Tensor, fibre_mask: Tensor, x: Tensor, n_complete: Tensor) -> tuple[Tensor, Tensor]:
         """Return the targets (Q, N) and their standard deviations, as `network.predict` does."""
         outputs: Any = 0.0
-        for name, phase in PHASES[moments.N_TIMED].items():
+        for name, phase in moments.PHASES[moments.N_TIMED].items():
             network = self.networks[name]
             answers = (n_complete >= phase.first) & (n_complete < phase.first + len(phase.shares))
             outputs = torch.where(answers[:, None], network(x.expand(network.n_members, -1, -1)), outputs)
@@ -229,27 +219,27 @@ class _LocalizerModule(nn.Module):
         if self.bayes is None:
             return combined
         corrected = _combine_members(torch.cat([outputs, self.bayes(scaled, fibre_mask, x, n_complete)]))
-        is_corrected = (n_complete >= BAYES_STAGES[0])[:, None]
+        is_corrected = (n_complete >= moments.BAYES_STAGES[0])[:, None]
         targets, std = (torch.where(is_corrected, *pair) for pair in zip(corrected, combined, strict=True))
         return targets, std
 
     def _follow(self, scaled: Tensor, fibre_mask: Tensor, complete: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return targets, standard deviations and the relative motion, as `Sliding.follow` does."""
-        network, n_timed = self.networks[SLIDE_NETWORK], moments.N_TIMED
+        network, n_timed = self.networks[moments.SLIDE_NETWORK], moments.N_TIMED
 
         def predict_from(scaled: Tensor, n_complete: int) -> tuple[Tensor, Tensor]:
             x = network_inputs(scaled, fibre_mask, complete & (torch.arange(n_timed) < n_complete))
             return _combine_members(network(x.expand(network.n_members, -1, -1)))
 
-        targets, std = predict_from(scaled, N_PRESS_WINDOWS)
+        targets, std = predict_from(scaled, moments.N_PRESS_WINDOWS)
         now = [
-            scaled[:, :, EARLY_WINDOWS - 1 - k] * self.now_factor[:, k, EARLY_WINDOWS - 1 - k]
-            + self.now_offset[:, k, EARLY_WINDOWS - 1 - k]
+            scaled[:, :, moments.EARLY_WINDOWS - 1 - k] * self.now_factor[:, k, moments.EARLY_WINDOWS - 1 - k]
+            + self.now_offset[:, k, moments.EARLY_WINDOWS - 1 - k]
             for k in range(len(moments.LATEST_WINDOWS))
         ]
         modulation = scaled[:, :, n_timed + len(now) :]
         soon, soon_std = predict_from(
-            torch.cat([scaled[:, :, :n_timed], torch.stack(now, dim=2), modulation], dim=2), EARLY_WINDOWS
+            torch.cat([scaled[:, :, :n_timed], torch.stack(now, dim=2), modulation], dim=2), moments.EARLY_WINDOWS
         )
         distance, expected = (torch.linalg.vector_norm(each[:, :2], dim=1) for each in (targets - soon, soon_std))
         return targets, std, distance / torch.clamp(expected, min=1e-9)
@@ -375,7 +365,7 @@ def _compare(
     filled, last, with_previous = interpolate_gaps(readings), slice(-1, None), slice(-2, None)
     commands = down_command, up_command
     # The readings after the last press may end before all of its windows are complete.
-    ends = {min(int(complete_at(n, *commands)[-1]), len(readings)) for n in range(1, moments.N_TIMED + 1)}
+    ends = {min(int(moments.complete_at(n, *commands)[-1]), len(readings)) for n in range(1, moments.N_TIMED + 1)}
     trials = [(slice(None), compute_features(readings, *commands), filled, *commands)]
     for end in sorted(end for end in ends if end > down_command[-1] + 1):
         until = np.full(len(down_command), end)
