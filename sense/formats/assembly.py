@@ -146,9 +146,9 @@ def _assemble(content: ForeignArrays, presses: Arrays) -> Recording:
         return values[rows[np.clip((down + up) // 2, 0, len(times) - 1)]]
 
     measures = {name: at_presses(MEASURES[name], columns[name]) for name in MEASURES if name in columns}
-    for name in measures.keys() & {"force", "depth"}:
-        entry = next(entry for entry, _ in arrays if entry.quantity == name)
-        measures[name] = _upright(entry, measures[name], notes)
+    entries = {entry.quantity: entry for entry, _ in arrays}  # the last one, that of the table of presses, counts
+    for name in [name for name in ("depth", "force") if name in measures]:
+        measures[name] = _upright(entries[name], measures[name], notes)
     presses_mm = np.full((len(down), 2), np.nan) if positions is None else at_presses("positions", positions)
     presses_mm = np.where(presses_mm == UNKNOWN, np.nan, presses_mm)
     source |= {NOTE: "; ".join(notes)} if notes else {}
@@ -335,11 +335,7 @@ def _find_presses(
         return _find_runs(press[:, None], _is_pressed(press), 0.0)
     if positions is None or len(positions) != n_readings:
         return None
-    missing = np.isnan(positions)
-    incomplete = missing[:, 0] != missing[:, 1]
-    if incomplete.any():
-        raise InputError(f"positions have one of x and y in row {int(np.argmax(incomplete))}, expected both or neither")
-    pressed = ~missing[:, 0]
+    pressed = ~np.isnan(positions[:, 0])  # x and y are both known or both unknown
     if not pressed.any() or pressed.all():
         return None
     down, up = _find_runs(positions, pressed, jitter_mm)
