@@ -87,28 +87,19 @@ def _order_in_rounds(positions_mm: Array) -> Array:
     return ordered
 
 
-def _remaining_targets(targets_mm: Array, pressed_mm: Array) -> Array:
-    """Return the targets (Q, 2), in order, except one for each of the positions (R, 2) already pressed."""
-    pressed, remaining = pressed_mm.tolist(), []
-    for position in targets_mm.tolist():
-        if position in pressed:
-            pressed.remove(position)
-        else:
-            remaining.append(position)
-    return np.array(remaining).reshape(-1, 2)
-
-
 def open_recorder_by_hand(config: RigConfig, board: Mapping[str, Any], resume: bool) -> tuple[Recorder, Array, Array]:
     """Return the recorder, new or resumed, the targets (Q, 2) of its plan, and the remaining targets (P, 2), mm."""
     is_resumed = resume and (config.out / START).exists()
     if is_resumed:
-        presses = read_source(config, config.rig, KIND)["plan"]["presses"]
-        targets_mm = np.array(presses, np.float64)
+        targets_mm = np.array(read_source(config, config.rig, KIND)["plan"]["presses"], np.float64)
     else:
         targets_mm = plan_targets(config)
     recorder = open_recorder(config, config.rig, targets_mm.tolist(), config.out, resume, {"board": board}, KIND)
-    pressed = [press[:2] for press in read_journal(config.out / JOURNAL).values()] if is_resumed else []
-    return recorder, targets_mm, _remaining_targets(targets_mm, np.reshape(pressed, (-1, 2)))
+    remaining = targets_mm.tolist()
+    for press in read_journal(config.out / JOURNAL).values() if is_resumed else ():
+        if list(press[:2]) in remaining:
+            remaining.remove(list(press[:2]))
+    return recorder, targets_mm, np.array(remaining).reshape(-1, 2)
 
 
 class HandPhase(StrEnum):
