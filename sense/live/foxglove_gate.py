@@ -39,7 +39,7 @@ def hidden_host() -> str:
 
 
 def is_welcome(headers: Message, port: int) -> bool:
-    """Return whether a request comes from no web page, a page of this machine, or the Foxglove app.
+    """Return whether a request is to this machine, and from no web page, one of this machine, or the Foxglove app.
 
     The origin "null" stands for a hidden one and is refused.
     """

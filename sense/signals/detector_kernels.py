@@ -48,7 +48,7 @@ PAD = np.dtype(
         *[("block_first", "i8"), ("block_start_s", "f8"), ("block_count", "i8")],  # first reading, its time, and count
         ("block_s", "f8"),  # time of the last block
         ("n_blocks", "i8"),  # blocks that the noise was learnt from
-        ("resolution_v", "f8"),  # of the converter: least difference of two readings
+        ("resolution_v", "f8"),  # resolution of the converter: least difference of two readings
         *[("run", "i8"), ("run_first", "i8"), ("run_s", "f8")],  # blocks in a row that leave the levels, and the first
         ("in_change", "?"),
         ("change", "i8"),  # a `Change`
@@ -59,7 +59,7 @@ PAD = np.dtype(
         ("n_presses", "i8"),  # presses that direction and size were learnt from
         ("typical_v", "f8"),  # root of the summed squares of a press's steps, V
         ("typical_size", "f8"),  # size of a press, clipped
-        ("agreement", "f8"),  # of touches with the direction of earlier ones, -1 to 1
+        ("agreement", "f8"),  # agreement of touches with the direction of earlier ones, -1 to 1
         ("rest_scatter", "f8"),  # mean clipped size of the step from one rest level to the next
         ("press_scatter", "f8"),  # the same of levels under presses
     ]
@@ -69,17 +69,17 @@ PAD = np.dtype(
 BLOCK_S = 0.03  # length of a block; a probe takes a tenth of a second to sink in
 FADE_S, SLOPE_S, NOISE_S = 2.5, 1.0, 10.0  # times in which a slope fades, a slope is learnt, and noise is learnt
 GAP_S, GIVE_UP_S = 1.0, 1.0  # a fibre missing for longer is reset; a longer run without agreement is grown noise
-WARM_UP_BLOCKS, ROUGH_BLOCKS = 8, 8  # before the first change; after n blocks noise is widened by ROUGH_BLOCKS / n
-LEVEL_ERROR, SLOPE_ERROR = 0.05, 0.4  # shares of a step by which level, and slope per s, may be wrong: silicone settles
-MAX_INNOVATION, MAX_GROWTH = 2.5, 3.0  # standard deviations beyond which a block moves level, and noise, no further
-MIN_SHARE, MIN_V = 0.01, 1e-7  # least noise, as a share of a typical press, and in V (smaller steps are rounding)
+WARM_UP_BLOCKS, ROUGH_BLOCKS = 8, 8  # blocks before the first change; noise of n blocks is widened by ROUGH_BLOCKS / n
+LEVEL_ERROR, SLOPE_ERROR = 0.05, 0.4  # errors of level, and of slope per s, relative to a step that silicone settles to
+MAX_INNOVATION, MAX_GROWTH = 2.5, 3.0  # limits of the influence of a block on level, and on noise, standard deviations
+MIN_SHARE, MIN_V = 0.01, 1e-7  # least noise, relative to a typical press, and in V (smaller steps are rounding)
 MIN_CORRELATION = 0.25  # correlation of successive innovations above which a level is modelled as a random walk
 MEAN_TO_STD = math.sqrt(math.pi / 2)  # standard deviation over mean absolute value of a normal distribution
-STALL_S, SETTLED = 0.5, 0.1  # a change ends if it goes no farther for STALL_S, or two blocks differ by less (share)
-RELEASE_S = 1.0  # a step in the direction of a release so soon after one belongs to it
+STALL_S, SETTLED = 0.5, 0.1  # a change ends if it does not grow for STALL_S, or by less than SETTLED of it in a block
+RELEASE_S = 1.0  # a step in the direction of a release, within this time after one, belongs to it
 MAX_STEP = 20.0  # limit of a whitened step, so that a broken fibre does not outweigh the others
 CLEAR_STEP = 5.0  # whitened step above which a fibre adds to the typical press in V
-MIN_PRESSES, MIN_AGREEMENT = 3, 0.5  # touches, and their agreement, from which on their direction is used
+MIN_PRESSES, MIN_AGREEMENT = 3, 0.5  # minimum touches, and their minimum agreement, for a use of their direction
 TOUCH_RATE, LEVEL_RATE = 0.05, 0.15  # weights of the newest touch and level in their running means
 INVERTED, MIN_INVERTED = 1.2, 0.4
 """Rests are presses if rest levels scatter more than these shares of levels under presses, and of a typical press."""
