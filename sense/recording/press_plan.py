@@ -191,7 +191,7 @@ def check_pressable(plan: PressPlan, path: Path, is_pressable: PositionTest) -> 
 
 
 def read_plan(path: Path, depths_mm: Sequence[float]) -> PressPlan:
-    """Read a plan from a CSV file with the columns x_mm, y_mm and, by default `depths_mm` in turn, depth_mm."""
+    """Read a plan from a CSV file of x_mm, y_mm and depth_mm; without the latter, presses take `depths_mm` in turn."""
     table = read_table(path)
     if tuple(table.names) not in (COLUMNS, COLUMNS[:2]):
         raise InputError(f"{path}: header is {','.join(table.names)[:60]!r}, expected x_mm,y_mm or x_mm,y_mm,depth_mm")

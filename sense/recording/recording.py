@@ -183,7 +183,7 @@ class Recording:
         presses_mm: ArrayLike | None = None,
         **measures: ArrayLike,
     ) -> "Recording":
-        """Return the recording in some arrays.
+        """Make a recording from arrays.
 
         Args:
             readings: voltages, NaN where missing; shape (R, C), V.
@@ -339,7 +339,7 @@ def check_replaceable(path: Path) -> None:
 
 
 def detect_commands(readings: Array, times_s: Array, source: Mapping[str, Any]) -> tuple[Indices, Indices]:
-    """Detect the presses in readings (R, C), at least one, and return their down and up commands (Q,)."""
+    """Detect the presses in readings (R, C) and return their down and up commands (Q,); InputError if there is none."""
     from padforge.sense.signals.press_detection import detect_presses, estimate_commands
 
     placeholder = np.array([1])
