@@ -235,7 +235,7 @@ class FaultMonitor:
         # A swapped pair or an inverted fibre is the fault if it makes the readings far more likely.
         wirings = [*self._swapped(pairs, first), *self._inverted(first)]
         wiring = max(wirings, key=lambda each: each.llr, default=None)
-        if wiring and wiring.llr <= self.model.threshold:
+        if wiring and not wiring.llr > self.model.threshold:
             wiring = None
         scores = []
         for fibre in suspects:
