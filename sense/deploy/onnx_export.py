@@ -182,7 +182,7 @@ class _LocalizerModule(nn.Module):
         self, readings: Tensor, down_command: Tensor, up_command: Tensor, fibre_mask: Tensor
     ) -> tuple[Tensor, ...]:
         scaled, complete = self.features(readings, down_command, up_command)
-        fibre_mask = fibre_mask & ~torch.isnan(scaled).any(dim=2)  # a missing reading makes the sums of history NaN
+        fibre_mask = fibre_mask & ~torch.isnan(scaled).any(dim=2)  # otherwise a missing reading makes predictions NaN
         n_complete = complete.sum(dim=1)
         x = network_inputs(scaled, fibre_mask, complete)
         targets, std = self._predict(scaled, fibre_mask, x, n_complete)

@@ -59,7 +59,7 @@ class PadModel:
     free: PositionTest  # which positions (Q, 2) may be pressed
     responses: Callable[[Array, Array], PressParts[Array]]  # function of positions (Q, 2) and depths (Q,), mm
     source: dict[str, Any]  # description of the pad for the recording, JSON
-    noise_v: Array | None = None  # as in `simulate_readings`, by which it tells what the responses are
+    noise_v: Array | None = None  # noise of responses in V; None for relative changes of resistance
 
 
 def model_plan(pad: Morphology, contact: Contact, rig: RigSettings, size: PadSettings | None = None) -> PadModel:
@@ -262,8 +262,7 @@ def sample_positions(pad: Morphology, presses: int, rng: np.random.Generator, si
 def measure_rig_settings(recording: Recording) -> dict[str, float]:
     """Measure the `noise_mv`, `drift_mv` and `hysteresis_s` of `[rig]` in a recording.
 
-    Channels that miss readings or are constant are ignored. Returns {} for fewer than MIN_PRESSES, or if no channel is
-    left.
+    Channels that miss readings or are constant are ignored. Returns {} for fewer than MIN_PRESSES, or without channels.
     """
     down_command, up_command, rate_hz = recording.down_command[:-1], recording.up_command[:-1], recording.rate_hz
     valid = np.isfinite(recording.readings).all(axis=0) & (np.ptp(recording.readings, axis=0) > MIN_SCALE_V)
