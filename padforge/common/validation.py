@@ -3,7 +3,8 @@
 import math
 import re
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from numbers import Integral, Real
 from pathlib import Path
 from reprlib import repr as shortened
@@ -34,6 +35,15 @@ class InputError(ValueError):
 
     def __init__(self, message: object = "") -> None:
         super().__init__(" ".join(str(message).splitlines()))  # names of files and keys may contain line ends
+
+
+@contextmanager
+def naming_file(path: Path | str) -> Iterator[None]:
+    """Put the name of a file, or of anything else that is read, before the message of an InputError."""
+    try:
+        yield
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
 
 
 class Fault(Exception):  # noqa: N818  not an error of the program

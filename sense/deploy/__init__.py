@@ -2,5 +2,5 @@
 
 import os
 
-# read as onnxruntime is loaded, which else leaves a file with a number of its user and tells its maker what is run
+# Set before onnxruntime is loaded, which otherwise stores an identifier of the user and reports to its maker.
 os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")

@@ -1,9 +1,9 @@
 """`localizer.onnx`: the localizer as one graph, from readings and the commands of presses to positions and radii.
 
-The graph takes the readings so far and finds out which windows of each press are complete, so that it answers at every
-reading of a press. It is traced by `torch.onnx` from a torch module, which shares its networks and its Bayesian
-localizers with the rest of padforge. As a graph has no branches, all of them are evaluated, and those for the moment of
-each press selected. It is written only if onnxruntime computes from it what the localizer predicts.
+The graph takes the readings so far and determines which windows of each press are complete, so that it predicts at
+every reading of a press. It is traced by `torch.onnx` from a torch module, which shares its networks and its Bayesian
+localizers with the rest of padforge. As a graph has no branches, it evaluates all networks, and selects the output for
+the moment of each press. It is written only if its outputs in onnxruntime agree with the predictions of the localizer.
 """
 
 import io
@@ -30,16 +30,6 @@ from padforge.sense.localizer import features, moments
 from padforge.sense.localizer.bayes import PREFIX, BayesianLocalizer
 from padforge.sense.localizer.features import compute_features, interpolate_gaps
 from padforge.sense.localizer.model import MEASURE_COLUMNS, UNIFORM, LocalizerModel
-from padforge.sense.localizer.moments import (
-    BAYES_STAGES,
-    EARLY_WINDOWS,
-    N_PRESS_WINDOWS,
-    PHASES,
-    SLIDE_NETWORK,
-    SLIDE_THRESHOLD,
-    Window,
-    complete_at,
-)
 from padforge.sense.localizer.network import MAX_LOG_ERROR, MIN_LOG_ERROR, Weights
 from padforge.sense.localizer.scaler import MAX_INPUT
 from padforge.sense.localizer.torch_network import EnsembleMlp, network_inputs
@@ -47,11 +37,9 @@ from padforge.sense.recording.frames import frame_rate_hz, framed
 from padforge.sense.recording.recording import Recording
 
 FORMAT = "padforge-onnx/1"
-OPSET = 18  # of the operators: ONNX 1.13, 2022
-MAX_DIFFERENCE_MM = 1e-4
-"""A graph whose positions differ more from those of its localizer is not written."""
-N_TRIALS, TRIAL_READINGS = 64, 40
-"""Presses that are made up to test a graph where there is no recording, and readings from one to the next."""
+OPSET = 18  # version of the operators: ONNX 1.13, 2022
+MAX_DIFFERENCE_MM = 1e-4  # maximum difference between the positions of a graph and of its localizer
+N_TRIALS, TRIAL_READINGS = 64, 40  # synthetic presses that test a graph without a recording, and readings a press
 INPUTS = {
     "readings": "V, (R, C): one row a reading so far, one column a fibre, which fails where one is missing",
     "down_command": "(Q,), ascending: row of the first reading after the probe was sent down",
@@ -72,7 +60,7 @@ OUTPUTS = {
 
 
 class _Traceable:
-    """torch as `BayesianLocalizer.predict` calls it, without the argument `out`, which cannot be exported."""
+    """Replaces torch in `BayesianLocalizer.predict`, and ignores the argument `out`, which cannot be exported."""
 
     def __getattr__(self, name: str) -> Any:
         return getattr(torch, name)
@@ -97,13 +85,13 @@ class _FeatureModule(nn.Module):
             self.register_buffer(name, torch.from_numpy(getattr(model.scaler, name)))
 
     def forward(self, readings: Tensor, down_command: Tensor, up_command: Tensor) -> tuple[Tensor, Tensor]:
-        """Return (Q, C, F + G) scaled features, and (Q, K) which windows are complete."""
+        """Return the scaled features (Q, C, F + G), and whether each window is complete (Q, K)."""
         n_readings = torch.ones_like(readings[:, 0], dtype=torch.int64).sum()[None]  # a shape would be traced as fixed
         previous_end = torch.cat([torch.zeros_like(up_command[:1]), up_command[:-1]])
         until = torch.cat([down_command[1:], n_readings])
         held = torch.minimum(up_command, until)
 
-        def mean(origin: Tensor, window: Window, low: Tensor, high: Tensor) -> Tensor:
+        def mean(origin: Tensor, window: moments.Window, low: Tensor, high: Tensor) -> Tensor:
             index = torch.maximum(origin[:, None] + torch.arange(*window), low[:, None])
             return readings[torch.minimum(index, torch.minimum(high, n_readings)[:, None] - 1)].mean(dim=1)
 
@@ -119,7 +107,7 @@ class _FeatureModule(nn.Module):
 
 
 def _complete_windows(down_command: Tensor, up_command: Tensor, until: Tensor) -> Tensor:
-    """(Q, K), as `moments.complete_windows`."""
+    """Return whether each window is complete (Q, K), as `moments.complete_windows` does."""
     down_end, up_end = (
         torch.tensor([end for _, end in each]) for each in (moments.PRESS_WINDOWS, moments.RELEASE_WINDOWS)
     )
@@ -128,18 +116,12 @@ def _complete_windows(down_command: Tensor, up_command: Tensor, until: Tensor) -
     return torch.cat([down, released & (up_command[:, None] + up_end <= until[:, None])], dim=1)
 
 
-def _median(values: Tensor) -> Tensor:
-    """(Q, W, C) to (Q, C), as `np.median`."""
-    n = values.shape[1]
-    return torch.sort(values, dim=1).values[:, (n - 1) // 2 : n // 2 + 1].mean(dim=1)
-
-
 def _history(readings: Tensor, down_command: Tensor) -> Tensor:
-    """(Q, C, J) V, as `features.compute_history`."""
+    """Return the history features (Q, C, J), V, as `features.compute_history` does."""
     sums = torch.cumsum(readings - readings[:1], dim=0)
     sums = torch.cat([torch.zeros_like(sums[:1]), sums])
 
-    def mean(window: Window) -> Tensor:
+    def mean(window: moments.Window) -> Tensor:
         first = torch.clamp(down_command + window[0], min=0)
         end = torch.maximum(down_command + window[1], first + 1)
         return (sums[end] - sums[first]) / (end - first)[:, None] + readings[:1]
@@ -147,7 +129,9 @@ def _history(readings: Tensor, down_command: Tensor) -> Tensor:
     means = [mean(window) for window in features.HISTORY_WINDOWS]
     for length in features.SLOW:
         offsets = torch.arange(-length, 0, length // features.N_MEDIAN_SAMPLES)
-        means.append(_median(readings[torch.clamp(down_command[:, None] + offsets, min=0)]))
+        samples = torch.sort(readings[torch.clamp(down_command[:, None] + offsets, min=0)], dim=1).values
+        n = samples.shape[1]
+        means.append(samples[:, (n - 1) // 2 : n // 2 + 1].mean(dim=1))  # the median
     return torch.stack(means, dim=2) - mean(moments.REST)[:, :, None]
 
 
@@ -158,15 +142,15 @@ class _BayesModule(nn.Module):
         super().__init__()
         self.residual, self.n_stages = EnsembleMlp.from_numpy(residual_network), len(stages)
         for number, stage in enumerate(stages):
-            for name, array in stage.to_arrays(number).items():  # single precision is exact, and half the size
+            for name, array in stage.to_arrays(number).items():  # in single precision, which is exact
                 self.register_buffer(name.replace(".", "_"), torch.from_numpy(array))
 
     def forward(self, scaled: Tensor, fibre_mask: Tensor, x: Tensor, n_complete: Tensor) -> Tensor:
-        """Return (1, Q, 4) outputs of presses whose features are scaled and whose network inputs are x."""
+        """Return the outputs (1, Q, 4) of presses from their scaled features and network inputs x."""
         position, summary = self._predict(0, scaled, fibre_mask)
         for number in range(1, self.n_stages):
             later = self._predict(number, scaled, fibre_mask)
-            is_later = (n_complete >= BAYES_STAGES[number])[:, None]
+            is_later = (n_complete >= moments.BAYES_STAGES[number])[:, None]
             position, summary = (torch.where(is_later, *pair) for pair in zip(later, (position, summary), strict=True))
         corrected = self.residual(torch.cat([x, summary], dim=1)[None])
         return corrected + functional.pad(position, (0, 2))
@@ -198,16 +182,16 @@ class _LocalizerModule(nn.Module):
         self, readings: Tensor, down_command: Tensor, up_command: Tensor, fibre_mask: Tensor
     ) -> tuple[Tensor, ...]:
         scaled, complete = self.features(readings, down_command, up_command)
-        fibre_mask = fibre_mask & ~torch.isnan(scaled).any(dim=2)  # or one missing reading would spoil all presses
+        fibre_mask = fibre_mask & ~torch.isnan(scaled).any(dim=2)  # otherwise a missing reading makes predictions NaN
         n_complete = complete.sum(dim=1)
         x = network_inputs(scaled, fibre_mask, complete)
         targets, std = self._predict(scaled, fibre_mask, x, n_complete)
         *followed, moved = self._follow(scaled, fibre_mask, complete)
-        slid = (n_complete >= N_PRESS_WINDOWS) & (moved > SLIDE_THRESHOLD)
+        slid = (n_complete >= moments.N_PRESS_WINDOWS) & (moved > moments.SLIDE_THRESHOLD)
         targets, std = (torch.where(slid[:, None], *pair) for pair in zip(followed, (targets, std), strict=True))
-        n_failed, moment = (~fibre_mask).sum(dim=1), torch.where(slid, N_PRESS_WINDOWS - 1, n_complete)
+        n_failed, moment = (~fibre_mask).sum(dim=1), torch.where(slid, moments.N_PRESS_WINDOWS - 1, n_complete)
         factors = self.interval_factors[moment, torch.clamp(n_failed, max=self.interval_factors.shape[1] - 1)]
-        blind = ~fibre_mask.any(dim=1) | (n_complete == 0)  # which may be anywhere
+        blind = ~fibre_mask.any(dim=1) | (n_complete == 0)  # such a press may be anywhere
         radius = torch.linalg.vector_norm(std[:, :2], dim=1)
 
         def unless_blind(value: Tensor, otherwise: float) -> Tensor:
@@ -225,9 +209,9 @@ class _LocalizerModule(nn.Module):
         return tuple(values)
 
     def _predict(self, scaled: Tensor, fibre_mask: Tensor, x: Tensor, n_complete: Tensor) -> tuple[Tensor, Tensor]:
-        """Return (Q, N) targets and their standard deviations, as `network.predict`."""
+        """Return the targets (Q, N) and their standard deviations, as `network.predict` does."""
         outputs: Any = 0.0
-        for name, phase in PHASES[moments.N_TIMED].items():
+        for name, phase in moments.PHASES[moments.N_TIMED].items():
             network = self.networks[name]
             answers = (n_complete >= phase.first) & (n_complete < phase.first + len(phase.shares))
             outputs = torch.where(answers[:, None], network(x.expand(network.n_members, -1, -1)), outputs)
@@ -235,34 +219,34 @@ class _LocalizerModule(nn.Module):
         if self.bayes is None:
             return combined
         corrected = _combine_members(torch.cat([outputs, self.bayes(scaled, fibre_mask, x, n_complete)]))
-        is_corrected = (n_complete >= BAYES_STAGES[0])[:, None]
+        is_corrected = (n_complete >= moments.BAYES_STAGES[0])[:, None]
         targets, std = (torch.where(is_corrected, *pair) for pair in zip(corrected, combined, strict=True))
         return targets, std
 
     def _follow(self, scaled: Tensor, fibre_mask: Tensor, complete: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """`Sliding.follow`."""
-        network, n_timed = self.networks[SLIDE_NETWORK], moments.N_TIMED
+        """Return targets, standard deviations and the relative motion, as `Sliding.follow` does."""
+        network, n_timed = self.networks[moments.SLIDE_NETWORK], moments.N_TIMED
 
         def predict_from(scaled: Tensor, n_complete: int) -> tuple[Tensor, Tensor]:
             x = network_inputs(scaled, fibre_mask, complete & (torch.arange(n_timed) < n_complete))
             return _combine_members(network(x.expand(network.n_members, -1, -1)))
 
-        targets, std = predict_from(scaled, N_PRESS_WINDOWS)
+        targets, std = predict_from(scaled, moments.N_PRESS_WINDOWS)
         now = [
-            scaled[:, :, EARLY_WINDOWS - 1 - k] * self.now_factor[:, k, EARLY_WINDOWS - 1 - k]
-            + self.now_offset[:, k, EARLY_WINDOWS - 1 - k]
+            scaled[:, :, moments.EARLY_WINDOWS - 1 - k] * self.now_factor[:, k, moments.EARLY_WINDOWS - 1 - k]
+            + self.now_offset[:, k, moments.EARLY_WINDOWS - 1 - k]
             for k in range(len(moments.LATEST_WINDOWS))
         ]
         modulation = scaled[:, :, n_timed + len(now) :]
         soon, soon_std = predict_from(
-            torch.cat([scaled[:, :, :n_timed], torch.stack(now, dim=2), modulation], dim=2), EARLY_WINDOWS
+            torch.cat([scaled[:, :, :n_timed], torch.stack(now, dim=2), modulation], dim=2), moments.EARLY_WINDOWS
         )
         distance, expected = (torch.linalg.vector_norm(each[:, :2], dim=1) for each in (targets - soon, soon_std))
         return targets, std, distance / torch.clamp(expected, min=1e-9)
 
 
 def _combine_members(outputs: Tensor) -> tuple[Tensor, Tensor]:
-    """(E, Q, 2 N) outputs to (Q, N) targets and their standard deviations, as `network.combine_members`."""
+    """Return targets (Q, N) and their standard deviations from outputs (E, Q, 2 N); see `network.combine_members`."""
     targets, log_errors = outputs.chunk(2, dim=2)
     variance = 2 * torch.exp(2 * torch.clip(log_errors, MIN_LOG_ERROR, MAX_LOG_ERROR))
     pooled = variance[:, :, :2].mean(dim=2, keepdim=True)
@@ -273,13 +257,13 @@ def _combine_members(outputs: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _build_graph(model: LocalizerModel, digest: str) -> onnx.ModelProto:
-    """Export a localizer of method "ensemble" as a graph for any number of presses and readings."""
-    arguments = tuple(map(torch.from_numpy, (*_made_up_presses(model), np.ones((N_TRIALS, model.fibres), bool))))
+    """Trace a localizer of method "ensemble" as a graph for any number of presses and readings."""
+    arguments = tuple(map(torch.from_numpy, (*_synthetic_presses(model), np.ones((N_TRIALS, model.fibres), bool))))
     names = [*list(OUTPUTS)[:4], *(name for each in model.scaler.measures for name in MEASURE_COLUMNS[each.name])]
     axes = {"readings": {0: "readings"}} | {name: {0: "presses"} for name in [*list(INPUTS)[1:], *names]}
     content = io.BytesIO()
     with warnings.catch_warnings(), one_thread(), torch.no_grad():
-        warnings.simplefilter("ignore")  # the exporter is deprecated, and constants are traced as such
+        warnings.simplefilter("ignore")  # of the deprecated exporter, and of values that are traced as constants
         torch.onnx.export(
             _LocalizerModule(model),
             arguments,
@@ -294,7 +278,7 @@ def _build_graph(model: LocalizerModel, digest: str) -> onnx.ModelProto:
     graph = onnx.load_model_from_string(content.getvalue())
     for each in (*graph.graph.input, *graph.graph.output):
         each.doc_string = (INPUTS | OUTPUTS)[each.name]
-    for each in graph.graph.output[:2]:  # positions and deviations, whose size is traced as unknown
+    for each in graph.graph.output[:2]:  # the size of positions and deviations is traced as unknown
         each.type.tensor_type.shape.dim[1].dim_value = 2
     graph.producer_name = "padforge"
     metadata = {
@@ -314,12 +298,12 @@ def _build_graph(model: LocalizerModel, digest: str) -> onnx.ModelProto:
 
 @dataclass(frozen=True)
 class OnnxReport:
-    """A written graph, and how it compares with its localizer."""
+    """Size of a written graph, and its differences from its localizer."""
 
     size: int  # bytes of the file
-    n_presses: int  # that it was tested on
-    max_failures: int  # fibres that were masked in the tests, at most
-    position_difference_mm: float  # the largest
+    n_presses: int  # number of presses that it was tested on
+    max_failures: int  # maximum number of fibres that were masked in the tests
+    position_difference_mm: float  # the largest, like the next
     r90_difference_mm: float
 
     @property
@@ -335,9 +319,9 @@ class OnnxReport:
 def export_onnx(model: LocalizerModel, digest: str, path: Path, recording: Recording | None = None) -> OnnxReport:
     """Write a localizer, whose `localizer.json` has the SHA-256 `digest`, as an ONNX graph.
 
-    It is tested on the presses of a recording, or on made-up ones. Raises InputError for a localizer of the published
-    method or of arrays, a recording of another pad or rate, or a path that cannot be written; Fault if positions differ
-    by more than MAX_DIFFERENCE_MM.
+    The graph is tested on the presses of a recording, or on synthetic ones. Raises InputError for a localizer of the
+    published method or of arrays, a recording of another pad or rate, or a path that cannot be written; Fault if
+    positions differ by more than MAX_DIFFERENCE_MM.
     """
     if model.method != "ensemble":
         raise InputError(f"the localizer is of method {model.method}, expected ensemble: calibrate again")
@@ -348,7 +332,7 @@ def export_onnx(model: LocalizerModel, digest: str, path: Path, recording: Recor
         frames = framed(recording)
         trial = frames.readings, frames.down_command, frames.up_command
     else:
-        trial = _made_up_presses(model)
+        trial = _synthetic_presses(model)
     content = _build_graph(model, digest).SerializeToString()
     positions, radii = _compare(model, content, *trial)
     if not positions <= MAX_DIFFERENCE_MM:
@@ -361,8 +345,8 @@ def export_onnx(model: LocalizerModel, digest: str, path: Path, recording: Recor
     return OnnxReport(len(content), len(trial[1]), model.max_failures, positions, radii)
 
 
-def _made_up_presses(model: LocalizerModel) -> tuple[Array, Indices, Indices]:
-    """Return noise with presses as strong as those of the training, and their commands."""
+def _synthetic_presses(model: LocalizerModel) -> tuple[Array, Indices, Indices]:
+    """Return readings of noise and presses of the size of those in the training, and their commands."""
     rng, scaler = np.random.default_rng(0), model.scaler
     down_command = TRIAL_READINGS // 2 + TRIAL_READINGS * np.arange(N_TRIALS)
     up_command = down_command + moments.PRESS_WINDOWS[-1][1]
@@ -376,12 +360,12 @@ def _made_up_presses(model: LocalizerModel) -> tuple[Array, Indices, Indices]:
 def _compare(
     model: LocalizerModel, content: bytes, readings: Array, down_command: Indices, up_command: Indices
 ) -> tuple[float, float]:
-    """Return the largest differences of positions and of radii, mm, of whole presses and at every moment of one."""
+    """Return the largest differences of positions and of radii, mm: complete presses, and every moment of the last."""
     session = onnxruntime.InferenceSession(content, providers=["CPUExecutionProvider"])
     filled, last, with_previous = interpolate_gaps(readings), slice(-1, None), slice(-2, None)
     commands = down_command, up_command
     # The readings after the last press may end before all of its windows are complete.
-    ends = {min(int(complete_at(n, *commands)[-1]), len(readings)) for n in range(1, moments.N_TIMED + 1)}
+    ends = {min(int(moments.complete_at(n, *commands)[-1]), len(readings)) for n in range(1, moments.N_TIMED + 1)}
     trials = [(slice(None), compute_features(readings, *commands), filled, *commands)]
     for end in sorted(end for end in ends if end > down_command[-1] + 1):
         until = np.full(len(down_command), end)

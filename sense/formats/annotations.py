@@ -1,4 +1,4 @@
-"""What a trained model predicts for the presses and fibres of a recording, as exports carry it."""
+"""Predictions of a trained model for the presses and fibres of a recording, to be exported with it."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,39 +11,29 @@ from padforge.sense.recording.recording import Recording
 
 @dataclass(frozen=True)
 class FaultAnnotation:
-    """A fault of fibres (indices) that a model names at a press (index): its kind, one word, and a line of text."""
+    """A fault that a model detected."""
 
-    press: int
-    fibres: tuple[int, ...]
-    kind: str
-    text: str
+    press: int  # index of the press at which it was detected
+    fibres: tuple[int, ...]  # indices
+    kind: str  # one word
+    text: str  # one line
 
 
 @dataclass(frozen=True)
 class ModelAnnotations:
-    """Predictions for Q presses.
+    """Predictions for Q presses."""
 
-    Attributes:
-        positions_mm: (Q, 2).
-        std_mm: (Q, 2) standard deviations.
-        r90_mm: (Q,) radius that holds the true position in 90 % of presses.
-        depths_mm: (Q,) NaN where the model predicts no depth.
-        depths_r90_mm: (Q,) error of the depth that 90 % of presses stay below.
-        faults: in the order of presses; None if the model has no health model.
-        dead: indices of fibres that never responded.
-    """
-
-    positions_mm: Array
-    std_mm: Array
-    r90_mm: Array
-    depths_mm: Array
-    depths_r90_mm: Array
-    faults: Sequence[FaultAnnotation] | None = None
-    dead: Sequence[int] = ()
+    positions_mm: Array  # shape (Q, 2)
+    std_mm: Array  # standard deviations of the positions; shape (Q, 2)
+    r90_mm: Array  # radius that contains the true position in 90 % of presses; shape (Q,)
+    depths_mm: Array  # NaN if the model predicts none; shape (Q,)
+    depths_r90_mm: Array  # half width of the 90 % interval of the depth; shape (Q,)
+    faults: Sequence[FaultAnnotation] | None = None  # in the order of presses; None if there is no health model
+    dead: Sequence[int] = ()  # indices of fibres that never responded
 
 
 def check_export(recording: object, path: object, annotations: object = None) -> Path:
-    """Check the arguments of an export, and return the path; raise InputError where one is of another type."""
+    """Check the types of the arguments of an export, and return the path."""
     check_type("recording", recording, Recording)
     if annotations is not None:
         check_type("annotations", annotations, ModelAnnotations)

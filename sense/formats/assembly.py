@@ -1,6 +1,7 @@
-"""The recording in the arrays of a foreign file: its readings, their times, and its presses.
+"""Assembly of a recording from the arrays of a foreign file: readings, their times, and presses.
 
-What cannot be right is refused, or put right where that is certain, in one line that names the mapping to mend it.
+Values that cannot be right are corrected if the correction is certain, with a note, or else refused, with the mapping
+that would be right.
 """
 
 import re
@@ -13,9 +14,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from padforge.common.validation import InputError
+from padforge.common.validation import InputError, naming_file
 from padforge.sense.arrays import MAX_VOLTS, Array, Indices, Mask, check_numbers
-from padforge.sense.formats.columns import ColumnEntry, naming_file
+from padforge.sense.formats.columns import ColumnEntry
 from padforge.sense.recording.doubts import rate_doubts, suggest_unit
 from padforge.sense.recording.recording import (
     FIBRE_NAMES,
@@ -28,55 +29,41 @@ from padforge.sense.recording.recording import (
 from padforge.sense.recording.tables import UNKNOWN, name_lines
 
 Arrays = Sequence[tuple[ColumnEntry, NDArray[Any]]]
-"""Arrays of a file, each with its entry of the mapping and its own name."""
+"""Arrays of a file, each with its entry of the mapping."""
 MEASURES = {"depth": "depths_mm", "reached": "reached_mm", "force": "forces_n"}
 """Quantities with one value a press, and their attributes of a `Recording`."""
 MAX_GAP = 3  # readings without a position that are bridged within a press
-MAX_JITTER_MM = 0.5  # between two readings, of a position that an arm or camera measures within a press
-MAX_NOISE_SHARE = 0.1  # of the largest force, below 0: a load cell that is not quite at 0
-MAX_UNTIMED_SHARE = 0.05  # of readings without a time that are left out
-MAX_LATE_SHARE = 0.01  # of readings whose times go back and that are left out
+MAX_JITTER_MM = 0.5  # change of a position, measured by an arm or camera within a press, from one reading to the next
+MAX_NOISE_SHARE = 0.1  # size of a negative force relative to the largest one: the offset of a load cell
+MAX_UNTIMED_SHARE = 0.05  # fraction of readings that are left out since they have no time
+MAX_LATE_SHARE = 0.01  # fraction of readings that are left out since their times go back
 WRAPS_S = (2**32 / 1e6, 2**32 / 1e3, 2**16 / 1e3, 2**16 / 1e6, 86400.0, 43200.0)
-"""After which the clocks of boards begin anew: counters of us and ms with 32 and 16 bits, and times of day."""
+"""Periods of the clocks of boards: counters of us and ms with 32 and 16 bits, and times of day."""
 
 
 @dataclass
 class ForeignArrays:
-    """What was read of a file by a mapping.
+    """The content of a file, read by a mapping.
 
-    Attributes:
-        path: of the file, for messages.
-        arrays: `time` and `press` have R values; `fibres` is (R, C), (C, R), (R,) or frames (R, h, w), in one array or
-            several; `positions` is (n, 2) or (2, n), and x and y are (n,), for n readings or presses.
-        source: of the recording; the names of the fibres are added.
-        notes: what was left out in reading, each in one line.
-        line_number: number of the line of a row, for messages; by default rows are named, from 0.
-        is_own: whether padforge wrote the file: positions are exact, and every line is a reading.
-        is_held: whether values hold until the next, so that a position does not say when the pad is pressed.
+    Of the arrays, `time` and `press` have R values; `fibres` is (R, C), (C, R), (R,) or frames (R, h, w), in one array
+    or several; `positions` is (n, 2) or (2, n), and x and y are (n,), for n readings or presses.
     """
 
     path: Path
     arrays: Arrays
-    source: Mapping[str, Any]
-    notes: list[str] = field(default_factory=list)
-    line_number: Callable[[int], int] | None = None
-    is_own: bool = False
-    is_held: bool = False
+    source: Mapping[str, Any]  # source of the recording, without the names of its fibres
+    notes: list[str] = field(default_factory=list)  # a line for each omission in reading
+    line_number: Callable[[int], int] | None = None  # returns the line of a row, for messages; by default rows, from 0
+    is_own: bool = False  # whether padforge wrote the file, so that positions are exact and every line is a reading
+    is_held: bool = False  # whether values hold until the next one, so that a position does not mean a press
 
 
 def assemble_recording(content: ForeignArrays, presses: Arrays = ()) -> Recording:
-    """Make a recording of the arrays of a file.
+    """Return the recording in the arrays of a file; `presses` from a separate table replace those in the file.
 
-    Presses are where `down_command` and `up_command` are, else `press`, else where positions are missing between
-    presses; or they are detected in the readings. Of positions, depths and forces with one value a reading, a press
-    gets the one in its middle.
-
-    Args:
-        content: of the file.
-        presses: of a table of their own, as `read_presses` returns them; in place of what the file says of presses.
-
-    Raises:
-        InputError: arrays that do not fit together, or that are no recording.
+    Presses are defined by `down_command` and `up_command`, or else by `press`, or else by positions that are missing
+    between presses; otherwise they are detected in the readings. Of positions, depths and forces with one value a
+    reading, a press gets the one in its middle. Raises InputError for arrays that are inconsistent or no recording.
     """
     with naming_file(content.path):
         return _assemble(content, presses)
@@ -101,16 +88,19 @@ def _assemble(content: ForeignArrays, presses: Arrays) -> Recording:
     fibres = [(entry, _by_readings(values, len(times))) for entry, values in fibres]
     readings = fibres[0][1] if len(fibres) == 1 else np.column_stack([values for _, values in fibres])
     if not np.nanmax(np.abs(readings), initial=0) <= MAX_VOLTS:
-        _check_volts(readings, content.source)
+        level_v = float(np.nanmedian(np.abs(readings)))
+        if np.isfinite(level_v) and level_v > MAX_VOLTS:
+            hint = suggest_unit(content.source, "fibres", readings)
+            raise InputError(f"fibres rest at {level_v:.4g} V, allowed is {MAX_VOLTS:g} V; are they {hint}?")
     names = [name for each in fibres for name in _fibre_names(*each)]
-    # 1. lines without a reading, and times
+    # 1. Leave out lines without a reading, and repair times.
     with_values = {name: values for name, values in columns.items() if len(values) == len(times)}
     keep, is_held = np.ones(len(times), bool), content.is_held
     if not content.is_own:
         keep = ~np.isnan(readings).all(axis=1)
         if not keep.all() and keep.any():
             present = [~np.isnan(values.reshape(len(times), -1)).all(axis=1) for values in with_values.values()]
-            if present and not np.any(present & keep):  # a table of several sources, each with lines of its own
+            if present and not np.any(present & keep):  # a table of several sources, which write separate lines
                 is_held = True
                 columns |= {name: _hold(values) for name, values in with_values.items()}
             notes.append(f"{(~keep).sum()} lines without any reading are no readings")
@@ -119,10 +109,10 @@ def _assemble(content: ForeignArrays, presses: Arrays) -> Recording:
     if len(rows) < len(is_timed):
         readings, times = readings[rows], times[rows]
         columns = {name: values[rows] if len(values) == len(is_timed) else values for name, values in columns.items()}
-    # 2. presses
+    # 2. Find the presses.
     timed = {entry.quantity for entry, _ in arrays if entry.factor is not None}
     for name in timed & {"down_command", "up_command"}:
-        # A thousandth of an interval is allowed for: times that were converted to another unit and back are rounded.
+        # The tolerance is for times that were converted to another unit and back, and rounded.
         tolerance = 1e-3 * np.median(np.diff(times)) if len(times) > 1 else 0.0
         columns[name] = np.searchsorted(times, columns[name] - tolerance).astype(np.float64)
     columns = _within(columns, len(times), notes) if presses else columns
@@ -156,9 +146,9 @@ def _assemble(content: ForeignArrays, presses: Arrays) -> Recording:
         return values[rows[np.clip((down + up) // 2, 0, len(times) - 1)]]
 
     measures = {name: at_presses(MEASURES[name], columns[name]) for name in MEASURES if name in columns}
-    for name in measures.keys() & {"force", "depth"}:
-        entry = next(entry for entry, _ in arrays if entry.quantity == name)
-        measures[name] = _upright(entry, measures[name], notes)
+    entries = {entry.quantity: entry for entry, _ in arrays}  # the last one, that of the table of presses, counts
+    for name in [name for name in ("depth", "force") if name in measures]:
+        measures[name] = _upright(entries[name], measures[name], notes)
     presses_mm = np.full((len(down), 2), np.nan) if positions is None else at_presses("positions", positions)
     presses_mm = np.where(presses_mm == UNKNOWN, np.nan, presses_mm)
     source |= {NOTE: "; ".join(notes)} if notes else {}
@@ -167,7 +157,7 @@ def _assemble(content: ForeignArrays, presses: Arrays) -> Recording:
 
 
 def _scale(entry: ColumnEntry, array: NDArray[Any]) -> Array:
-    """Return values in s, V, mm or N; UNKNOWN stays what it is."""
+    """Convert values to s, V, mm or N; UNKNOWN is not converted."""
     array = np.asarray(array)
     array = array.astype(np.uint8) if array.dtype.kind == "b" else array
     values = check_numbers(array, np.float64, entry.quantity, copy=False)
@@ -187,23 +177,15 @@ def _by_readings(values: Array, n_readings: int) -> Array:
 
 
 def _fibre_names(entry: ColumnEntry, values: Array) -> list[str]:
-    """Return the names of (R, c) readings from an array: its own, with an index where it holds several fibres."""
+    """Return the names of the fibres in an array (R, c): its name, with an index if it holds several fibres."""
     if not entry.index and values.shape[1] == 1:
         return [entry.name]
     first = int(re.search(r"\d*", entry.index.lstrip("[:, "))[0] or 0)  # type: ignore[index]
     return [f"{entry.name}[{first + i}]" for i in range(values.shape[1])]
 
 
-def _check_volts(readings: Array, source: Mapping[str, Any]) -> None:
-    """Raise InputError if finite readings are beyond what is allowed, with the factor that counts would have."""
-    level_v = float(np.nanmedian(np.abs(readings)))
-    if np.isfinite(level_v) and level_v > MAX_VOLTS:
-        hint = suggest_unit(source, "fibres", readings)
-        raise InputError(f"fibres rest at {level_v:.4g} V, allowed is {MAX_VOLTS:g} V; are they {hint}?")
-
-
 def _hold(values: Array) -> Array:
-    """Return values (n, ...) that hold until the next."""
+    """Fill missing values (n, ...) by the last one before them."""
     missing = np.isnan(values.reshape(len(values), -1)).all(axis=1)
     last = np.maximum.accumulate(np.where(missing, -1, np.arange(len(values))))
     return np.where((last < 0).reshape(-1, *[1] * (values.ndim - 1)), np.nan, values[np.maximum(last, 0)])
@@ -212,22 +194,16 @@ def _hold(values: Array) -> Array:
 def repair_times(
     times_s: Array, notes: list[str], line_number: Callable[[int], int] | None, readings: Mask
 ) -> tuple[Array, Mask]:
-    """Put right times that do not ascend, where that is certain.
+    """Correct times that do not ascend; return them (n,) and whether each is the time of a reading (n,).
 
-    A clock that begins anew goes on; readings whose times go back are left out, if they are few; equal times are
-    spread between their neighbours.
+    The wrap of a clock is added; readings whose times are missing or go back are left out if they are few, otherwise
+    InputError is raised; equal times are spread between their neighbours. Each correction adds to the `notes`.
 
     Args:
-        times_s: NaN where missing; shape (n,), s.
-        notes: of the recording, to which what was done is added.
-        line_number: number of the line of a row.
-        readings: rows that are readings; shape (n,).
-
-    Returns:
-        Times (n,), and which of them are those of readings (n,).
-
-    Raises:
-        InputError: times go back where no clock wraps.
+        times_s: times, NaN where missing; shape (n,), s.
+        notes: notes of the recording.
+        line_number: returns the number of the line of a row.
+        readings: whether each row is a reading; shape (n,).
     """
 
     def name_rows(rows: Indices) -> str:
@@ -244,24 +220,20 @@ def repair_times(
     steps = np.diff(times)
     if not (steps <= 0).any():
         return times_s, np.isin(np.arange(len(times_s)), rows) if len(rows) < len(times_s) else readings
-    # 1. clocks that begin anew
+    # 1. Add the wraps of clocks.
     usual = float(np.median(steps[steps > 0])) if (steps > 0).any() else 0.0
     offsets, n_wraps = np.zeros(len(times)), 0
     for row in np.flatnonzero(steps < 0):
         for wrap in WRAPS_S:
-            # A counter was below its wrap and nearly there, and many readings fit in: not two lines that were swapped.
+            # A wrap needs a clock just below it, and a period of many readings; otherwise two lines were swapped.
             if 0 < steps[row] + wrap <= 5 * usual < 0.1 * wrap and 0 <= times[row] < wrap:
                 offsets[row + 1 :] += wrap
                 n_wraps += 1
                 break
     times = times + offsets
     if n_wraps:
-        notes.append(
-            f"the clock began anew {n_wraps} times; times go on"
-            if n_wraps > 1
-            else "the clock began anew once; times go on"
-        )
-    # 2. single times that go back: the longest part in order stays
+        notes.append(f"the clock began anew {'once' if n_wraps == 1 else f'{n_wraps} times'}; times go on")
+    # 2. Leave out single times that go back, so that the longest sequence in order remains.
     if (np.diff(times) < 0).any():
         in_order = _longest_ascent(times)
         late = np.setdiff1d(np.arange(len(times)), in_order)
@@ -272,13 +244,13 @@ def repair_times(
             raise InputError(f"{what}, expected every reading later than the one before; are there several runs in it?")
         notes.append(f"{name_rows(rows[late])} left out: times go back")
         times, rows = times[in_order], rows[in_order]
-    # 3. equal times
+    # 3. Spread equal times.
     starts = np.flatnonzero(np.append(True, np.diff(times) > 0))
     if len(starts) < len(times):
         if len(starts) == 1:
             raise InputError(f"times are all {times[0]:g} s, expected every reading later than the one before")
         notes.append(f"{len(times) - len(starts)} times equal the one before; they are spread between their neighbours")
-        # A time that several readings share is that of the middle one; at the ends readings follow at the mean rate.
+        # A shared time is that of the middle reading; at both ends readings are extrapolated at the mean rate.
         middles = (starts + np.append(starts[1:], len(times)) - 1) / 2
         interval = (times[-1] - times[0]) / (middles[-1] - middles[0])
         ends_s = times[0] - interval * middles[0], times[-1] + interval * (len(times) - 1 - middles[-1])
@@ -305,7 +277,7 @@ def _longest_ascent(values: Array) -> Indices:
 
 
 def _within(columns: Mapping[str, Array], n_readings: int, notes: list[str]) -> dict[str, Array]:
-    """Leave out the presses of a table that lie outside of the readings."""
+    """Return the columns without the presses of a table that lie outside of the readings."""
     down, up = columns["down_command"], columns["up_command"]
     is_within = (down >= 1) & (up > down) & (down < n_readings)
     if not is_within.any():
@@ -316,7 +288,7 @@ def _within(columns: Mapping[str, Array], n_readings: int, notes: list[str]) -> 
 
 
 def _upright(entry: ColumnEntry, values: Array, notes: list[str]) -> Array:
-    """Return depths or forces of presses, which point down; a force little below 0 is 0."""
+    """Return depths or forces of presses; a force little below 0 becomes 0, and a sign that is inverted is refused."""
     if np.nanmedian(np.append(values, np.nan) if np.isnan(values).all() else values) < 0:
         factor = -1 if entry.factor is None else -entry.factor
         what = f"{entry.quantity} is below 0 in most presses, such as {np.nanmin(values):g}"
@@ -347,7 +319,7 @@ def _join_positions(columns: Mapping[str, Array]) -> Array | None:
 def _find_presses(
     columns: Mapping[str, Array], positions: Array | None, n_readings: int, jitter_mm: float
 ) -> tuple[Indices, Indices] | None:
-    """Return the (Q,) down and up commands that the columns say; None if they say nothing."""
+    """Return the down and up commands (Q,) that the columns define; None if they define none."""
     if "down_command" in columns:
         down, up = (check_numbers(columns[name], np.int64, name) for name in ("down_command", "up_command"))
         if len(down) != len(up):
@@ -363,24 +335,20 @@ def _find_presses(
         return _find_runs(press[:, None], _is_pressed(press), 0.0)
     if positions is None or len(positions) != n_readings:
         return None
-    missing = np.isnan(positions)
-    incomplete = missing[:, 0] != missing[:, 1]
-    if incomplete.any():
-        raise InputError(f"positions have one of x and y in row {int(np.argmax(incomplete))}, expected both or neither")
-    pressed = ~missing[:, 0]
+    pressed = ~np.isnan(positions[:, 0])  # x and y are both known or both unknown
     if not pressed.any() or pressed.all():
         return None
     down, up = _find_runs(positions, pressed, jitter_mm)
-    # A position that is known from some reading on, at several places, does not say when the pad is pressed.
+    # Positions that are known from some reading on do not tell when the pad is pressed.
     is_late = jitter_mm > 0 and len(down) > 1 and pressed[down[0] :].all()
     return None if is_late else (down, up)
 
 
 def _bridge_gaps(positions: Array, jitter_mm: float) -> Indices:
-    """Return which of (R, 2) positions each reading takes, (R,): its own, or in a short gap the last before it.
+    """Return the row (R,) of the positions (R, 2) for each reading: its own, or in a short gap the last one before it.
 
-    A gap is short if it has MAX_GAP readings at most, fewer than half a rest between presses, and the same position
-    before and after.
+    A short gap has at most MAX_GAP readings, fewer than half of a rest between presses, and the same position before
+    and after it.
     """
     positioned = np.flatnonzero(~np.isnan(positions[:, 0]))
     before, after = positioned[:-1], positioned[1:]
@@ -397,7 +365,7 @@ def _bridge_gaps(positions: Array, jitter_mm: float) -> Indices:
 
 
 def _is_pressed(press: Array) -> Mask:
-    """Return (R,) where `press` is not 0, or where it is neither missing nor negative."""
+    """Return whether each value (R,) is positive; unpressed values must be all 0, or all missing or negative."""
     missing, zero = ~(press >= 0), press == 0
     if missing.any() and zero.any():
         raise InputError(
@@ -412,9 +380,9 @@ def _is_pressed(press: Array) -> Mask:
 
 
 def _find_runs(values: Array, pressed: Mask, jitter: float) -> tuple[Indices, Indices]:
-    """Return the down and up commands of presses: runs of readings that are pressed, of values (R, k) that stay.
+    """Return the down and up commands of presses: runs of pressed readings with about constant values (R, k).
 
-    From one reading of a run to the next, values change by the jitter at most.
+    From one reading of a run to the next, values change by at most `jitter`.
     """
     steps = np.vstack([np.full((1, values.shape[1]), np.nan), np.abs(np.diff(values, axis=0))])
     down = np.flatnonzero(pressed & ~(steps <= jitter).all(axis=1))

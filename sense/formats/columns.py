@@ -1,15 +1,14 @@
-"""What the columns, datasets or topics of a foreign file hold, and the recording in them.
+"""The mapping of the columns, datasets or topics of a foreign file to quantities.
 
 A mapping such as `time=t_ms:ms,fibres=ch*:mV,x=px,y=py` has entries QUANTITY=NAME or QUANTITY=NAME:UNIT. In a name `*`
-stands for any characters and `?` for any one, also for a comma or a colon; `NAME[1]` and `NAME[1:5]` are columns of an
-array, from 0 and without the last as in Python, and `2-5` are columns of a table without header, from 1. A unit is one
-of `UNITS` or a factor, such as 0.001; without any, times are s, readings V, positions and depths mm, and forces N.
-`rate=20` stands for `time` where readings have none: Hz.
+stands for any characters and `?` for any one, also for a comma or a colon. `NAME[1]` and `NAME[1:5]` are columns of an
+array, which count from 0 and exclude the last as in Python; `2-5` are columns of a table without header, which count
+from 1. A unit is one of `UNITS` or a factor, such as 0.001; by default times are in s, readings in V, positions and
+depths in mm, and forces in N. `rate=20`, in Hz, replaces `time` in a file without times.
 """
 
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence, Set
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence, Set
 from fnmatch import fnmatchcase
 from math import isfinite
 from pathlib import Path
@@ -31,32 +30,29 @@ UNITS: dict[str, Mapping[str, float]] = {
     "press": {},
     **dict.fromkeys(("down_command", "up_command", "down", "up", "duration"), _SECONDS),
 }
-"""Quantities that a mapping may name, and their units in s, V, mm or N.
+"""Quantities that a mapping may name, and the factors of their units to s, V, mm or N.
 
-`positions` are x and y in one array. `depth` was commanded and `reached` was measured. `press` numbers the presses, or
-is 1 while the pad is pressed. `down_command` and `up_command` are indices of readings, or times if they have a unit;
-`down`, `up` and `duration` are of a table of presses.
+`positions` are x and y in one array. `depth` is the commanded one, `reached` the measured one. `press` numbers the
+presses, or is 1 while the pad is pressed. `down_command` and `up_command` are indices of readings, or times if they
+have a unit; `down`, `up` and `duration` are columns of a table of presses.
 """
 DATASETS = tuple(name for name in UNITS if name not in ("down", "up", "duration"))
 """Quantities that a dataset or a variable may hold."""
-_MAX_LISTED = 12
+_MAX_LISTED = 12  # names in a message
 _NUMBER = re.compile(r"\d{1,9}")
 _INDEX = re.compile(r"(.+?)(\[(?:: ?, ?)?\d*:?\d*\])")
 
 
 class ColumnEntry(NamedTuple):
-    """A quantity, the name or pattern of its column, the factor to s, V, mm or N, and which columns of an array it is.
-
-    The factor is None without a unit, and the index "" for all columns.
-    """
+    """An entry of a mapping."""
 
     quantity: str
-    name: str
-    factor: float | None = None
-    index: str = ""
+    name: str  # name or pattern of the columns
+    factor: float | None = None  # to s, V, mm or N; None without a unit
+    index: str = ""  # which columns of an array; "" for all
 
     def select(self, values: NDArray[Any]) -> NDArray[Any]:
-        """Return the columns of an array that the index names; columns are what an array has fewer of than rows."""
+        """Return the columns of an array that the index names; the shorter axis of an array is that of its columns."""
         if not self.index:
             return values
         if values.ndim != 2:
@@ -70,22 +66,13 @@ class ColumnEntry(NamedTuple):
         return columns
 
 
-@contextmanager
-def naming_file(path: Path | str) -> Iterator[None]:
-    """Put what is read before the message of an InputError."""
-    try:
-        yield
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from error
-
-
 def check_import(path: object, columns: object) -> tuple[Path, str]:
-    """Check the arguments of an import, a path and the text of a mapping, and return them."""
+    """Check and return the arguments of an import, a path and the text of a mapping."""
     return check_path("path", path), check_type("columns", columns, str)
 
 
 def parse_columns(text: str, quantities: Sequence[str] = DATASETS) -> list[ColumnEntry]:
-    """Return the entries of a mapping of these quantities, in its order; `fibres` may have several."""
+    """Return the entries of a mapping, in its order; only `fibres` may have several."""
     entries = [_parse_entry(entry.strip(), quantities) for entry in re.split(r",(?![^\[\]]*\])", text)]
     named = [entry.quantity for entry in entries]
     for quantity in named:
@@ -145,17 +132,17 @@ def _parse_unit(quantity: str, unit: str) -> float:
 
 
 def matches(name: str, pattern: str) -> bool:
-    """Whether a name is that of an entry, or matches its pattern."""
+    """Return whether a name is that of an entry, or matches its pattern."""
     if (span := re.fullmatch(r"(\d+)-(\d+)", pattern)) and name.isdecimal():
         return int(span[1]) <= int(name) <= int(span[2])
-    return name == pattern or fnmatchcase(name, pattern.replace("[", "[[]"))  # brackets hold units, no characters
+    return name == pattern or fnmatchcase(name, pattern.replace("[", "[[]"))  # a bracket is literal: it holds a unit
 
 
 def match_columns(entries: Sequence[ColumnEntry], names: Sequence[str]) -> list[tuple[ColumnEntry, int]]:
-    """Return the columns that entries name, each with its own name and its index: fibres last, others once each.
+    """Return an entry, with the name of its column, and an index for each column that entries name; fibres come last.
 
-    A pattern leaves out the columns of entries before it. Columns of one pattern whose names differ by a number alone
-    come in the order of that number, others in the order of the file.
+    A pattern excludes the columns of earlier entries. Columns of one pattern whose names differ only by a number are
+    in the order of that number, others in the order of the file.
     """
     matched: list[tuple[ColumnEntry, int]] = []
     used: set[int] = set()
@@ -187,12 +174,12 @@ def _find_columns(pattern: str, names: Sequence[str], used: Set[int]) -> list[in
 def read_entries(
     matched: Sequence[tuple[ColumnEntry, int]], read: Callable[[int], NDArray[Any]]
 ) -> list[tuple[ColumnEntry, NDArray[Any]]]:
-    """Return the arrays of matched columns, read by their indices; a rate is that of the mapping."""
+    """Return the arrays of matched columns, read by their indices; a rate has its value in the mapping only."""
     return [(entry, np.ones(1) if entry.quantity == "rate" else read(i)) for entry, i in matched]
 
 
 def order_notes(matched: Sequence[tuple[ColumnEntry, int]]) -> list[str]:
-    """Say which fibre is which column, where fibres are in the order of their numbers and not in that of the file."""
+    """Return a note on the columns of the fibres if these are sorted by their numbers, and not as in the file."""
     columns = [i for entry, i in matched if entry.quantity == "fibres"]
     if columns == sorted(columns):
         return []
@@ -202,9 +189,9 @@ def order_notes(matched: Sequence[tuple[ColumnEntry, int]]) -> list[str]:
 
 
 def _by_number(columns: Sequence[int], names: Sequence[str]) -> list[int]:
-    """Sort columns by the numbers in their names, among those whose names are alike otherwise.
+    """Sort columns by the numbers in their names, within groups of names that are otherwise equal.
 
-    pandas, R and HDF5 sort names as text, in which c10 comes before c2.
+    pandas, R and HDF5 sort names as text, so that c10 comes before c2.
     """
     alike: dict[str, list[int]] = {}
     for column in columns:
@@ -217,6 +204,6 @@ def _by_number(columns: Sequence[int], names: Sequence[str]) -> list[int]:
 
 
 def join_names(names: Sequence[str]) -> str:
-    """Return the first names with commas between them, for a message."""
+    """Join the first names by commas, for a message."""
     more = f" and {len(names) - _MAX_LISTED} more" if len(names) > _MAX_LISTED else ""
     return (", ".join(short_repr(name) for name in names[:_MAX_LISTED]) or "nothing") + more

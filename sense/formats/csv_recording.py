@@ -1,9 +1,9 @@
 """Recordings from and to CSV.
 
-Columns are `time_s`, one of volts per fibre (of any name; an empty cell is a missing reading), `x_mm` and `y_mm`: the
-position of the press while the probe is sent down, `?` where it is unknown, and empty on all other lines. A press is a
-run of equal positions; where no line or every line has one, presses are detected in the readings. `depth_mm`
-(commanded), `reached_mm` and `force_n` follow where any press has them. A mapping (`columns`) names other columns.
+Columns are `time_s`, one of volts per fibre (of any name; an empty cell is a missing reading), `x_mm` and `y_mm`. These
+are the position of the press while the probe is sent down, `?` if it is unknown, and empty on all other lines. A press
+is a run of equal positions; if no line or every line has one, presses are detected in the readings. `depth_mm`
+(commanded), `reached_mm` and `force_n` follow if any press has them. A mapping (`columns`) names other columns.
 """
 
 import csv
@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from padforge.common.files import atomic_file, reraise_write_error
-from padforge.common.validation import InputError, short_repr
+from padforge.common.validation import InputError, naming_file, short_repr
 from padforge.sense.arrays import MAX_FIBRES, Array
 from padforge.sense.formats.annotations import check_export
 from padforge.sense.formats.assembly import MEASURES, Arrays, ForeignArrays, assemble_recording
@@ -25,7 +25,6 @@ from padforge.sense.formats.columns import (
     check_import,
     join_names,
     match_columns,
-    naming_file,
     order_notes,
     parse_columns,
     read_entries,
@@ -53,16 +52,16 @@ def import_csv(path: str | Path, columns: str = "", encoding: str = "", presses:
     """Read a recording from a table of text.
 
     Args:
-        path: of the file.
-        columns: what its columns hold, as `time=t_ms:ms,fibres=ch*`; by default they are padforge's own.
-        encoding: of the text; by default by its first bytes.
-        presses: of a table of their own, as `read_presses` returns them.
+        path: path of the file.
+        columns: mapping of its columns, such as `time=t_ms:ms,fibres=ch*`; by default the columns of `export_csv`.
+        encoding: encoding of the text; by default detected.
+        presses: presses from a separate table, see `read_presses`.
     """
     path, columns = check_import(path, columns)
     entries = parse_columns(columns, QUANTITIES) if columns else None
     table = read_table(path, encoding)
     with naming_file(path):
-        matched = match_columns(entries or _own_entries(table), table.names)
+        matched = match_columns(entries or _exported_entries(table), table.names)
     arrays = _read_matched(table, matched)
     if not columns:
         _check_positions(table, arrays)
@@ -78,16 +77,10 @@ def import_csv(path: str | Path, columns: str = "", encoding: str = "", presses:
 
 
 def read_presses(path: Path, columns: str = "", encoding: str = "") -> Arrays:
-    """Read when and where a pad was pressed from a table with a line for each press.
+    """Read the times and positions of presses from a table with a line for each press, for `assemble_recording`.
 
-    Args:
-        path: of the file.
-        columns: what its columns hold, as `down=t0:ms,duration=d:ms,x=px,y=py`; by default they have the names of
-            `PRESS_COLUMNS`. `down` and one of `up` and `duration` are needed.
-        encoding: of the text; by default by its first bytes.
-
-    Returns:
-        Arrays for `assemble_recording`.
+    `columns` is a mapping such as `down=t0:ms,duration=d:ms,x=px,y=py`; by default columns have the names of
+    `PRESS_COLUMNS`. `down` and one of `up` and `duration` are required. The encoding is detected by default.
     """
     path, columns = check_import(path, columns)
     table = read_table(path, encoding)
@@ -113,7 +106,7 @@ def read_presses(path: Path, columns: str = "", encoding: str = "") -> Arrays:
 
 
 def describe_table(path: Path, encoding: str = "") -> list[str]:
-    """Return what the columns of a table hold, each in a line with its unit and first values."""
+    """Return a line for each column of a table, with its unit and first values."""
     table = read_table(path, encoding)
     values = table.read_columns(range(len(table.names)))
     lines = [f"table of {len(values)} lines, text in {table.encoding}" + ("" if table.has_header else ", no header")]
@@ -125,7 +118,7 @@ def describe_table(path: Path, encoding: str = "") -> list[str]:
 
 
 def _read_matched(table: Table, matched: Sequence[tuple[ColumnEntry, int]]) -> Arrays:
-    """Read the columns of entries; one without a unit has that of the line of units, or of its header in brackets."""
+    """Read the columns of entries, by default in the unit of the line of units or in brackets in the header."""
     indices = list(dict.fromkeys(i for _, i in matched if i >= 0))
     values = table.read_columns(indices, [i for entry, i in matched if entry.quantity in "xy"])
     stated, converted = [], dict[str, list[str]]()
@@ -145,14 +138,15 @@ def _read_matched(table: Table, matched: Sequence[tuple[ColumnEntry, int]]) -> A
 
 
 def _check_positions(table: Table, arrays: Arrays) -> None:
-    """Raise InputError where a line of padforge's own table has one of x and y."""
+    """Raise InputError if a line of an exported table has only one of x and y."""
     x_y = [np.isnan(values) for entry, values in arrays if entry.quantity in ("x", "y")]
     if x_y and (incomplete := x_y[0] != x_y[1]).any():
         line = table.line_number(int(np.argmax(incomplete)))
         raise InputError(f"{table.path}: line {line} has one of x_mm and y_mm, expected both or neither")
 
 
-def _own_entries(table: Table) -> list[ColumnEntry]:
+def _exported_entries(table: Table) -> list[ColumnEntry]:
+    """Return the entries of the columns of an exported table."""
     names = table.names
     entries = [ColumnEntry(name[0], name) for name in ("x_mm", "y_mm") if name in names]
     if entries:
@@ -173,8 +167,8 @@ def export_csv(recording: Recording, path: str | Path) -> None:
     """Write a recording as CSV, atomically; importing it gives the same numbers.
 
     Args:
-        recording: to write.
-        path: of the file, which is replaced.
+        recording: recording to write.
+        path: path of the file, which is replaced.
 
     Raises:
         InputError: the file cannot be written.
@@ -195,7 +189,7 @@ def export_csv(recording: Recording, path: str | Path) -> None:
 
 
 def _press_cells(recording: Recording, measures: list[Array]) -> Iterator[list[float | str]]:
-    """Yield the cells of each reading that say where and how the pad is pressed; empty while it is not."""
+    """Yield the cells of position and measures of each reading; they are empty while the pad is not pressed."""
     idle: list[float | str] = [""] * (2 + len(measures))
     end = 0
     of_presses = zip(recording.presses_mm, *measures, recording.down_command, recording.up_command, strict=True)

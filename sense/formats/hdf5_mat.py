@@ -1,8 +1,8 @@
 """Recordings from and to HDF5, and from MATLAB files such as those of the published study.
 
 An exported HDF5 file has the datasets `times_s` (R,), `readings_v` (R, C), `presses_mm` (Q, 2), `down_command` and
-`up_command` (Q,), and `depths_mm`, `reached_mm` and `forces_n` (Q,) where any press has them; the attribute `source` is
-JSON. The states of an arm stay in the run directory. Other files are named by a mapping (`columns`).
+`up_command` (Q,), and `depths_mm`, `reached_mm` and `forces_n` (Q,) if any press has them; the attribute `source` is
+JSON. The states of an arm are not exported. Other files are read by a mapping (`columns`).
 """
 
 import json
@@ -14,7 +14,7 @@ import numpy as np
 
 from padforge.common.files import atomic_file, reraise_write_error
 from padforge.common.mat_files import flatten_variables, load_mat, open_hdf5
-from padforge.common.validation import InputError
+from padforge.common.validation import InputError, naming_file
 from padforge.sense.arrays import Array
 from padforge.sense.formats.annotations import check_export
 from padforge.sense.formats.assembly import MEASURES, Arrays, ForeignArrays, assemble_recording
@@ -22,7 +22,6 @@ from padforge.sense.formats.columns import (
     check_import,
     join_names,
     match_columns,
-    naming_file,
     order_notes,
     parse_columns,
     read_entries,
@@ -33,16 +32,15 @@ FORMAT = "padforge-hdf5/2"
 _DATASETS = {name: name for name in ("times_s", "presses_mm", "down_command", "up_command")}
 _DATASETS["readings_v"] = "readings"
 """Datasets, and their attributes of a `Recording`."""
-CYCLE, DOWN_AT = 40, 20
-"""Readings of a published press, and the one at which the probe is sent down; it is sent up at the end."""
+CYCLE, DOWN_AT = 40, 20  # readings of a published press, and the one at which the probe is sent down
 
 
 def export_hdf5(recording: Recording, path: str | Path) -> None:
     """Write a recording as HDF5, atomically; importing it gives the same numbers.
 
     Args:
-        recording: to write.
-        path: of the file, which is replaced.
+        recording: recording to write.
+        path: path of the file, which is replaced.
 
     Raises:
         InputError: the file cannot be written.
@@ -68,9 +66,9 @@ def import_hdf5(path: str | Path, columns: str = "", presses: Arrays = ()) -> Re
     """Read a recording from an HDF5 file.
 
     Args:
-        path: of the file.
-        columns: what its datasets hold, as `time=/t,fibres=/data/volts`; by default it was exported.
-        presses: of a table of their own, as `read_presses` returns them.
+        path: path of the file.
+        columns: mapping of its datasets, such as `time=/t,fibres=/data/volts`; by default those of `export_hdf5`.
+        presses: presses from a separate table, see `read_presses`.
     """
     path, columns = check_import(path, columns)
     if columns:
@@ -92,21 +90,21 @@ def import_hdf5(path: str | Path, columns: str = "", presses: Arrays = ()) -> Re
         source = file.read_text("source")
     try:
         return Recording(**content, source=json.loads(source or ""))
-    except (InputError, ValueError) as error:
+    except ValueError as error:  # also an InputError
         raise InputError(f"{path}: {error}") from error
 
 
 def import_mat(path: str | Path, columns: str = "", presses: Arrays = ()) -> Recording:
     """Read a recording from a MATLAB file, by default as published.
 
-    Published are `voltage` (R, C) volts, `pos` (2, Q) mm and `tim` (1, R) s, with 40 readings a press. `pos` may be
-    (Q, 2); without it, or where it is NaN, positions are unknown. If the last press is cut off, its readings stay, as
-    those of the press before need them, but it is no press. Readings may follow the last press.
+    Published files have `voltage` (R, C), V, `pos` (2, Q), mm, and `tim` (1, R), s, with 40 readings a press. `pos` may
+    be (Q, 2); positions are unknown without it, or where it is NaN. If the last press is cut off, it is omitted, but
+    its readings are kept, since the previous press needs them. Readings may follow the last press.
 
     Args:
-        path: of the file.
-        columns: what its variables hold, as `time=data.t,fibres=data.volts` or `time=x[0],fibres=x[1:9]`.
-        presses: of a table of their own, as `read_presses` returns them.
+        path: path of the file.
+        columns: mapping of its variables, such as `time=data.t,fibres=data.volts` or `time=x[0],fibres=x[1:9]`.
+        presses: presses from a separate table, see `read_presses`.
     """
     path, columns = check_import(path, columns)
     content = flatten_variables(load_mat(path, ()))
@@ -131,20 +129,20 @@ def import_mat(path: str | Path, columns: str = "", presses: Arrays = ()) -> Rec
 
 
 def _refuse_tables(content: dict[str, Any], names: Sequence[str]) -> None:
-    """Raise InputError for a table of MATLAB among the variables of these names, with the way out."""
+    """Raise InputError, with advice, if one of these variables is a table of MATLAB."""
     for name, value in content.items():
         if name in names and isinstance(value, str) and "only MATLAB" in value:
             raise InputError(f"{name} is {value}")
 
 
 def check_no_presses(path: Path, presses: Arrays) -> None:
-    """Raise InputError if presses are given beside a whole recording."""
+    """Raise InputError if there is a separate table of presses for a complete recording."""
     if presses:
         raise InputError(f"{path}: holds presses of its own, expected --columns for readings beside --presses")
 
 
 def describe_arrays(path: Path) -> list[str]:
-    """Return what the datasets or variables of an HDF5 or MATLAB file hold, each in a line."""
+    """Return a line for each dataset or variable of an HDF5 or MATLAB file."""
     if path.suffix.lower() != ".mat":
         with open_hdf5(path) as file:
             return [

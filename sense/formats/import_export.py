@@ -1,4 +1,4 @@
-"""Recordings from files and to files, by the extensions of their names."""
+"""Import and export of recordings, by the extension of the file."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -37,10 +37,10 @@ def open_recording(path: str | Path) -> Recording:
     """Open a recording.
 
     Args:
-        path: of a run directory, finished or not, or of a file that `import_file` reads without a mapping.
+        path: path of a run directory, finished or not, or of a file that `import_file` reads without a mapping.
 
     Raises:
-        InputError: neither, or damaged.
+        InputError: it is neither, or damaged.
     """
     path = check_path("path", path)
     is_file = path.suffix.lower() in _READERS and not path.is_dir()
@@ -52,7 +52,7 @@ def _is_bag_folder(path: Path) -> bool:
 
 
 def is_recording(path: Path) -> bool:
-    """Whether a path is a folder, or a file that may hold a recording; a .mat must have its `voltage`."""
+    """Return whether a path is a folder, or a file that may contain a recording; a .mat must have its `voltage`."""
     if path.suffix.lower() == ".mat" and path.is_file():
         return "voltage" in load_mat(path, ())
     return path.is_dir() or path.suffix.lower() in _READERS
@@ -63,12 +63,8 @@ def import_file(
 ) -> Recording:
     """Read a recording from a table, an HDF5 or MATLAB file, or a bag, by its extension, or from a rosbag2 folder.
 
-    Args:
-        path: of the file or folder.
-        columns: what the columns, datasets or topics of a foreign file hold.
-        encoding: of tables; by default by their first bytes.
-        presses: table of presses, where the file has readings alone.
-        press_columns: what its columns hold.
+    `columns` is the mapping of a foreign file, `presses` a table of presses with the mapping `press_columns` for a file
+    of readings only, and `encoding` that of tables, which is detected by default.
     """
     read = find_reader(path)
     if encoding and read is not import_csv:
@@ -78,7 +74,7 @@ def import_file(
 
 
 def find_reader(path: Path) -> Callable[..., Recording]:
-    """Return what imports a file of a name that ends so, or a rosbag2 folder; raises InputError for another path."""
+    """Return the function that imports a path, by its extension; InputError if there is none."""
     if _is_bag_folder(path):
         return import_bag
     if path.suffix.lower() not in _READERS:
@@ -90,7 +86,7 @@ def find_reader(path: Path) -> Callable[..., Recording]:
 
 
 def describe_file(path: Path, encoding: str = "") -> list[str]:
-    """Return what a file holds, each column, dataset, variable or topic in a line: name, shape, unit, first values."""
+    """Return a line for each column, dataset, variable or topic of a file: name, shape, unit and first values."""
     read = find_reader(path)
     if read is import_csv:
         return describe_table(path, encoding)
@@ -98,7 +94,7 @@ def describe_file(path: Path, encoding: str = "") -> list[str]:
 
 
 def arm_states(path: Path) -> Array | None:
-    """Return the (n, 10) states of the arm in a run directory, by `STATE_COLUMNS`; None if it has none."""
+    """Return the states (n, 10) of the arm in a run directory, by `STATE_COLUMNS`; None if it has none."""
     file = path / STATES
     return np.column_stack(read_blocks(file, len(STATE_COLUMNS) - 1)) if file.is_file() else None
 
@@ -112,12 +108,7 @@ def export_file(
 ) -> None:
     """Write a recording as .csv, .h5 or .mcap, by the extension, or as a folder of a kind of `FORMATS`.
 
-    Args:
-        recording: to write.
-        path: of the file or folder.
-        kind: one of `FORMATS`; "" for a file.
-        annotations: of a model, for .mcap and LeRobot.
-        states: (n, 10) of the arm, by `STATE_COLUMNS`, for .mcap.
+    Annotations by a model are for .mcap and LeRobot, the states of `arm_states` for .mcap.
     """
     extension = path.suffix.lower()
     if kind == "lerobot":

@@ -1,8 +1,8 @@
-"""Recordings as LeRobot datasets v3.0: folders of Parquet files that policies are trained from.
+"""Recordings as LeRobot datasets v3.0: folders of Parquet files, on which policies are trained.
 
 An episode is a press with half of the pause before it and half of the pause after it; a frame is a reading. `timestamp`
 has the uniform rate that the format requires, and `observation.time` the measured times since the first frame of the
-episode. `lerobot.datasets` of https://github.com/huggingface/lerobot (0.6) reads it.
+episode. `lerobot.datasets` of https://github.com/huggingface/lerobot (0.6) reads them.
 """
 
 import json
@@ -25,10 +25,8 @@ if TYPE_CHECKING:
 
 VERSION = "v3.0"
 TASK = "Press the pad."
-FILE_MB, CHUNK_FILES = 100, 1000
-"""Size of a data file, and files in a folder, by default of the format."""
-MAX_RATE_ERROR = 0.05
-"""Relative distance to a whole number at which a rate is called that number, which the format requires."""
+FILE_MB, CHUNK_FILES = 100, 1000  # size of a data file, and number of files in a folder: the format's defaults
+MAX_RATE_ERROR = 0.05  # maximum relative error of rounding a rate to a whole number, which the format requires
 _FILE = "chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 _QUANTILES = (0.01, 0.1, 0.5, 0.9, 0.99)
 _Column = NDArray[Any]
@@ -37,14 +35,14 @@ _Column = NDArray[Any]
 def export_lerobot(recording: Recording, path: Path, annotations: ModelAnnotations | None = None) -> None:
     """Write a recording as a LeRobot dataset, a folder that appears complete or not at all.
 
-    Features are `observation.state`, the readings in V, NaN where one is missing; `action`, the commanded position,
-    with the depth if all presses have one, and whether the probe is down; `observation.force` if all presses have one;
-    and `observation.touch`, what a model predicts once a press is over. Presses of unknown position are no episodes.
+    Features are `observation.state`, the readings in V, NaN where missing; `action`, the commanded position, with the
+    depth if all presses have one, and whether the probe is down; `observation.force` if all presses have one; and
+    `observation.touch`, the prediction of a model after the end of a press. Presses of unknown position are omitted.
 
     Args:
-        recording: to write.
-        path: of a folder that is new or empty.
-        annotations: of a model.
+        recording: recording to write.
+        path: path of a folder that is new or empty.
+        annotations: predictions of a model.
     """
     path = check_export(recording, path, annotations)
     try:
@@ -80,7 +78,7 @@ def _frame_rate(recording: Recording) -> float:
 def _build_columns(
     recording: Recording, starts: Indices, ends: Indices, annotations: ModelAnnotations | None
 ) -> tuple[dict[str, _Column], dict[str, list[str] | None]]:
-    """Return the columns (n, k) or (n,) of n frames, and the names of their k values, by feature."""
+    """Return the values of n frames, (n, k) or (n,), and the names of the k columns, by feature."""
     lengths = ends - starts
     frames = np.concatenate([np.arange(start, end) for start, end in zip(starts, ends, strict=True)])
     episodes = np.repeat(np.arange(len(lengths)), lengths)
@@ -142,7 +140,7 @@ def _write(
         episodes |= {f"stats/{name}/{statistic}": [part[statistic] for part in parts] for statistic in parts[0]}
     episodes |= {f"meta/episodes/{name}": np.zeros(len(lengths), np.int64) for name in ("chunk_index", "file_index")}
     _write_table(folder / "meta" / "episodes" / _file_name(0), pa.table(episodes))
-    # The index of pandas is the text of the one task.
+    # The index of the pandas table is the text of the only task.
     index = {"metadata": None, "field_name": "task", "name": "task", "pandas_type": "unicode", "numpy_type": "object"}
     column = dict.fromkeys(("field_name", "name"), "task_index") | dict.fromkeys(("pandas_type", "numpy_type"), "int64")
     about = {"index_columns": ["task"], "column_indexes": [], "columns": [{"metadata": None} | column, index]}

@@ -1,11 +1,11 @@
-"""A recording as topics of ROS 2: which messages they have, and their numbers as arrays.
+"""A recording as topics of ROS 2: their messages, and the numbers of these as arrays.
 
 Numbers are in the units of REP 103: m, N and V. Positions are in the frame `pad`: its origin is the middle of the pad,
-x and y run as on the plan, and z points away from the surface; for a pad that lay mirrored z points into it, so that
-the frame is right-handed there, too. The messages of a press come with the reading that follows its begin or its end.
+x and y are those of the plan, and z points away from the surface. For a pad that lay mirrored z points into it, so that
+the frame is right-handed. The messages of a press have the stamp of the reading that follows its begin or its end.
 
-Messages round a recording, to whole ns and from mm to m. RECORDING holds its exact numbers as JSON, which are taken
-where the other messages still say the same.
+Messages round a recording, to whole ns and from mm to m. RECORDING contains its exact numbers as JSON, which are used
+if the other messages still agree with them.
 """
 
 import json
@@ -29,22 +29,19 @@ REACHED, FORCE, RECORDING = "/pad/reached", "/pad/force", "/pad/recording"
 TOUCHES, HEALTH, ARM = "/pad/touches", "/pad/health", "/arm/pose"
 FRAME, ARM_FRAME = "pad", "base"
 _POSITION = ("pose.pose.position.x", "pose.pose.position.y", "pose.pose.position.z", "pose.covariance")
-DEPTH_VARIANCE = 14
-"""Index of the variance of z in a covariance of 6 x 6; those of x and y are 0 and 7."""
-UNKNOWN_VARIANCE = -1.0
-"""Variance of an unknown quantity, as in `sensor_msgs/msg/Imu`."""
-Z90 = 1.6449
-"""Standard deviations that hold 90 % of a normal distribution, two-sided."""
+DEPTH_VARIANCE = 14  # index of the variance of z in a covariance of 6 x 6; those of x and y are 0 and 7
+UNKNOWN_VARIANCE = -1.0  # variance of an unknown quantity, as in `sensor_msgs/msg/Imu`
+Z90 = 1.6449  # a normal variable is within so many standard deviations in 90 % of cases
 _INDICES = ("down_command", "up_command")
 _NUMBERS = ("times_s", "presses_mm", "depths_mm", "reached_mm", "forces_n")
 
 
 class TopicType(NamedTuple):
-    """Type of the messages of a topic, what they mean, and the attributes that hold their numbers."""
+    """Type of a topic."""
 
-    msgtype: str
-    description: str
-    paths: tuple[str, ...] = ()
+    msgtype: str  # type of its messages
+    description: str  # meaning of its messages
+    paths: tuple[str, ...] = ()  # attributes of its messages that are numbers
 
 
 TOPICS = {
@@ -83,11 +80,11 @@ TOPICS = {
 
 
 class RawMessages(NamedTuple):
-    """Messages of a topic as the file has them: type, what deserializes one, and log time (ns) and bytes of each."""
+    """Serialized messages of a topic."""
 
     msgtype: str
-    deserialize: Callable[[bytes], Any]
-    stamps: list[int]
+    deserialize: Callable[[bytes], Any]  # returns a message
+    stamps: list[int]  # log time of each message, ns
     messages: list[bytes]
 
     def decode(self, index: int) -> Any:
@@ -99,45 +96,45 @@ class RawMessages(NamedTuple):
 
 
 class TopicSeries(NamedTuple):
-    """Numbers of a topic: stamps (n,), ns, ascending, and values (n, k), in the order of the paths."""
+    """Numbers of a topic."""
 
-    stamps: Indices
-    values: Array
+    stamps: Indices  # ascending; shape (n,), ns
+    values: Array  # in the order of the paths; shape (n, k)
 
     def equals(self, other: "TopicSeries") -> bool:
-        """Whether another topic has the same numbers at the same times."""
+        """Return whether another topic has the same numbers at the same times."""
         return np.array_equal(self.stamps, other.stamps) and np.array_equal(self.values, other.values, equal_nan=True)
 
 
 def choose_epoch(times_s: Array) -> float:
-    """Return the time that stamps count from: 0, unless the (n,) times begin before, which stamps cannot hold."""
+    """Return the origin of the stamps: 0 unless times (n,) are negative, since stamps are not."""
     return min(0.0, float(np.floor(times_s[0])))
 
 
 def to_stamps(times_s: Array, epoch_s: float) -> Indices:
-    """Return (n,) times in ns since the epoch."""
+    """Convert times (n,) to ns since the epoch."""
     seconds = np.floor(times_s)
     return (seconds - epoch_s).astype(np.int64) * 10**9 + np.round((times_s - seconds) * 1e9).astype(np.int64)
 
 
 def stamps_at(stamps: Indices, readings: Indices) -> Indices:
-    """Return the stamps of readings by their indices; the one after the last would come one interval later."""
+    """Return the stamps of readings by their indices; the reading after the last one is an interval later."""
     interval = max(int(stamps[-1] - stamps[-2]), 1)
     return np.append(stamps, stamps[-1] + interval)[readings]
 
 
 def depths_to_z(depths_mm: Array, mirrored: bool) -> Array:
-    """Return the z of depths below the surface, m; 0 where they are unknown."""
+    """Convert depths below the surface to z, m; 0 for unknown ones."""
     return 0 - upward(mirrored) * np.nan_to_num(depths_mm) / 1000
 
 
 def upward(mirrored: bool) -> float:
-    """Return the sign of z above the surface, with which x and y of the plan are right-handed."""
+    """Return the sign of z above the surface in a right-handed frame with x and y of the plan."""
     return -1.0 if mirrored else 1.0
 
 
 def to_topics(recording: Recording, epoch_s: float) -> dict[str, TopicSeries]:
-    """Return the topics of a recording that have messages, but for RECORDING."""
+    """Return the topics of a recording that have messages, except RECORDING."""
     stamps, mirrored = to_stamps(recording.times_s, epoch_s), recording.mirrored
     depths_mm, reached_mm, forces_n = recording.depths_mm, recording.reached_mm, recording.forces_n
     down, up = (stamps_at(stamps, readings) for readings in (recording.down_command, recording.up_command))
@@ -170,7 +167,7 @@ def touches(recording: Recording, annotations: ModelAnnotations, epoch_s: float)
 
 
 def arm_poses(states: Array, epoch_s: float) -> TopicSeries:
-    """Return ARM from (n, 10) states, in m and with rotation vectors as quaternions; only of times that stamps hold."""
+    """Return ARM from states (n, 10): m, and rotation vectors as quaternions; states before the epoch are omitted."""
     states = states[np.isfinite(states[:, :7]).all(axis=1) & (states[:, 0] >= epoch_s)]
     angle = np.linalg.norm(states[:, 4:7], axis=1)
     x_y_z = states[:, 4:7] * (np.sinc(angle / (2 * np.pi)) / 2)[:, None]  # sin(angle / 2) along the axis
@@ -200,13 +197,14 @@ def encode(store: "Typestore", topic: str, series: TopicSeries) -> list[memoryvi
         if header is not None:
             header.stamp.sec, header.stamp.nanosec = divmod(stamp, 10**9)
         for column, (parent, name, takes_array) in enumerate(zip(parents, names, is_array, strict=True)):
-            setattr(parent, name, row[column:] if takes_array else float(row[column]))  # an array is the last path
+            # An array is at the last path, and takes the rest of the row.
+            setattr(parent, name, row[column:] if takes_array else float(row[column]))
         encoded.append(store.serialize_cdr(message, msgtype))
     return encoded
 
 
 def decode(raw: RawMessages, paths: Sequence[str]) -> TopicSeries:
-    """Return the numbers at the paths, attributes of the messages, in the order of stamps; refuse damaged messages."""
+    """Return the numbers at paths of attributes of the messages, sorted by stamps; InputError for damaged messages."""
     rows, width = bytearray(), 0
     for index in range(len(raw.messages)):
         message = raw.decode(index)
@@ -223,7 +221,7 @@ def decode(raw: RawMessages, paths: Sequence[str]) -> TopicSeries:
 
 
 def get_field(message: Any, path: str) -> Any:
-    """Return the field at a path; of a list of messages, the list of theirs."""
+    """Return the field of a message at a path, or the list of fields of a list of messages."""
     for name in path.split("."):
         try:
             message = [getattr(item, name) for item in message] if isinstance(message, list) else getattr(message, name)
@@ -248,7 +246,7 @@ def decode_text(raw: RawMessages) -> str:
 
 
 def _empty(store: "Typestore", msgtype: str, **fields: Any) -> Any:
-    """Return a message of zeros and empty texts and arrays, but for `fields`."""
+    """Return a message of zeros and empty texts and arrays, except `fields`."""
     from rosbags.interfaces import Nodetype
 
     def zero(node: Any) -> Any:
@@ -280,7 +278,7 @@ def encode_recording(store: "Typestore", recording: Recording, epoch_s: float, t
 
 
 def from_text(text: str, readings: Array) -> tuple[Recording, float, str] | None:
-    """Return the recording of a text, its epoch and its digest; None if the text does not fit the readings (R, C)."""
+    """Return the recording in a text, its epoch and its digest; None if the text does not fit the readings (R, C)."""
     try:
         document = json.loads(text)
         if document["format"] != FORMAT:
@@ -295,7 +293,7 @@ def from_text(text: str, readings: Array) -> tuple[Recording, float, str] | None
 def encode_health(
     store: "Typestore", recording: Recording, annotations: ModelAnnotations, stamps: Indices
 ) -> tuple[Indices, list[memoryview]]:
-    """Return HEALTH, (n,) stamps and messages: all fibres at the first reading, and whenever a fault was named."""
+    """Return stamps (n,) and messages of HEALTH: all fibres at the first reading, and when a fault was detected."""
     faults: dict[int, tuple[str, str]] = dict.fromkeys(
         annotations.dead, ("dead", "was dead in the recording that health was learnt from")
     )

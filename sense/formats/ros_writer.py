@@ -10,7 +10,6 @@ from padforge.sense.formats.ros_messages import RECORDING, TOPICS
 
 if TYPE_CHECKING:
     from rosbags.interfaces import Connection
-    from rosbags.rosbag2 import Writer
     from rosbags.typesys.store import Typestore
 
 
@@ -25,37 +24,30 @@ def load_typestore(purpose: str) -> "Typestore":
 
 @cache
 def _typestore() -> "Typestore":
-    """One for all files: it compiles the code of a message when it first meets one."""
+    """Return one store for all files, since it compiles code for every type of message."""
     from rosbags.typesys import Stores, get_typestore
 
     return get_typestore(Stores.ROS2_HUMBLE)
 
 
 def write_mcap(folder: Path, store: "Typestore", messages: Iterable[tuple[str, int, memoryview]]) -> Path:
-    """Write messages (topic, stamp in ns, CDR) as a rosbag2 folder, and return the .mcap file that holds them.
-
-    A topic is added to the file with its first message.
-    """
+    """Write messages (topic, stamp in ns, CDR) as a rosbag2 folder, and return its .mcap file."""
     from rosbags.rosbag2 import StoragePlugin, Writer
 
     connections: dict[str, Connection] = {}
     with Writer(folder, version=8, storage_plugin=StoragePlugin.MCAP) as writer:
         for topic, stamp, message in messages:
             if topic not in connections:
-                connections[topic] = _add_topic(writer, store, topic)
+                msgtype, description, _ = TOPICS[topic]
+                writer.set_custom_data(topic, description)
+                options = {"typestore": store, "offered_qos_profiles": [_qos(is_latched=topic == RECORDING)]}
+                connections[topic] = writer.add_connection(topic, msgtype, **options)
             writer.write(connections[topic], stamp, message)
     return folder / f"{folder.name}.mcap"
 
 
-def _add_topic(writer: "Writer", store: "Typestore", topic: str) -> "Connection":
-    msgtype, description, _ = TOPICS[topic]
-    writer.set_custom_data(topic, description)
-    # The last message of a latched topic is for those that come later.
-    profiles = [_qos(is_latched=topic == RECORDING)]
-    return writer.add_connection(topic, msgtype, typestore=store, offered_qos_profiles=profiles)
-
-
 def _qos(is_latched: bool) -> Any:
+    """Return a quality of service; subscribers that connect later get the last message of a latched topic."""
     from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
 
     never = QosTime(2147483647, 4294967295)

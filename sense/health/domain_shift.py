@@ -31,10 +31,10 @@ MAX_PRESSES = 1000  # presses that are used at most
 
 @dataclass(frozen=True)
 class DomainShift:
-    """How fibres differ from what they were in calibration."""
+    """A difference between the fibres now and in the calibration."""
 
     kind: str  # "rest" or "gain"
-    fibres: tuple[int, ...]  # their indices: one, or all
+    fibres: tuple[int, ...]  # indices of one fibre, or of all
     value: float  # median baseline, V; or size of the responses relative to that in calibration
     usual: tuple[float, float]  # lowest and highest usual value
 
@@ -54,19 +54,10 @@ class DomainShift:
 def detect_shifts(
     localizer: LocalizerModel, health: HealthModel, recording: Recording, fibre_mask: Mask
 ) -> list[DomainShift]:
-    """Detect how a recording differs from that of the calibration.
+    """Detect how a recording differs from that of the calibration; `fibre_mask` (Q, C) is false for faulty fibres.
 
     The size of responses also depends on the depth of presses. If the localizer predicts depths, responses are compared
-    with those expected at these depths.
-
-    Args:
-        localizer: of the pad.
-        health: of the pad.
-        recording: of a pad with the fibres of the training, with about as many readings a second or more.
-        fibre_mask: (Q, C), false where a fibre is masked in a press; fibres masked in all presses are ignored.
-
-    Raises:
-        InputError: as `LocalizerModel.raw_features`.
+    with those expected at these depths. Raises InputError as `LocalizerModel.raw_features` does.
     """
     shifts = _rest_shifts(health, recording, fibre_mask)
     if localizer.features == "windows":
@@ -95,7 +86,7 @@ def _rest_shifts(health: HealthModel, recording: Recording, fibre_mask: Mask) ->
 def _gain_shifts(localizer: LocalizerModel, training: int, recording: Recording, fibre_mask: Mask) -> list[DomainShift]:
     """Compare responses with those expected at the predicted positions: of all fibres together, or else of each.
 
-    A single fibre is compared at the positions predicted by the others, which it does not bias.
+    Each fibre is compared at positions that the others predict, so that its own fault does not bias them.
     """
     presses = localizer.scaled_features(recording)
     rows = np.linspace(0, len(presses) - 1, min(len(presses), MAX_PRESSES)).astype(np.int64)

@@ -40,9 +40,9 @@ from padforge.sense.recording.recording import PRESSES_DETECTED, Recording
 from padforge.sense.signals.press_detection import align_to_detected
 
 MAX_MISSING = 20  # successive presses with too few readings, see `MIN_PRESENT`, after which a fibre is missing
-WINDOW = 64  # presses that are evaluated again to identify a faulty fibre
-MAX_SUSPECTS = 4  # fibres that are compared then
-MAX_SCORE = 99.0  # score of what is certain
+WINDOW = 64  # recent presses that are evaluated again to identify a faulty fibre
+MAX_SUSPECTS = 4  # maximum number of fibres that are compared to identify it
+MAX_SCORE = 99.0  # score of a certain fault
 FLOATING = 30.0  # noise, as a multiple of the median, that only an open input picks up
 
 TEXTS = {
@@ -62,7 +62,7 @@ TEXTS = {
 }
 """Kinds of faults, in words."""
 RESPONSE_FAULTS = ("no_response", "reduced_gain", "inverted", "inconsistent", "swapped")
-"""Kinds that the calibration alone tells: if most fibres have them, it is at fault, not they (misfit)."""
+"""Kinds that are detected by the calibration alone; if most fibres have them, the calibration is wrong (misfit)."""
 
 
 @dataclass(frozen=True)
@@ -92,11 +92,11 @@ class FibreFault:
 
 
 class _PressRecord(NamedTuple):
-    trace: Array  # (L, TRACE)
-    inputs: Floats  # (L, N)
-    targets: Array  # (L, T)
-    level: Array  # (L,) of the rests before it
-    is_warm: Mask  # (L,) whether that level is reliable
+    trace: Array  # shape (L, TRACE)
+    inputs: Floats  # shape (L, N)
+    targets: Array  # shape (L, T)
+    level: Array  # running level of the rests before the press; shape (L,)
+    is_warm: Mask  # whether that level is reliable; shape (L,)
 
 
 class _WiringFault(NamedTuple):
@@ -146,10 +146,10 @@ class FaultMonitor:
         """Process the next press.
 
         Args:
-            readings: of this press alone, best from 10 readings before the probe was sent down to 20 after it was sent
+            readings: readings of this press alone, best from 10 before the probe was sent down to 20 after it was sent
                 up (fewer only if the next press begins), NaN where missing; shape (R, C), V.
-            down_command: first of them after the probe was sent down, 1 or more.
-            up_command: first of them after it was sent up, above `down_command`, R at most.
+            down_command: index of the first reading after the probe was sent down, >= 1.
+            up_command: index of the first reading after it was sent up, > `down_command`, <= R.
 
         Raises:
             InputError: another number of fibres than the model's.
@@ -233,7 +233,11 @@ class FaultMonitor:
         )
         is_alarm = worst > self.model.threshold
         pairs = [pair for pair in combinations(sorted(order.tolist()), 2) if is_alarm[list(pair)].any()]
-        wiring = self._find_wiring(pairs, first)
+        # A swapped pair or an inverted fibre is the fault if it makes the readings far more likely.
+        wirings = [*self._swapped(pairs, first), *self._inverted(first)]
+        wiring = max(wirings, key=lambda each: each.llr, default=None)
+        if wiring and not wiring.llr > self.model.threshold:
+            wiring = None
         scores = []
         for fibre in suspects:
             failed = self._failed.copy()
@@ -251,14 +255,8 @@ class FaultMonitor:
         self._replay(first, self._failed)
         return FibreFault(self.n_presses, since, tuple(self.model.living[list(fibres)].tolist()), kind, score)
 
-    def _find_wiring(self, pairs: Sequence[tuple[int, int]], first: int) -> _WiringFault | None:
-        """Find the pair or fibre whose readings since press `first` are far more likely if swapped or inverted."""
-        wirings = [*self._swapped(pairs, first), *self._inverted(first)]
-        best = max(wirings, key=lambda wiring: wiring.llr, default=None)
-        return best if best and best.llr > self.model.threshold else None
-
     def _inverted(self, first: int) -> Iterator[_WiringFault]:
-        """Yield each fibre as if inverted; an inverted one disturbs predictions for all others, but not its own."""
+        """Yield the likelihood of each fibre being inverted: it disturbs predictions for the others, not its own."""
         _, targets, mean, std = self._predict(self._records_since(first), self._failed)
         log_likelihood = self.model.likelihoods.log_likelihood_healthy
         difference = log_likelihood(-targets, mean, std) - log_likelihood(targets, mean, std)
@@ -267,7 +265,7 @@ class FaultMonitor:
             yield _WiringFault("inverted", (fibre,), float(llrs[fibre]))
 
     def _swapped(self, pairs: Sequence[tuple[int, int]], first: int) -> Iterator[_WiringFault]:
-        """Yield pairs as if swapped."""
+        """Yield the likelihood of each pair being swapped."""
         records = self._records_since(first)
         pca, likelihoods = self.model.pca, self.model.likelihoods
         for pair in pairs:
@@ -392,7 +390,7 @@ class FaultDetector:
         return [fault for fault in faults if is_fit or fault.kind not in RESPONSE_FAULTS]
 
     def include_rests(self, recording: Recording) -> None:
-        """Make the rests of a recording usual ones, as after a recalibration.
+        """Extend the usual range of rests to those of a recording, as after a recalibration.
 
         Args:
             recording: of the pad as it is now, healthy.
@@ -405,7 +403,7 @@ class FaultDetector:
         check_same_pad(self.model_, "health", recording.fibres, recording.rate_hz)
         for name in ("model_", "live_model_"):
             model: HealthModel = getattr(self, name)
-            (low, high), new = model.rest_range_v, rests[:, model.living]  # fmin and fmax pass over what is missing
+            (low, high), new = model.rest_range_v, rests[:, model.living]  # fmin and fmax ignore NaN
             range_v = np.stack([np.fmin(low, np.fmin.reduce(new)), np.fmax(high, np.fmax.reduce(new))])
             setattr(self, name, replace(model, rest_range_v=range_v))
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from padforge.sense.arrays import MIN_SCALE_V, Array, Mask
+from padforge.sense.arrays import MIN_SCALE_V, Array
 from padforge.sense.health.trace_model import COMPONENTS, HELD, RELEASED, REST, T_DEGREES, TRACE
 
 OFFSETS = (2.0, -2.0, 4.0, -4.0, 12.0, -12.0)  # of the rest, in standard deviations of its residual
@@ -19,17 +19,18 @@ GAINS = {"no_response": 0.0, "reduced_gain": 0.5, "inverted": -1.0}
 HYPOTHESES = ("stuck", *GAINS, "inconsistent", "noisy", *(f"offset {o:+g}" for o in OFFSETS))
 """Constant readings; a gain of `GAINS`; the response to another press; five times the noise; and a rest that has
 shifted by one of `OFFSETS`."""
-NOISE_FACTOR = 5.0
-STD_FACTOR = 4.0  # an inconsistent response is that to another press, or wrong by this many predicted deviations
-MAX_LLR = 6.0  # largest contribution of one press: no mishap in a single press is a fault
-MAX_STEP_LLR = 12.0  # of a step within a trace, yet below the threshold until the rest has shifted as well
+NOISE_FACTOR = 5.0  # increase of the noise of a noisy fibre
+STD_FACTOR = 4.0  # an inconsistent response is that to another press, or has this many times the predicted deviation
+MAX_LLR = 6.0  # largest contribution of one press, so that an accident in a single press is no fault
+MAX_STEP_LLR = 12.0  # the same of a step within a trace; below the threshold until the rest has shifted as well
 STEPS = np.arange(3, TRACE - 2)  # readings of a trace where a step is tested; nearer to an end it may be a spike
 LIBRARY = 64  # other presses that an inconsistent response is compared with
+# Calibrations of predicted deviations that are tried.
 STD_SCALES = np.geomspace(0.5, 2.0, 9)
-STD_FLOORS = np.array([0.0, 0.02, 0.05, 0.1, 0.2, 0.4, 0.8])  # calibrations of predicted deviations that are tried
+STD_FLOORS = np.array([0.0, 0.02, 0.05, 0.1, 0.2, 0.4, 0.8])
 MIN_INNOVATION = 1e-3  # least standard deviation of the innovation of a rest, since it is divided by
 MAX_HEIGHT = 1e5  # a height that no sum reaches
-MIN_PEAKS = 30
+MIN_PEAKS = 30  # minimum number of peaks that a tail is fitted to
 _CHUNK = 64  # presses that are compared with the library at once
 MEDIAN_T, FAR_T = 0.7267, 6.869  # median and 0.999 quantile of |Student's t| with `T_DEGREES` degrees of freedom
 
@@ -49,7 +50,7 @@ class FaultLikelihoods:
     constant_share: Array  # share of presses in which the fibre is constant; shape (C,)
     step_filters: Array  # matched filters of a step; shape (C, S, TRACE), 1/V
     rest_autocorr: Array  # correlation of the rest's residual with that of the press before, of all fibres; shape (1,)
-    innovation_std: Array  # standard deviation of what does not correlate; shape (1,)
+    innovation_std: Array  # standard deviation of the uncorrelated part of that residual; shape (1,)
 
     @classmethod
     def fit(
@@ -77,7 +78,7 @@ class FaultLikelihoods:
             noise_v=noise_v,
             log_noise_mean=log_noise_mean,
             log_noise_std=np.maximum(np.median(np.abs(log_noise - log_noise_mean), axis=0) / 0.6745, 0.1),
-            constant_share=(_is_constant(traces).sum(axis=0) + 1) / (len(traces) + 2),
+            constant_share=((np.ptp(traces, axis=-1) == 0).sum(axis=0) + 1) / (len(traces) + 2),
             step_filters=fit_step_filters(traces, noise_v),
             rest_autocorr=autocorr,
             innovation_std=np.maximum(innovation_std, MIN_INNOVATION),
@@ -101,11 +102,11 @@ class FaultLikelihoods:
         predecessor. Returns `llr_continuing` if the fault was present at the press before, and `llr_onset` if it
         has begun since; 0 for a fibre that misses readings.
         """
-        constant = np.where(_is_constant(traces), -np.log(self.constant_share), -MAX_LLR)
+        constant = np.where(np.ptp(traces, axis=-1) == 0, -np.log(self.constant_share), -MAX_LLR)
         noise_shift = np.log(NOISE_FACTOR) / self.log_noise_std
         log_noise = (_log_noise(traces, self.noise_v) - self.log_noise_mean) / self.log_noise_std
         common = [constant, *self._response_llrs(targets, mean, std), _shift_llr(log_noise, noise_shift)]
-        # The residual of the rest decays slowly by itself: only its innovation is evidence of an offset.
+        # The residual of the rest decays slowly also without a fault: only its innovation is evidence of an offset.
         offset_residual = ((targets - mean) / self._calibrated(std))[..., -1]
         innovation = (offset_residual - self.rest_autocorr * _previous(offset_residual)) / self.innovation_std
         step = self.largest_step(traces)
@@ -124,7 +125,7 @@ class FaultLikelihoods:
         return llr_continuing, llr_onset
 
     def _response_llrs(self, targets: Array, mean: Array, std: Array) -> list[Array]:
-        """Ratios (Q, C) of `GAINS` and inconsistent."""
+        """Return the ratios (Q, C) of `GAINS`, and of an inconsistent response."""
         targets = np.nan_to_num(targets)
         healthy = self.log_likelihood_healthy(targets, mean, std)
         response, mean = targets[..., :COMPONENTS], mean[..., :COMPONENTS]
@@ -133,7 +134,7 @@ class FaultLikelihoods:
             _log_t(response, gain * mean, np.hypot(gain * std, self.noise_floor)).sum(axis=-1)
             for gain in GAINS.values()
         ]
-        # In parts: with all of the library a press takes kilobytes a fibre.
+        # In chunks, since a press takes kilobytes a fibre with all of the library.
         parts = (response[first : first + _CHUNK, None] for first in range(0, len(response), _CHUNK))
         others = (_log_t(part, self.library_mean, self.library_std).sum(axis=-1) for part in parts)
         other = np.concatenate([np.logaddexp.reduce(each, axis=1) for each in others]) - np.log(LIBRARY)
@@ -168,12 +169,8 @@ def estimate_noise(traces: Array) -> Array:
 
 
 def _log_noise(traces: Array, noise_v: Array) -> Array:
-    # A quarter keeps a press that happens to be without noise from being an outlier.
+    # 0.25 is added so that a press that happens to have no noise is not an outlier.
     return np.log(estimate_noise(traces) / noise_v + 0.25)
-
-
-def _is_constant(traces: Array) -> Mask:
-    return np.ptp(traces, axis=-1) == 0
 
 
 def fit_step_filters(traces: Array, noise_v: Array) -> Array:
@@ -196,18 +193,18 @@ def fit_step_filters(traces: Array, noise_v: Array) -> Array:
 
 
 def _log_t(value: Array, mean: Array | float, std: Array | float) -> Array:
-    """Logarithm of the density of Student's t, up to a constant."""
+    """Return the logarithm of the density of Student's t, up to a constant."""
     return -(T_DEGREES + 1) / 2 * np.log1p(((value - mean) / std) ** 2 / T_DEGREES) - np.log(std)
 
 
 def _shift_llr(value: Array, shift: Array | float) -> Array:
-    """Log-likelihood ratio of a mean of at least `shift` > 0 against 0."""
+    """Return the log-likelihood ratio of a mean of at least `shift` > 0 against 0."""
     value = np.minimum(value, shift)
     return _log_t(value, shift, 1.0) - _log_t(value, 0.0, 1.0)
 
 
 def cusum_update(height: Array, llr_continuing: Array, llr_onset: Array) -> Array:
-    """Update cumulative sums by a press: the fault was present before, or begins now, or there is none (0)."""
+    """Update cumulative sums by a press, at which the fault was present before, begins, or is absent (0)."""
     return np.maximum(np.maximum(height + llr_continuing, llr_onset), 0.0)
 
 
@@ -222,8 +219,8 @@ class ExceedanceModel:
     def fit(cls, llrs: Sequence[tuple[Array, Array]]) -> "ExceedanceModel":
         """Fit to the ratios (Q, C, H), continuing and onset, of successive healthy presses, by the number of failures.
 
-        The slope is the mean excess of the highest tenth of the peaks. By the level the highest of all occurs at least
-        once in these Q presses. No slope is below 1, that of exact likelihoods (A. Wald).
+        The slope is the mean excess of the highest tenth of the peaks, at least 1, that of exact likelihoods (A. Wald).
+        The level is so high that the highest peak occurs at least once in Q presses.
         """
         levels, slopes = zip(*[_fit_tail(*each) for each in llrs], strict=True)
         return cls(np.stack(levels), np.stack(slopes))
@@ -242,7 +239,7 @@ def _fit_tail(llr_continuing: Array, llr_onset: Array) -> tuple[Array, Array]:
     level, slope = np.empty(heights.shape[2]), np.empty(heights.shape[2])
     for hypothesis in range(heights.shape[2]):
         peaks = np.sort(np.concatenate([_peaks(series) for series in heights[:, :, hypothesis].T]))
-        # Few peaks are a tail by themselves; zeros stand for sums that never left 0.
+        # Zeros, of sums that never left 0, complete a number of peaks that is too small for a tail.
         peaks = np.concatenate([np.zeros(max(MIN_PEAKS + 1 - len(peaks), 0)), peaks])
         top = int(np.clip(len(peaks) // 10, MIN_PEAKS, 300))
         base = peaks[-top - 1]
@@ -253,7 +250,7 @@ def _fit_tail(llr_continuing: Array, llr_onset: Array) -> tuple[Array, Array]:
 
 
 def _peaks(heights: Array) -> Array:
-    """Largest height of every excursion from 0."""
+    """Return the largest height of every excursion from 0."""
     above = heights > 0
     starts = np.flatnonzero(above & ~np.concatenate([[False], above[:-1]]))
     return np.maximum.reduceat(heights, starts) if len(starts) else np.empty(0)

@@ -12,12 +12,7 @@ from padforge.common.files import read_json
 from padforge.common.settings import Settings, validate
 from padforge.common.validation import InputError
 from padforge.sense.arrays import MAX_FIBRES, MAX_RATE_HZ, MIN_RATE_HZ, MIN_SCALE_V, Array, Indices
-from padforge.sense.health.fault_likelihoods import (
-    HYPOTHESES,
-    MAX_HEIGHT,
-    ExceedanceModel,
-    FaultLikelihoods,
-)
+from padforge.sense.health.fault_likelihoods import HYPOTHESES, MAX_HEIGHT, ExceedanceModel, FaultLikelihoods
 from padforge.sense.health.trace_model import (
     MEMBERS,
     REST,
@@ -59,7 +54,7 @@ class HealthDocument(Settings):
 
 @dataclass(frozen=True)
 class HealthModel:
-    """Model of a healthy pad. Its arrays are of the L living fibres, that is those of the C that were not dead."""
+    """Model of a healthy pad. Its arrays are of the L living fibres: those of the C fibres that were not dead."""
 
     pca: TracePCA  # reduces traces to the inputs and targets of the networks
     weights: Weights  # of the networks that predict each fibre from the others
@@ -166,7 +161,7 @@ def fit_health_model(
     weights = train_networks(inputs, targets, rows, rng)
 
     def predict_held_out(failed: Indices) -> tuple[Array, Array]:
-        """Mean and deviation of warm presses without the failed fibres, by the member not trained on the press."""
+        """Predict mean and deviation of warm presses without the failed fibres, by the member not trained on them."""
         mean, std = np.empty_like(targets), np.empty_like(targets)
         fibre_mask = ~np.isin(np.arange(len(living)), failed)
         for member in range(MEMBERS):
@@ -183,11 +178,11 @@ def fit_health_model(
     for n_failed in range(min(MAX_FAILED, len(living) - 1) + 1):
         subsets = []
         for failed in [rng.permutation(len(living))[:n_failed] for _ in range(SUBSETS if n_failed else 1)]:
-            llr = likelihoods.log_likelihood_ratios(*measured, *predict_held_out(failed))
-            for each in llr:
-                each[:, failed] = 0.0  # a failed fibre is not tested
+            llr = np.stack(likelihoods.log_likelihood_ratios(*measured, *predict_held_out(failed)))
+            llr[:, :, failed] = 0.0  # a failed fibre is not tested
             subsets.append(llr)
-        llrs.append((np.concatenate([each[0] for each in subsets]), np.concatenate([each[1] for each in subsets])))
+        continuing, onset = np.concatenate(subsets, axis=1)
+        llrs.append((continuing, onset))
     exceedance = ExceedanceModel.fit(llrs)
     if is_short:
         exceedance.level[:, HYPOTHESES.index("reduced_gain")] = MAX_HEIGHT

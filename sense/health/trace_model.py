@@ -19,8 +19,8 @@ Weights = Mapping[str, Floats]
 (E, C, H, 2 T) and `last.b` (E, C, 2 T), for E members, N inputs a fibre, H hidden units and T targets a fibre."""
 
 REST = 10  # readings of a trace before the probe is sent down
-HELD = 20  # readings after it was sent down
-RELEASED = 20  # readings after it was sent up
+HELD = 20  # readings of a trace after it was sent down
+RELEASED = 20  # readings of a trace after it was sent up
 TRACE = REST + HELD + RELEASED
 COMPONENTS = 6  # principal components of a response: 99.7 % of the variance on the published pad
 INPUTS = 2 * COMPONENTS + 1  # inputs of a fibre: response, baseline and history

@@ -1,4 +1,4 @@
-"""A gate to Foxglove's server, which accepts every connection, so that any web page could read the pad.
+"""A gate to Foxglove's server. The server accepts every connection, so that any web page could read the pad.
 
 Browsers let pages open WebSockets to any address, and state the origin of the page and the host of the request. The
 gate refuses requests of foreign pages, and forwards others to the server, whose address a page cannot guess.
@@ -18,20 +18,12 @@ from urllib.parse import urlsplit
 
 from padforge.common.server import HOST, ConnectionServer, is_this_machine
 
-APP_ORIGIN = "https://app.foxglove.dev"  # of the app in a browser; the desktop app has no web origin
+APP_ORIGIN = "https://app.foxglove.dev"  # origin of the app in a browser; the desktop app has no web origin
 CHUNK = 2**16  # maximum number of bytes forwarded at once
 
 
 class FoxgloveGate(ConnectionServer):
-    """A port of this machine that forwards connections to a server in the `with` block.
-
-    Args:
-        port: port, 0 for any free one.
-        target: address of the server.
-
-    Raises:
-        InputError: the port cannot be used.
-    """
+    """A port of this machine, 0 for any free one, that forwards connections to a server in the `with` block."""
 
     def __init__(self, port: int, target: tuple[str, int]) -> None:
         self.target = target
@@ -47,11 +39,9 @@ def hidden_host() -> str:
 
 
 def is_welcome(headers: Message, port: int) -> bool:
-    """Return whether a request is not that of a foreign page; pages of this machine and the Foxglove app are allowed.
+    """Return whether a request is to this machine, and from no web page, one of this machine, or the Foxglove app.
 
-    Args:
-        headers: headers of the request; the origin "null" stands for a hidden one and is refused.
-        port: port of the connection.
+    The origin "null" stands for a hidden one and is refused.
     """
     origin = headers["Origin"]
     if not is_this_machine(headers["Host"] or "", port):

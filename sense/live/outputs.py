@@ -44,7 +44,7 @@ class Message:
 
 
 class MessageBuilder:
-    """Builds the messages of a pipeline; if the pad is `mirrored`, with its tracks up, z points into it."""
+    """Builds the messages of a pipeline; z points into a pad that is `mirrored`, that is with its tracks up."""
 
     def __init__(self, pipeline: Live, mirrored: bool = False) -> None:
         self._pipeline, self._pressed, self._is_first = pipeline, False, True
@@ -126,13 +126,8 @@ def broadcast(outputs: Iterable[OutputStream], messages: Iterable[Message]) -> N
 class JsonLines(ConnectionServer):
     """A TCP server of JSON lines in the `with` block: the latest state of the fibres, then all later messages.
 
-    Args:
-        host: address.
-        port: port, 0 for any free one.
-        token: first line that a subscriber must send, "" for none.
-
-    Raises:
-        InputError: the port cannot be used, or other machines could connect without a token.
+    Raises InputError if the port (0 for any free one) cannot be used, or other machines could connect without a token,
+    which a subscriber has to send as its first line.
     """
 
     def __init__(self, host: str, port: int, token: str = "") -> None:

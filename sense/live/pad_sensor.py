@@ -19,16 +19,9 @@ START_S = 20.0  # longest wait for the first reading
 
 
 def open_board(rig: str, model: Path, options: RigSettings, fibres: int) -> Board:
-    """Return the board of a rig without its arm, not yet connected.
+    """Return the board of `[rig]`, not yet connected; "simulated" is the simulated pad that the model was trained on.
 
-    Args:
-        rig: "simulated" for the pad that the model was trained on; otherwise the board is that of `[rig]`.
-        model: folder written by `calibrate`.
-        options: settings `[rig]`.
-        fibres: number of fibres.
-
-    Raises:
-        InputError: the board is not installed, or the model is not that of a simulated pad.
+    Raises InputError if the board is not installed, or the model is not that of a simulated pad.
     """
     if rig == "simulated":
         from padforge.sense.rig.simulated_board import simulated_board_of
@@ -43,19 +36,7 @@ def load_health(model: Path) -> HealthModel | None:
 
 
 class PadSensor:
-    """A live pad, localized in a thread.
-
-    Args:
-        rig: see `open_board`.
-        model: folder written by `calibrate`.
-        options: settings `[rig]`.
-
-    Attributes:
-        names: names of the values that `read` returns.
-
-    Raises:
-        InputError: the model cannot be loaded.
-    """
+    """A live pad, localized in a thread; see `open_board` for the arguments."""
 
     def __init__(self, rig: str, model: Path, options: RigSettings) -> None:
         self._rig, self._model, self._options = rig, model, options
@@ -63,7 +44,7 @@ class PadSensor:
         measures = [column for measure in self._localizer.scaler.measures for column in MEASURE_COLUMNS[measure.name]]
         fibres = [f"fibre_{fibre}_v" for fibre in range(self._localizer.fibres)]
         self._touch_names = ["x_mm", "y_mm", "r90_mm", "unlike", *measures]
-        self.names = (*fibres, "pressed", "valid", *self._touch_names)
+        self.names = (*fibres, "pressed", "valid", *self._touch_names)  # of the values that `read` returns
         self._thread: threading.Thread | None = None
         self._stop, self._started = threading.Event(), threading.Event()
         self._values: Mapping[str, float] = {}
@@ -93,11 +74,7 @@ class PadSensor:
 
         `pressed` is 1 while the pad is pressed. While `valid` is 1, position, radius, depth and force are those of the
         current press, otherwise of the last one; they are 0 before the first estimate. `unlike` is 1 if no single press
-        explains the responses, for example with two fingers.
-
-        Raises:
-            RigFault: the board failed.
-            InputError: the pad is not connected.
+        explains the responses, for example with two fingers. Raises RigFault if the board failed.
         """
         if self._thread is None:
             raise InputError("the pad is not connected")

@@ -44,7 +44,7 @@ MAX_TRACK = 64  # latest positions of the current press in the view
 SHARPER = 0.75  # ratio of radii below which a new estimate at the same position replaces the earlier one
 LEAD = MEDIAN_OFFSET + MEDIAN_WIDTH // 2  # readings before `down_command` that features use, without their history
 OPENING = PRESS_WINDOWS[-1][1]  # readings after `down_command` that features use
-LATEST = 20  # readings before the present or the release that features of a long press use
+LATEST = 20  # readings before the present, or the release, that features of a long press use
 RELEASE = max(RELEASE_WINDOWS[-1][1], RELEASED)  # readings after `up_command` that complete a press
 
 
@@ -115,7 +115,7 @@ class Estimate:
 
 @dataclass(frozen=True)
 class OtherPad:
-    """The latest presses are those of another pad than the calibrated one, or of one cast again by its plan."""
+    """Notice that the latest presses are those of another pad than the calibrated one, even if of the same plan."""
 
     press: int  # index of the latest press
     text: str = OTHER_PAD
@@ -151,11 +151,10 @@ class BufferedPress:
             self._opening = buffer.rows(self.down_command - LEAD, self.down_command + OPENING)[:, 1:].copy()
 
     def excerpt(self, buffer: RingBuffer, until: int) -> tuple[Array, int, int, int]:
-        """Return the readings of the press before index `until`, without those in its middle that no feature uses.
+        """Return the readings (n, C) of the press before index `until`, without those that no feature uses.
 
-        Returns:
-            Readings (n, C), and the indices in them of `down_command`, of `up_command`, n while the press is held, and
-            of the end of the previous press.
+        Also returned are the indices in them of `down_command`, of `up_command` (n while the press is held), and of the
+        end of the previous press.
         """
         up_command = until if self.up_command is None else min(self.up_command, until)
         opened = min(self.down_command + OPENING, until)

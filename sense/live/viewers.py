@@ -17,23 +17,16 @@ from padforge.sense.live.outputs import Message
 from padforge.sense.localizer.doubts import OTHER_PAD
 
 SCENE = "/pad/scene"
-THICKNESS_MM = 1.0  # of the disc
+THICKNESS_MM = 1.0  # thickness of the disc
 BLUE = (0.13, 0.47, 0.71, 0.8)  # red, green, blue and alpha of the disc
-GREY = (0.5, 0.5, 0.5, 0.3)  # of the area
+GREY = (0.5, 0.5, 0.5, 0.3)  # the same of the sensed area
 
 
 class FoxgloveOutput(contextlib.AbstractContextManager["FoxgloveOutput"]):
     """A WebSocket server of this machine for Foxglove: all messages as JSON, and the scene in m, frame `pad`.
 
-    No web page can read it, except the Foxglove app.
-
-    Args:
-        port: port, 0 for any free one.
-        centre_mm: x and y of the middle of the sensed area.
-        half_mm: half the width and height of that area.
-
-    Raises:
-        InputError: the port cannot be used.
+    No web page can read it, except the Foxglove app. The sensed area has a centre (x, y), and half a width and height.
+    Raises InputError if the port (0 for any free one) cannot be used.
     """
 
     def __init__(self, port: int, centre_mm: list[float], half_mm: list[float]) -> None:
@@ -118,16 +111,8 @@ def _json_schema(value: Any) -> dict[str, Any]:
 class RerunOutput(contextlib.AbstractContextManager["RerunOutput"]):
     """A stream for Rerun, in V and mm by the clock of the readings, to a viewer or into a file.
 
-    The file appears, complete, at the end of the `with` block.
-
-    Args:
-        target: address of a viewer, rerun+http://HOST:PORT/proxy, or a file that ends in .rrd.
-        fibres: number of fibres.
-        centre_mm: x and y of the middle of the sensed area.
-        half_mm: half the width and height of that area.
-
-    Raises:
-        InputError: the target is invalid, or the file cannot be written.
+    The target is the address of a viewer, rerun+http://HOST:PORT/proxy, or a file that ends in .rrd, which appears,
+    complete, at the end of the `with` block. Raises InputError if it is neither, or the file cannot be written.
     """
 
     def __init__(self, target: str, fibres: int, centre_mm: list[float], half_mm: list[float]) -> None:

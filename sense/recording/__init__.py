@@ -1,1 +1,1 @@
-"""Recordings: what was read and where was pressed, on disk."""
+"""Recordings of readings and presses, on disk."""

@@ -1,8 +1,8 @@
 """An append-only file of readings in blocks, each with a checksum.
 
 All blocks have the same size: a header (magic number, sequence number, index of the first reading, number of readings,
-CRC-32 of the block without this field), rows of float64 (time in s, then one voltage per fibre) and zeros. A writer
-that is killed leaves at worst a torn last block, which readers ignore; damage before an intact block is an error.
+CRC-32 of the block without this field), rows of float64 (time in s, then one voltage per fibre) and zeros. A killed
+writer leaves at worst a torn last block, which is ignored in reading; damage before an intact block is an error.
 """
 
 import zlib
@@ -17,9 +17,9 @@ from padforge.common.validation import InputError
 from padforge.sense.arrays import MAX_BYTES, Array, Mask
 
 _MAGIC = b"PFB1"
-_UNIT = 256  # the size of a block is a multiple, bytes
-_CRC_OFFSET = 20  # bytes
-_HEADER = 24  # size, bytes
+_UNIT = 256  # the size of a block is a multiple of this, bytes
+_CRC_OFFSET = 20  # offset of the checksum, bytes
+_HEADER = 24  # size of the header, bytes
 
 
 def block_dtype(fibres: int) -> np.dtype[np.void]:
@@ -36,13 +36,8 @@ def block_dtype(fibres: int) -> np.dtype[np.void]:
 class BlockWriter:
     """Appends rows to a file: full blocks at once, the remaining rows at `flush`.
 
-    A failed write adds nothing; the next one overwrites its remains.
-
-    Args:
-        file: file open for writing in place.
-        fibres: number of fibres C.
-        blocks: number of blocks in the file.
-        rows: number of rows in the file.
+    A failed write adds nothing; the next one overwrites its remains. The file is open for writing in place, and has
+    `blocks` blocks of `rows` rows in all.
     """
 
     def __init__(self, file: BinaryIO, fibres: int, blocks: int = 0, rows: int = 0) -> None:
@@ -94,7 +89,7 @@ class BlockWriter:
 
 
 def write_at(file: BinaryIO, position: int, data: bytes) -> None:
-    """Write all data at a position; after a failure, another call overwrites data that were written in part."""
+    """Write all data at a position; after a failure, repeat the call to overwrite what was written in part."""
     file.seek(position)
     remaining = memoryview(data)
     while remaining:
@@ -109,7 +104,7 @@ def read_blocks(path: Path, fibres: int) -> tuple[Array, Array]:
 
 
 def _has_row(blocks: NDArray[np.void]) -> Mask:
-    """Return which rows of blocks (B,) are filled; shape (B, rows of a block)."""
+    """Return whether each row of blocks (B,) is filled; shape (B, rows of a block)."""
     return np.arange(blocks.dtype["rows"].shape[0]) < blocks["count"][:, None]
 
 

@@ -10,12 +10,12 @@ from padforge.sense.arrays import Array, Mask
 from padforge.sense.recording.recording import Recording
 
 MIN_SPAN_MM = 2.0  # span of the presses on the smallest pad; positions in m have a smaller one
-MIN_RATE_HZ = 1.5  # of multimeters; 200 readings a second with times in ms, read as s, have 0.2 Hz
-MAX_RATE_HZ = 10_000.0  # of fast boards
-REFERENCE_V = 3.3  # of common boards
+MIN_RATE_HZ = 1.5  # rate of multimeters; 200 readings a second with times in ms, read as s, have 0.2 Hz
+MAX_RATE_HZ = 10_000.0  # rate of fast boards
+REFERENCE_V = 3.3  # reference of common boards
 MARGIN = 0.5  # distance, in spans of most presses, beyond which a press is far outside
-MIN_PRESSES = 20  # for an estimate of that span
-MAX_NAMED = 5
+MIN_PRESSES = 20  # minimum number of presses for an estimate of that span
+MAX_NAMED = 5  # presses in a message
 
 
 def area_mm(recording: Recording) -> Array | None:
@@ -45,8 +45,8 @@ def suggest_unit(
     Args:
         source: source of the recording, with its mapping as `columns`.
         quantity: `time`, `positions` or `fibres`.
-        readings: readings as interpreted, V; they tell the number of bits of a converter.
-        rate_hz: rate as interpreted; it tells whether times are ms, us or ns.
+        readings: readings that were read as V, for the number of bits of a converter.
+        rate_hz: rate of times that were read as s, for the choice of ms, us or ns.
     """
     columns = str(source.get("columns", ""))
     names = [piece.partition("=")[::2] for piece in columns.split(",")] if columns else []

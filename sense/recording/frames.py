@@ -12,10 +12,10 @@ import numpy as np
 from padforge.sense.arrays import Array
 from padforge.sense.recording.recording import Recording
 
-FRAME_S = 0.075  # length of a frame, s
+FRAME_S = 0.075  # length of a frame
 AS_READ = 0.9, 1.1  # range of readings per frame, by the median interval, in which each reading is a frame
 MIN_PRESENT = 0.25  # minimum fraction of a frame with readings of a fibre; otherwise the fibre is missing in it
-# Longer intervals between readings count as the maximum of these two, so that a computer's sleep makes no frames.
+# Intervals between readings count as at most the larger of these two, so that a computer's sleep makes no frames.
 MAX_PAUSE_S = 1.0
 MAX_PAUSE = 3.0  # in intervals of the rate
 
@@ -48,12 +48,7 @@ def framed(recording: Recording) -> Recording:
 
 
 class FrameStream:
-    """Consecutive frames of a stream, as soon as they are complete.
-
-    Args:
-        rate_hz: readings per second.
-        fibres: number of fibres C.
-    """
+    """Consecutive frames of a stream of readings of C fibres, as soon as they are complete."""
 
     def __init__(self, rate_hz: float, fibres: int) -> None:
         self._rate_hz = rate_hz
@@ -62,12 +57,7 @@ class FrameStream:
         self._pending = np.empty((0, 2 + fibres))
 
     def feed(self, times_s: Array, readings: Array) -> tuple[Array, Array]:
-        """Add readings; return the times (N,), s, and the means (N, C), V, of the frames that they complete.
-
-        Args:
-            times_s: times, ascending; shape (n,).
-            readings: readings, NaN where missing; shape (n, C), V.
-        """
+        """Add readings (n, C), V, at ascending times (n,); return times (N,) and means (N, C) of complete frames."""
         if is_as_read(self._rate_hz) or not len(times_s):
             return times_s, readings
         if not len(self._pending):  # assume a missing reading before the first one
@@ -113,15 +103,9 @@ def reading_edges(times_s: Array) -> Array:
 
 
 def time_means(edges: Array, readings: Array, frame_edges: Array) -> Array:
-    """Average a piecewise constant signal over frames.
+    """Average readings (R, C), constant between their edges (R + 1,), over frames with edges (N + 1,).
 
-    Args:
-        edges: edges of the readings' intervals; shape (R + 1,).
-        readings: readings, NaN where missing; shape (R, C).
-        frame_edges: edges of the frames; shape (N + 1,).
-
-    Returns:
-        Means over time (N, C); NaN if less than `MIN_PRESENT` of a frame has readings.
+    Returns the means (N, C), NaN if less than `MIN_PRESENT` of a frame has readings.
     """
     present = ~np.isnan(readings)
     # The means are subtracted from the readings, so that long sums keep their precision.

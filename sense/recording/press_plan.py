@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from padforge.common.settings import or_default
-from padforge.common.validation import InputError
+from padforge.common.validation import InputError, naming_file
 from padforge.design.morphology import Morphology
 from padforge.design.paths.keep_outs import is_outside, keep_outs
 from padforge.design.settings import Contact, PadSettings
@@ -24,15 +24,10 @@ PositionTest = Callable[[Array], Mask]  # returns which positions (Q, 2), mm, ma
 
 @dataclass(frozen=True)
 class PressPlan:
-    """Presses to be made.
+    """Presses to be made."""
 
-    Attributes:
-        positions_mm: positions (Q, 2) from the pad's centre.
-        depths_mm: depths (Q,) below the pad's surface, > 0.
-    """
-
-    positions_mm: Array
-    depths_mm: Array
+    positions_mm: Array  # from the pad's centre; shape (Q, 2)
+    depths_mm: Array  # below the pad's surface, > 0; shape (Q,)
 
     def __post_init__(self) -> None:
         positions = check_numbers(self.positions_mm, np.float64, "positions of the plan")
@@ -67,7 +62,7 @@ class PressPlan:
 
 
 def fit_pad_settings(pad: Morphology, pad_settings: PadSettings | None = None) -> PadSettings:
-    """Return `[pad]`, or the default, for the layout of a pad; raise InputError if keep-outs leave too little of it."""
+    """Return `[pad]`, or the default, for the layout of a pad; InputError if keep-outs leave too little of it."""
     pad_settings = or_default("size", pad_settings, PadSettings).for_layout(pad.layout)
     if pad_settings.keep_out_mm:
         import shapely
@@ -100,13 +95,7 @@ def planned_depths_mm(rig: RigSettings) -> Array:
 
 
 def check_depths(depths_mm: Array, thickness_mm: float, pad: str) -> None:
-    """Raise InputError if a press is as deep as the pad is thick.
-
-    Args:
-        depths_mm: depths of the presses; shape (n,).
-        thickness_mm: thickness of the pad.
-        pad: source of the thickness, for the message.
-    """
+    """Raise InputError if one of the depths (n,) reaches the thickness of the pad; `pad` is its source, in words."""
     if (deepest := float(depths_mm.max())) >= thickness_mm:
         raise InputError(f"[rig] presses {deepest:g} mm deep, allowed is less than {thickness_mm:g} mm, by {pad}")
 
@@ -136,18 +125,12 @@ def make_plan(
 def make_plan_in(
     corners_mm: Array, rig: RigSettings, rng: np.random.Generator, is_pressable: PositionTest
 ) -> PressPlan:
-    """Return the plan of `[rig]`: that of its file, or `presses` positions between two corners.
+    """Return the plan of `[rig]`: that of its file, or `presses` positions between two corners (2, 2), low and high.
 
     A grid has about equal steps along both axes, and as many rows as contain `presses` pressable positions; a
     serpentine plan alternates the direction of its rows. Depths alternate along a row, and each row starts with the
     next depth, since columns of equal depth would correlate depth with position. An adaptive plan is uniform until a
     localizer moves its presses.
-
-    Args:
-        corners_mm: low and high corner; shape (2, 2).
-        rig: plan, file, presses and depths.
-        rng: generator of random positions.
-        is_pressable: returns which positions may be pressed.
     """
     if rig.plan_file is not None:
         return check_pressable(read_plan(rig.plan_file, rig.press_depths_mm), rig.plan_file, is_pressable)
@@ -208,18 +191,11 @@ def check_pressable(plan: PressPlan, path: Path, is_pressable: PositionTest) -> 
 
 
 def read_plan(path: Path, depths_mm: Sequence[float]) -> PressPlan:
-    """Read a plan from a CSV file.
-
-    Args:
-        path: file with the columns x_mm, y_mm and, optionally, depth_mm.
-        depths_mm: depths that presses take in turn if the file has none.
-    """
+    """Read a plan from a CSV file of x_mm, y_mm and depth_mm; without the latter, presses take `depths_mm` in turn."""
     table = read_table(path)
     if tuple(table.names) not in (COLUMNS, COLUMNS[:2]):
         raise InputError(f"{path}: header is {','.join(table.names)[:60]!r}, expected x_mm,y_mm or x_mm,y_mm,depth_mm")
     values = table.read_columns(range(len(table.names)))
     depths = np.resize(depths_mm, (len(values), 1))
-    try:
+    with naming_file(path):
         return PressPlan.from_rows(np.column_stack([values, depths])[:, :3])
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from error

@@ -12,17 +12,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from padforge.common.files import (
-    LOCK,
-    locked,
-    make_folder,
-    read_json,
-    reraise_write_error,
-    sync,
-    temporary_folder,
-)
+from padforge.common.files import LOCK, locked, make_folder, read_json, reraise_write_error, sync, temporary_folder
 from padforge.common.files import provenance as origin
-from padforge.common.validation import InputError, check_path, check_type, short_repr
+from padforge.common.validation import InputError, check_path, check_type, naming_file, short_repr
 from padforge.sense.arrays import (
     MAX_FIBRES,
     MAX_MM,
@@ -54,11 +46,9 @@ from padforge.sense.recording.run_directory import (
 
 _ARRAYS = dict.fromkeys(("readings", "times_s", "presses_mm"), np.float64)
 _ARRAYS |= dict.fromkeys(("down_command", "up_command"), np.int64)
-FIBRE_NAMES = "fibre_names"
-"""Key in the source of a recording: names of its fibres in the file that it was imported from."""
+FIBRE_NAMES = "fibre_names"  # key in the source of a recording: names of its fibres in the imported file
 NOTE = "note"  # key in the source of a recording: what was omitted in the import, or filled in
-PRESSES_DETECTED = {"presses": "detected"}
-"""Entry of the source of a recording whose presses were detected in its readings."""
+PRESSES_DETECTED = {"presses": "detected"}  # entry of the source of a recording whose presses were detected
 _MIN_READINGS = 100  # fewer may be a table with a line for each press
 _MEASURES = {"depths_mm": (MAX_MM, "mm"), "reached_mm": (MAX_MM, "mm"), "forces_n": (MAX_N, "N")}
 
@@ -102,7 +92,7 @@ class Recording:
         _check_presses(self)
         for name in _MEASURES:
             values = check_numbers(getattr(self, name), np.float64, name)
-            is_unknown = np.isnan(values).all()  # whatever the length, which `replace` may have changed for the presses
+            is_unknown = np.isnan(values).all()  # of any length, since `replace` may have changed the number of presses
             self._freeze(name, np.full(len(self.presses_mm), np.nan) if is_unknown else values)
             _check_measure(self, name)
 
@@ -193,7 +183,7 @@ class Recording:
         presses_mm: ArrayLike | None = None,
         **measures: ArrayLike,
     ) -> "Recording":
-        """Return a recording of arrays.
+        """Make a recording from arrays.
 
         Args:
             readings: voltages, NaN where missing; shape (R, C), V.
@@ -238,7 +228,7 @@ class Recording:
         table = done[done[:, 3] <= len(times_s)]
         for array in (times_s, readings):
             array.setflags(write=False)
-        try:
+        with naming_file(path):
             return cls(
                 readings=readings,
                 times_s=times_s,
@@ -251,8 +241,6 @@ class Recording:
                 reached_mm=table[:, 5],
                 forces_n=table[:, 6],
             )
-        except InputError as error:
-            raise InputError(f"{path}: {error}") from error
 
     def save(self, path: str | Path, provenance: Mapping[str, Any] | None = None, replacing: bool = False) -> None:
         """Write a run directory atomically.
@@ -303,14 +291,10 @@ class PressSelection:
     """A selection of presses, `recording[presses]`, for cross-validation.
 
     It has the readings of all presses, since earlier presses influence later ones.
-
-    Attributes:
-        recording: the recording.
-        presses: indices of the selected presses; shape (S,).
     """
 
     recording: Recording
-    presses: Indices
+    presses: Indices  # indices of the selected presses; shape (S,)
 
     @property
     def presses_mm(self) -> Array:
@@ -355,11 +339,7 @@ def check_replaceable(path: Path) -> None:
 
 
 def detect_commands(readings: Array, times_s: Array, source: Mapping[str, Any]) -> tuple[Indices, Indices]:
-    """Detect the presses in readings (R, C) and return their down and up commands (Q,).
-
-    Raises:
-        InputError: the readings are invalid, or have no press.
-    """
+    """Detect the presses in readings (R, C) and return their down and up commands (Q,); InputError if there is none."""
     from padforge.sense.signals.press_detection import detect_presses, estimate_commands
 
     placeholder = np.array([1])
@@ -428,7 +408,7 @@ def _check_measure(recording: Recording, name: str) -> None:
 
 
 def is_mirrored(source: object) -> bool:
-    """Return whether the pad lay with its tracks up, by the source of a recording; see `Recording.mirrored`."""
+    """Return `Recording.mirrored` by the source of a recording."""
     rig = source.get("rig") if isinstance(source, Mapping) else None
     return isinstance(rig, Mapping) and rig.get("mirrored") is True
 

@@ -3,8 +3,8 @@
 It contains `start.json` (source and provenance), `readings.bin` and, for an arm, `states.bin` (see `block_file`), and
 `journal.ndjson`, with a line when a press starts, with its position and the index of its first reading, and a line when
 it is done or aborted. Readings are on the disk before the journal says that a press is done: after a kill all presses
-that are done according to the journal can be used, and the others are repeated. `start.json` is written last when a
-recording is created; a folder without it is empty or was abandoned, and can be used for a recording.
+that are done by the journal can be used, and the others are repeated. `start.json` is written last when a recording is
+created; a folder without it is empty or was abandoned, and can be used for a recording.
 """
 
 import contextlib
@@ -142,7 +142,7 @@ class Recorder:
         """Continue an unfinished run directory; torn ends are cut off, other damage raises InputError.
 
         Args:
-            path: of the run directory.
+            path: the run directory.
         """
         fibres = read_fibres(path := check_path("path", path))
         self = cls.__new__(cls)
@@ -156,7 +156,7 @@ class Recorder:
                 journal = read_journal(path / JOURNAL)
                 times_s, _ = read_blocks(path / READINGS, fibres)
                 if (journal and not len(times_s)) or not (np.diff(times_s) > 0).all():
-                    # No interruption causes this, so that nothing may be cut off.
+                    # No interruption can cause this, so nothing is cut off.
                     what = f"the readings of {len(journal)} presses of {fibres} fibres in the journal"
                     raise InputError(f"{path / READINGS}: not {what}")
                 blocks, self._stream, times_s = BlockWriter.resume(path / READINGS, fibres)
@@ -181,11 +181,11 @@ class Recorder:
         return self
 
     def append(self, times_s: ArrayLike, readings: ArrayLike) -> None:
-        """Add readings (n, C), V, at ascending times (n,), s; after an OSError (a full disk) none is added.
+        """Add readings; after an OSError (a full disk) none is added.
 
         Args:
-            times_s: (n,) ascending.
-            readings: (n, C) V.
+            times_s: times, ascending; shape (n,), s.
+            readings: readings, NaN where missing; shape (n, C), V.
         """
         times, volts = check_numbers(times_s, np.float64, "times"), check_numbers(readings, np.float64, "readings")
         if times.ndim != 1 or volts.shape != (len(times), self.fibres) or not np.isfinite(times).all():
@@ -199,10 +199,10 @@ class Recorder:
         self.n_readings += len(rows)
 
     def append_states(self, rows: Array) -> None:
-        """Add states (n, 10) of the arm, by `STATE_COLUMNS`.
+        """Add states of the arm.
 
         Args:
-            rows: (n, 10), by `STATE_COLUMNS`.
+            rows: states, by `STATE_COLUMNS`; shape (n, 10).
         """
         if self._states is None:
             file = (self._path / STATES).open("xb", buffering=0)
@@ -250,7 +250,7 @@ class Recorder:
         """Record that the current press, if any, was aborted for a reason.
 
         Args:
-            reason: in words.
+            reason: the reason, in words.
         """
         if self._is_down:
             self._is_down = False

@@ -61,26 +61,16 @@ class _Dialect:
 
 @dataclass
 class Table:
-    """A table whose columns are read by their indices.
-
-    Attributes:
-        path: the file.
-        encoding: encoding of its text.
-        names: names of the columns; numbers from 1 if there is no header.
-        units: units of the columns, from a line below the header; "" if there is none.
-        rows: cells of the first lines, for people.
-        dialect: format of the table.
-        notes: what was omitted in reading, a line each.
-    """
+    """A table whose columns are read by their indices."""
 
     path: Path
     encoding: str
-    names: list[str]
-    units: list[str]
-    rows: list[list[str]]
+    names: list[str]  # names of the columns; numbers from 1 if there is no header
+    units: list[str]  # units of the columns, from a line below the header; "" if there is none
+    rows: list[list[str]]  # cells of the first lines, for people
     dialect: _Dialect
-    notes: list[str] = field(default_factory=list)
-    _lines: "array[int]" = field(default_factory=lambda: array("q"))
+    notes: list[str] = field(default_factory=list)  # a line for each omission in reading
+    _lines: "array[int]" = field(default_factory=lambda: array("q"))  # number of the line of each row
 
     @property
     def has_header(self) -> bool:
@@ -92,22 +82,18 @@ class Table:
         return self._lines[row]
 
     def read_columns(self, columns: Sequence[int], may_be_unknown: Sequence[int] = ()) -> Array:
-        """Return columns of numbers.
+        """Return the numbers (R, n) in n columns, by their indices; NaN where missing.
 
-        Args:
-            columns: indices of n columns.
-            may_be_unknown: indices of columns in which `?` is read as `UNKNOWN`.
-
-        Returns:
-            Values (R, n), NaN where missing; dates as seconds since 1970, times of day as seconds since midnight.
+        Dates are seconds since 1970, and times of day seconds since midnight. In columns that `may_be_unknown`, `?` is
+        read as `UNKNOWN`.
         """
         dialect, width = self.dialect, len(self.names)
         numbers, self._lines, self.notes = array("d"), array("q"), []
         dates: dict[int, list[str]] = {column: [] for column in columns if column in dialect.dates}
         words: dict[int, dict[int, str]] = {column: {} for column in columns}  # invalid cells by column and line
         torn: list[tuple[int, int]] = []  # lines with a wrong number of values, and that number
-        n_headers, last = 0, 0
         garbled: list[int] = []
+        n_headers = last = 0
         for line, row in _split(_iterate_lines(self.path, self.encoding, garbled=garbled), dialect.separator):
             if line < dialect.first:
                 continue
@@ -175,12 +161,8 @@ def name_lines(lines: Sequence[int]) -> str:
 def read_table(path: Path, encoding: str = "") -> Table:
     """Open a table; its columns are read by `Table.read_columns`.
 
-    Args:
-        path: the file.
-        encoding: encoding; by default that of the byte order mark, UTF-8 if valid, or Windows' cp1252.
-
-    Raises:
-        InputError: the file cannot be read, or is not text.
+    The encoding is by default that of the byte order mark, UTF-8 if the text is valid, or Windows' cp1252. Raises
+    InputError if the file cannot be read, or is not text.
     """
     encoding = encoding or _find_encoding(check_file(path, MAX_BYTES))
     sample = list(islice(_iterate_lines(path, encoding, comments=True), _N_SAMPLED))

@@ -1,8 +1,7 @@
 """Recording by hand: a person is asked to press targets, and the presses are detected in the readings.
 
-The order of the targets has short distances, and covers the whole pad every few presses. A rejected press is recorded
-at an unknown position, since it influences the readings of the next presses. The view of a session is JSON, for the
-page (`live/pages/hand.html`), and a few lines of text for the terminal.
+A rejected press is recorded at an unknown position, since it influences the readings of the next presses. The view of a
+session is JSON, for the page (`live/pages/hand.html`), and a few lines of text for the terminal.
 """
 
 from collections import deque
@@ -25,7 +24,7 @@ from padforge.sense.rig.devices import Board, RigFault
 from padforge.sense.rig.streams import HISTORY, SLACK, RingBuffer, stream_board
 from padforge.sense.signals.press_detection import RELEASE_DELAY_S, TOUCH_DELAY_S, PressDetector
 
-KIND = "hand"  # kind of source of such a recording, whose depths are unknown
+KIND = "hand"  # kind of source of a recording by hand, whose depths are unknown
 # A uniform plan is ordered by short distances within rounds of this many targets. Each round covers the whole pad, so
 # that a session may end early, and drift with time is not confused with position.
 ROUND = 25
@@ -88,28 +87,19 @@ def _order_in_rounds(positions_mm: Array) -> Array:
     return ordered
 
 
-def _remaining_targets(targets_mm: Array, pressed_mm: Array) -> Array:
-    """Return the targets (Q, 2), in order, except one for each of the positions (R, 2) already pressed."""
-    pressed, remaining = pressed_mm.tolist(), []
-    for position in targets_mm.tolist():
-        if position in pressed:
-            pressed.remove(position)
-        else:
-            remaining.append(position)
-    return np.array(remaining).reshape(-1, 2)
-
-
 def open_recorder_by_hand(config: RigConfig, board: Mapping[str, Any], resume: bool) -> tuple[Recorder, Array, Array]:
     """Return the recorder, new or resumed, the targets (Q, 2) of its plan, and the remaining targets (P, 2), mm."""
     is_resumed = resume and (config.out / START).exists()
     if is_resumed:
-        presses = read_source(config, config.rig, KIND)["plan"]["presses"]
-        targets_mm = np.array(presses, np.float64)
+        targets_mm = np.array(read_source(config, config.rig, KIND)["plan"]["presses"], np.float64)
     else:
         targets_mm = plan_targets(config)
     recorder = open_recorder(config, config.rig, targets_mm.tolist(), config.out, resume, {"board": board}, KIND)
-    pressed = [press[:2] for press in read_journal(config.out / JOURNAL).values()] if is_resumed else []
-    return recorder, targets_mm, _remaining_targets(targets_mm, np.reshape(pressed, (-1, 2)))
+    remaining = targets_mm.tolist()
+    for press in read_journal(config.out / JOURNAL).values() if is_resumed else ():
+        if list(press[:2]) in remaining:
+            remaining.remove(list(press[:2]))
+    return recorder, targets_mm, np.array(remaining).reshape(-1, 2)
 
 
 class HandPhase(StrEnum):
@@ -130,15 +120,9 @@ class HandPhase(StrEnum):
 
 
 def press_responses(readings: Array, down_command: int, up_command: int) -> Array:
-    """Return the mean responses of a press in the second and in the last quarter of its hold.
+    """Return the mean responses (2, C) of a press in the second and in the last quarter of its hold, V; 0 if missing.
 
-    Args:
-        readings: readings (n, C), V, NaN where missing.
-        down_command: index of the reading at which the press began.
-        up_command: index of the reading at which it ended.
-
-    Returns:
-        Differences (2, C) from the baseline before the press, V; 0 where missing.
+    They are relative to the baseline before the press, in the readings (n, C), V, NaN where missing.
     """
     quarter = max((up_command - down_command) // 4, 1)
     early, last = down_command + quarter, up_command - 1  # the last reading may show the release
@@ -188,13 +172,7 @@ class PressValidator:
         return ""
 
     def is_untouched(self, volts: Array, before: Array, held_s: float) -> bool:
-        """Return whether nothing touches the pad although a touch was detected.
-
-        Args:
-            volts: present readings (C,).
-            before: readings (C,) before the touch.
-            held_s: time since the touch.
-        """
+        """Return whether nothing touches the pad although a touch was detected, by readings (C,) now and before it."""
         # 1. The readings equal those before the touch: it was a false detection, or the release was missed.
         if held_s > RELEASE_S and self.relative_response(volts - before) < MIN_RESPONSE:
             return True
@@ -221,12 +199,9 @@ class PressValidator:
 
 
 class PressSequence:
-    """Targets to press one after the other, each until a press of it is accepted.
+    """Targets (Q, 2) to press one after the other, each until a press of it is accepted.
 
-    Args:
-        targets_mm: positions (Q, 2).
-        hold_s: time for which a press is to be held, and for which the pad is to recover after it.
-        now_s: time of the start.
+    A press is to be held for `hold_s`, and the pad is to recover from it for the same time.
     """
 
     def __init__(self, targets_mm: Array, hold_s: float, now_s: float) -> None:
@@ -316,15 +291,7 @@ class PressSequence:
 
 
 class HandSession:
-    """A session of recording by hand.
-
-    Args:
-        recorder: recorder of the session, new or resumed.
-        n_fibres: number of fibres C.
-        targets_mm: positions (Q, 2), in their order.
-        hold_s: see `PressSequence`.
-        n_done: presses of the plan made in earlier sessions.
-    """
+    """A session of recording by hand, of targets (Q, 2) in their order, after `n_done` presses of earlier sessions."""
 
     def __init__(self, recorder: Recorder, n_fibres: int, targets_mm: Array, hold_s: float, n_done: int = 0) -> None:
         self._recorder, self._n_fibres, self._n_done = recorder, n_fibres, n_done

@@ -14,7 +14,7 @@ from padforge.sense.settings import RigSettings
 
 Status = Literal["ok", "warn", "fail"]
 
-OBSERVE_S = 2.0  # duration of the observation of each device
+OBSERVE_S = 2.0  # for which each device is observed
 _DEAD_V = 0.02  # a channel closer than this to either end of the range is open, shorted or saturated
 _LATE_S = 0.1  # maximum latency, age or gap
 

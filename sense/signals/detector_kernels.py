@@ -3,8 +3,9 @@
 Means over blocks of BLOCK_S are tracked by a local linear trend (A. C. Harvey, "Forecasting, Structural Time Series
 Models and the Kalman Filter", Cambridge 1989), whose noise is learnt. A change is a run of blocks that leave the
 prediction and agree with each other (chi-square tests); a block that agrees with no other is a spike. A release takes
-back the step of its touch, and goes against the direction of touches, since stretched fibres drive their dividers all
-one way. Steps are whitened: divided by `scale`, the noise of the fibre. The size of a step is the sum of the squares.
+back the step of its touch, and is opposite to the direction of touches, since every fibre changes its voltage in one
+direction when it is stretched. Steps are whitened: divided by `scale`, the noise of the fibre. The size of a step is
+the sum of squares of the whitened steps of all fibres.
 """
 
 import math
@@ -17,25 +18,25 @@ from padforge.common.compilation import kernel
 
 FIBRE = np.dtype(
     [
-        ("level", "f8"),  # predicted for now, V
+        ("level", "f8"),  # prediction for the present block, V
         ("slope", "f8"),  # V/s
         *[(name, "f8") for name in ("level_var", "cross_var", "slope_var")],  # covariance, in units of scale^2
         ("noise", "f8"),  # standard deviation of a block mean, V
-        ("scale", "f8"),  # the same, but not below what counts as noise, V
-        ("innovation", "f8"),  # of the last update, V
+        ("scale", "f8"),  # the same with a lower limit, V
+        ("innovation", "f8"),  # innovation of the last update, V
         ("autocov", "f8"),  # mean product of successive innovations, V^2
         ("random_walk_var", "f8"),  # variance of the level's own random walk, by `autocov`, V^2
         ("updated_s", "f8"),  # time of the last update
         ("reading", "f8"),  # the last one, V
         *[(name, "f8") for name in ("count", "lowest", "highest")],  # readings in the present block, their extremes
-        *[("mean", "f8"), ("previous_mean", "f8")],  # of the present block, and of the one before, V
-        ("residual", "f8"),  # of the block mean from the level, or from where a change began, V
-        *[(name, "f8") for name in ("run_sum", "run_square_sum")],  # of the residuals of a run, and of their squares
-        ("start_level", "f8"),  # where a change began, V
-        ("peak_step", "f8"),  # of a change at its farthest, V
-        ("press_step", "f8"),  # that the press made, V
+        *[("mean", "f8"), ("previous_mean", "f8")],  # means of the present block, and of the one before, V
+        ("residual", "f8"),  # block mean minus the level, or minus `start_level` during a change, V
+        *[(name, "f8") for name in ("run_sum", "run_square_sum")],  # sums of the residuals of a run, and of squares
+        ("start_level", "f8"),  # level at which a change began, V
+        ("peak_step", "f8"),  # largest step of a change, V
+        ("press_step", "f8"),  # step that the press made, V
         ("direction", "f8"),  # mean whitened step of touches
-        *[("rest_level", "f8"), ("press_level", "f8")],  # the last at rest, and under a press, V
+        *[("rest_level", "f8"), ("press_level", "f8")],  # last levels at rest, and under a press, V
     ]
 )
 """State of a fibre; NaN is unknown."""
@@ -46,8 +47,8 @@ PAD = np.dtype(
         ("reading_s", "f8"),  # time of the last reading
         *[("block_first", "i8"), ("block_start_s", "f8"), ("block_count", "i8")],  # first reading, its time, and count
         ("block_s", "f8"),  # time of the last block
-        ("n_blocks", "i8"),  # that the noise was learnt from
-        ("resolution_v", "f8"),  # of the converter: least difference of two readings
+        ("n_blocks", "i8"),  # blocks that the noise was learnt from
+        ("resolution_v", "f8"),  # resolution of the converter: least difference of two readings
         *[("run", "i8"), ("run_first", "i8"), ("run_s", "f8")],  # blocks in a row that leave the levels, and the first
         ("in_change", "?"),
         ("change", "i8"),  # a `Change`
@@ -55,30 +56,30 @@ PAD = np.dtype(
         ("state", "i8"),  # a `State`
         ("released_s", "f8"),  # time of the last release
         ("unclear_first", "i8"),  # first reading of the change that led to `UNCLEAR`
-        ("n_presses", "i8"),  # learnt from
+        ("n_presses", "i8"),  # presses that direction and size were learnt from
         ("typical_v", "f8"),  # root of the summed squares of a press's steps, V
         ("typical_size", "f8"),  # size of a press, clipped
-        ("agreement", "f8"),  # of touches with the direction of earlier ones, -1 to 1
+        ("agreement", "f8"),  # agreement of touches with the direction of earlier ones, -1 to 1
         ("rest_scatter", "f8"),  # mean clipped size of the step from one rest level to the next
-        ("press_scatter", "f8"),  # and from one level under a press to the next
+        ("press_scatter", "f8"),  # the same of levels under presses
     ]
 )
 """State of the pad."""
 
 BLOCK_S = 0.03  # length of a block; a probe takes a tenth of a second to sink in
-FADE_S, SLOPE_S, NOISE_S = 2.5, 1.0, 10.0  # in which a slope fades (as an overshoot does), is learnt, and noise is
-GAP_S, GIVE_UP_S = 1.0, 1.0  # a fibre missing for longer starts anew; a longer run without agreement is grown noise
-WARM_UP_BLOCKS, ROUGH_BLOCKS = 8, 8  # before the first change; after n blocks noise is widened by ROUGH_BLOCKS / n
-LEVEL_ERROR, SLOPE_ERROR = 0.05, 0.4  # shares of a step by which level, and slope per s, may be wrong: silicone settles
-MAX_INNOVATION, MAX_GROWTH = 2.5, 3.0  # standard deviations beyond which a block moves level, and noise, no further
-MIN_SHARE, MIN_V = 0.01, 1e-7  # least noise, as a share of a typical press, and in V (smaller steps are rounding)
-MIN_CORRELATION = 0.25  # correlation of successive innovations from which on a level is taken to walk
+FADE_S, SLOPE_S, NOISE_S = 2.5, 1.0, 10.0  # times in which a slope fades, a slope is learnt, and noise is learnt
+GAP_S, GIVE_UP_S = 1.0, 1.0  # a fibre missing for longer is reset; a longer run without agreement is grown noise
+WARM_UP_BLOCKS, ROUGH_BLOCKS = 8, 8  # blocks before the first change; noise of n blocks is widened by ROUGH_BLOCKS / n
+LEVEL_ERROR, SLOPE_ERROR = 0.05, 0.4  # errors of level, and of slope per s, relative to a step that silicone settles to
+MAX_INNOVATION, MAX_GROWTH = 2.5, 3.0  # limits of the influence of a block on level, and on noise, standard deviations
+MIN_SHARE, MIN_V = 0.01, 1e-7  # least noise, relative to a typical press, and in V (smaller steps are rounding)
+MIN_CORRELATION = 0.25  # correlation of successive innovations above which a level is modelled as a random walk
 MEAN_TO_STD = math.sqrt(math.pi / 2)  # standard deviation over mean absolute value of a normal distribution
-STALL_S, SETTLED = 0.5, 0.1  # a change ends if it goes no farther for STALL_S, or two blocks differ by less (share)
-RELEASE_S = 1.0  # a step in the direction of a release so soon after one belongs to it
-MAX_STEP = 20.0  # whitened; beyond it a fibre counts no more: a broken one would drown the others
-CLEAR_STEP = 5.0  # whitened; from it on a fibre adds to the typical press in V
-MIN_PRESSES, MIN_AGREEMENT = 3, 0.5  # touches, and their agreement, from which on their direction is used
+STALL_S, SETTLED = 0.5, 0.1  # a change ends if it does not grow for STALL_S, or by less than SETTLED of it in a block
+RELEASE_S = 1.0  # a step in the direction of a release, within this time after one, belongs to it
+MAX_STEP = 20.0  # limit of a whitened step, so that a broken fibre does not outweigh the others
+CLEAR_STEP = 5.0  # whitened step above which a fibre adds to the typical press in V
+MIN_PRESSES, MIN_AGREEMENT = 3, 0.5  # minimum touches, and their minimum agreement, for a use of their direction
 TOUCH_RATE, LEVEL_RATE = 0.05, 0.15  # weights of the newest touch and level in their running means
 INVERTED, MIN_INVERTED = 1.2, 0.4
 """Rests are presses if rest levels scatter more than these shares of levels under presses, and of a typical press."""
@@ -218,7 +219,7 @@ def kalman_update(fibres: Any, pad: Any, time_s: float) -> None:
 
 @kernel
 def _learn_run_noise(fibres: Any, pad: Any, time_s: float) -> None:
-    """Learn the noise of a run that was no change."""
+    """Learn the noise of a run, if there is one, that was no change."""
     if pad.run > 0:
         share = 1 - math.exp(-(time_s - pad.run_s) / NOISE_S)
         for fibre in fibres:
@@ -228,7 +229,7 @@ def _learn_run_noise(fibres: Any, pad: Any, time_s: float) -> None:
 
 @kernel
 def _start_run(fibres: Any, pad: Any, time_s: float) -> None:
-    """Start a run at the present block, or at the one block before: a touch may have two paces."""
+    """Start a run at the present block, or at the single block before it, since a touch may have two steps."""
     if pad.run != 2:
         pad.run_first, pad.run_s = pad.block_first, time_s
     pad.run = 1
@@ -239,11 +240,11 @@ def _start_run(fibres: Any, pad: Any, time_s: float) -> None:
 
 @kernel(inline="always")
 def _extend_run(fibres: Any, pad: Any) -> tuple[float, float]:
-    """Extend the run; return its common signal (mean product of two blocks: no spike), and the distance of the last."""
+    """Extend the run; return its common signal (mean product of two blocks) and the distance of the last block."""
     common, distance = 0.0, 0.0
     n_before, pad.run = pad.run, pad.run + 1
     for fibre in fibres:
-        if np.isnan(fibre.residual):  # as the blocks before, so that they keep their weight
+        if np.isnan(fibre.residual):  # counts like the blocks before, so that the sums keep their weight
             fibre.run_sum += fibre.run_sum / n_before
             fibre.run_square_sum += fibre.run_square_sum / n_before
             continue
@@ -288,7 +289,7 @@ def has_changed(fibres: Any, pad: Any, time_s: float, reject_limit: Any, accept_
 
 @kernel
 def _whiten(fibres: Any, f: int, volts: float, limit: float) -> float:
-    """Whiten a step of fibre f, clipped to the limit; 0 if the largest of as many fibres has it by chance, or NaN."""
+    """Whiten a step of fibre f, clipped to the limit; 0 for NaN, or for one that noise of C fibres makes by chance."""
     z = volts / fibres[f].scale
     return min(max(z, -limit), limit) if abs(z) > math.sqrt(2 * math.log(len(fibres))) else 0.0
 
@@ -304,7 +305,7 @@ def _size(fibres: Any, steps: Any, limit: float) -> float:
 
 @kernel
 def _projection(fibres: Any, steps: Any) -> float:
-    """Project the residual on steps (C,), as a share of them; 0 if they are none."""
+    """Project the residual on steps (C,), relative to them; 0 if all steps are 0."""
     product, total = 0.0, 0.0
     for f in range(len(fibres)):
         z = _whiten(fibres, f, steps[f], MAX_STEP)
@@ -315,7 +316,7 @@ def _projection(fibres: Any, steps: Any) -> float:
 
 @kernel
 def _agreement(fibres: Any) -> float:
-    """Return how far the residual has the direction of touches: 1 if all of it does, -1 if it is opposite."""
+    """Return the agreement of the residual with the direction of touches, from -1 (opposite) to 1."""
     product, total = 0.0, 0.0
     for f in range(len(fibres)):
         z = _whiten(fibres, f, fibres[f].residual, MAX_STEP)
@@ -335,7 +336,7 @@ def _confirmed_step(fibre: Any) -> float:
 
 @kernel(inline="always")
 def track_peak(fibres: Any, pad: Any, time_s: float) -> None:
-    """Store where a change is farthest in two blocks in a row: a single one may be a spike."""
+    """Store the largest step of a change in two blocks in a row; a single block may be a spike."""
     size = 0.0
     for f in range(len(fibres)):
         size += _whiten(fibres, f, _confirmed_step(fibres[f]), np.inf) ** 2
@@ -360,7 +361,8 @@ def _has_settled(fibres: Any, pad: Any, time_s: float, reject_limit: Any) -> boo
         return True
     if time_s - pad.peak_s <= STALL_S:
         return False
-    for fibre in fibres:  # it stalls unsettled: noise has grown; half of it, since it may be a slow press after all
+    # Noise has grown if a change stalls unsettled. Half of it is learnt, since this may be a slow press after all.
+    for fibre in fibres:
         std = MEAN_TO_STD * abs(fibre.mean - fibre.previous_mean) / math.sqrt(2)
         if std > fibre.noise:
             fibre.noise += (std - fibre.noise) / 2
@@ -404,10 +406,10 @@ def emit(events: Any, count: Any, down: bool, reading: int) -> int:
 
 @kernel(inline="always")
 def classify_change(fibres: Any, pad: Any, time_s: float, settled: bool, events: Any, count: Any) -> int:
-    """Classify a change under way, as soon as it is clear what it is; return the number of events."""
+    """Classify the present change, if its class is clear by now; return the number of events."""
     has_direction = pad.n_presses >= MIN_PRESSES and pad.agreement > MIN_AGREEMENT
     agreement = _agreement(fibres) if has_direction else 1.0
-    projection = _projection(fibres, fibres.press_step)  # -1: takes the step of the press back
+    projection = _projection(fibres, fibres.press_step)  # -1 if the step of the press is taken back
     ratio = _size(fibres, fibres.residual, MAX_STEP) / _size(fibres, fibres.press_step, MAX_STEP)
     if pad.state == State.REST and time_s - pad.released_s < RELEASE_S and projection < -0.5 * math.sqrt(ratio):
         pad.change = Change.SETTLING
@@ -436,7 +438,7 @@ def _set_press_step(fibres: Any, keep: float) -> None:
 @kernel(inline="always")
 def commit_change(fibres: Any, pad: Any, time_s: float, events: Any, count: Any) -> int:
     """Change the state by a change that has settled; return the number of events."""
-    if pad.change == Change.TOUCH and _projection(fibres, fibres.peak_step) < 0.5:  # a tap, released meanwhile
+    if pad.change == Change.TOUCH and _projection(fibres, fibres.peak_step) < 0.5:  # a tap, which has been released
         pad.state = State.REST
         return emit(events, count, False, pad.after_peak if pad.after_peak >= 0 else pad.block_first)
     if pad.change == Change.TOUCH:
@@ -472,11 +474,11 @@ def _process_block(
         elif has_changed(fibres, pad, time_s, reject_limit, accept_limit):
             pad.in_change, pad.change = True, Change.UNKNOWN
             pad.peak_size, pad.peak_s, pad.after_peak = 0.0, time_s, -1
-            for fibre in fibres:  # one by one: assigning slices compiles the wording of an error about their shapes
+            for fibre in fibres:  # one by one, since assigning a slice compiles code that formats an error message
                 fibre.start_level = fibre.level
     if pad.in_change:
         for fibre in fibres:
-            if np.isnan(fibre.mean):  # missing now: as last read in this change
+            if np.isnan(fibre.mean):  # a missing fibre stays as last read in this change
                 fibre.mean = fibre.start_level + fibre.residual
             fibre.residual = fibre.mean - fibre.start_level
         track_peak(fibres, pad, time_s)

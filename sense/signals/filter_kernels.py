@@ -15,10 +15,10 @@ from padforge.common.compilation import kernel
 
 @kernel
 def backward_pass(low: Any, high: Any, last: float, out: Any) -> None:
-    """Clip from the last value back, into `out` (R,)."""
+    """Compute the minimiser `out` (R,) from its last value: each value is the next one, clipped to its bounds."""
     value = last
     for i in range(len(low) - 1, -1, -1):
-        value = min(max(value, low[i]), high[i])  # NaN, no reading so far, stays: no comparison with it holds
+        value = min(max(value, low[i]), high[i])  # NaN, of a channel without readings, stays NaN
         out[i] = value
 
 
@@ -45,8 +45,7 @@ def running_median(readings: Any, before: int, after: int, out: Any) -> None:
             out[i] = middle
 
 
-GRAIN = 2.0**40
-"""Heights are whole multiples of 1 / GRAIN: their sums are exact, and nothing drifts however long a recording is."""
+GRAIN = 2.0**40  # heights are whole multiples of 1 / GRAIN, so that sums are exact in a recording of any length
 
 
 @kernel
@@ -101,9 +100,9 @@ def forward_pass_l1(readings: Any, lam: float, low: Any, high: Any) -> float:
     return positions[k - 1] if level > 0 else 0.5 * positions[k - 1] + 0.5 * positions[k]
 
 
-# Rows of knots. Beyond its POSITION, counted from the first reading, a knot adds COUNT x - SUM - LAMS lam to the
-# derivative. Sums of readings and multiples of lam are separate, and readings counted from the first, so that neither a
-# great lam nor a great offset costs digits.
+# Rows of knots. Beyond its POSITION, relative to the first reading, a knot adds COUNT x - SUM - LAMS lam to the
+# derivative. Sums of readings and multiples of lam are separate, and readings are relative to the first one, so that
+# neither a large lam nor a large offset costs digits.
 POSITION, SUM, LAMS, COUNT = range(4)
 
 
@@ -131,8 +130,8 @@ def forward_pass_l2(readings: Any, lam: float, low: Any, high: Any) -> float:
     """Carry the message over readings, with fidelity (y_i - x_i)^2 / 2; as `forward_pass_l1`.
 
     The derivative is piecewise linear. Knots beyond a cut never matter again, so they are pooled with the new reading
-    like adjacent violators: O(1) a reading on average, as the taut string (L. Condat, IEEE Signal Process. Lett. 20,
-    2013).
+    as in the pool-adjacent-violators algorithm: O(1) a reading on average, like the taut string (L. Condat, IEEE Signal
+    Process. Lett. 20, 2013).
     """
     origin, room = np.nan, len(readings)
     knots = np.empty((4, 2 * room))
@@ -151,7 +150,7 @@ def forward_pass_l2(readings: Any, lam: float, low: Any, high: Any) -> float:
         last = _cut_l2(-1, reading, lams, lam, knots, last, first)
         low[i] = origin + knots[POSITION, first]
         high[i] = origin + knots[POSITION, last]
-    # The minimum: the derivative, -lam before the first knot, is followed until it is 0.
+    # The minimum is where the derivative, which is -lam before the first knot, passes 0.
     total, lams, count = 0.0, 1.0, 0.0
     for k in range(first, last):
         total += knots[SUM, k]

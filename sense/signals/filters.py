@@ -18,7 +18,6 @@ from padforge.sense.signals import filter_kernels
 Fidelity = Literal["robust", "squares"]
 
 _FORWARD_PASSES = {"robust": filter_kernels.forward_pass_l1, "squares": filter_kernels.forward_pass_l2}
-MAX_WIDTH = 2**31 - 1  # largest width of a running median: no recording is longer
 
 
 def total_variation(readings: ArrayLike, lam: float, fidelity: Fidelity = "robust") -> Array:
@@ -39,7 +38,7 @@ def total_variation(readings: ArrayLike, lam: float, fidelity: Fidelity = "robus
         The minimiser, float64 of the shape of `readings`.
 
     Raises:
-        InputError: readings that are no numbers of such a shape, or infinite; lam or fidelity that are not as above.
+        InputError: `readings` are not numbers of such a shape, or infinite; `lam` or `fidelity` are not as above.
     """
     if fidelity not in _FORWARD_PASSES:
         raise InputError(f"fidelity is {short_repr(fidelity)}, allowed is {' or '.join(_FORWARD_PASSES)}")
@@ -58,7 +57,7 @@ def total_variation(readings: ArrayLike, lam: float, fidelity: Fidelity = "robus
 def running_median(readings: ArrayLike, width: int, causal: bool = False) -> Array:
     """Compute the median of the readings around each; windows shrink at the ends. O(R width).
 
-    NaN are ignored; an even number of readings has the mean of the two in the middle, none has NaN.
+    NaN are ignored. The median of an even number of readings is the mean of the two in the middle; that of none is NaN.
 
     Args:
         readings: any real type; shape (R,) or (R, C).
@@ -71,7 +70,7 @@ def running_median(readings: ArrayLike, width: int, causal: bool = False) -> Arr
     Raises:
         InputError: readings as in `total_variation`, or a width that is no odd whole number above 0.
     """
-    if check_int("width", width, 1, MAX_WIDTH) % 2 != 1:
+    if check_int("width", width, 1, 2**31 - 1) % 2 != 1:  # no recording is longer
         raise InputError(f"width is {width!r}, allowed is an odd whole number above 0")
     window = (width - 1, 0) if causal else (width // 2, width // 2)
 

@@ -1,8 +1,8 @@
 """Press detection in the readings alone, as they come (`PressDetector`) and in a recording (`detect_presses`).
 
 The detector learns the noise of every fibre, follows drift, creep and the return from the overshoot after a release,
-and copes with spikes, missing readings and fibres that are dead, saturated, noisy or fail meanwhile. It expects a pad
-that starts at rest, for eight readings or a quarter of a second, and a probe that sinks in within half a second.
+and copes with spikes, missing readings, and fibres that are dead, saturated or noisy, or that fail. The pad must rest
+for the first eight readings or quarter of a second, and the probe must sink in within half a second.
 """
 
 from typing import NamedTuple
@@ -14,7 +14,7 @@ from padforge.common.validation import InputError, check_int
 from padforge.sense.arrays import MAX_FIBRES, Array, Indices, check_stream
 from padforge.sense.signals.detector_kernels import detect, initial_state
 
-P_REJECT, P_ACCEPT = 1e-3, 1e-9  # probabilities that white noise leaves the levels for a block; that it is a change
+P_REJECT, P_ACCEPT = 1e-3, 1e-9  # probabilities that white noise makes a block leave the levels, and makes a change
 TOUCH_DELAY_S, RELEASE_DELAY_S = 0.16, 0.08  # from a command to its first effect: means of the published recording
 MAX_LEAD = 2  # readings before its command at which a press may show: commands are noted a little late
 
@@ -23,7 +23,7 @@ class PressEvent(NamedTuple):
     """A touch or a release."""
 
     down: bool  # whether it is a touch
-    reading: int  # the first that shows it, counted from the first that the detector got
+    reading: int  # index of the first reading that shows it, from the start of the stream
 
 
 class Presses(NamedTuple):
@@ -68,7 +68,7 @@ class PressDetector:
             raise InputError(f"times begin at {times[0]:g} s, expected later than the last reading, {self._last_s:g} s")
         self._last_s = times[-1] if len(times) else self._last_s
         events = np.empty((2 * len(times), 2), np.int64)
-        times, rows = np.array(times), np.array(rows, order="C")  # copies: for read-only arrays it is compiled anew
+        times, rows = np.array(times), np.array(rows, order="C")  # `detect` would compile again for read-only arrays
         count = detect(self._fibres, self._pad, times, rows, self._reject_limit, self._accept_limit, events)
         return [PressEvent(bool(down), reading) for down, reading in events[:count].tolist()]
 
@@ -112,7 +112,7 @@ def first_readings(readings: Array, times_s: Array, down_command: Indices, up_co
 
 
 def _nearest(touched: Indices, down_command: Indices) -> Indices:
-    """(Q,) index of the detected press that each commanded one may be."""
+    """Return the index (Q,) of the first detected press that may be each commanded one."""
     return np.minimum(np.searchsorted(touched, down_command - MAX_LEAD), len(touched) - 1)
 
 
@@ -121,9 +121,9 @@ def align_to_detected(
 ) -> tuple[Indices, Indices]:
     """Replace commanded presses by those that a detector finds in the readings.
 
-    A probe takes up to 0.4 s from its command to the pad. Live, presses are aligned by what the readings show; a model
-    that is used so must be trained so, since a release that is off by one reading costs several millimetres.
-    A press that is not detected keeps its commands.
+    A probe takes up to 0.4 s from its command to the pad. Live presses are aligned by the readings, and a model of them
+    must be trained on presses that are aligned in the same way, since an error of one reading in the release costs
+    several millimetres. A press that is not detected keeps its commands.
     """
     presses = detect_presses(readings, times_s)
     downs, ups = estimate_commands(presses, times_s)

@@ -1,9 +1,9 @@
 """A simulated pad as it comes out of the mould: fibres beside their plan, with a sensitivity that varies along them.
 
-The response to a press has four parts: held; onset, while the probe moves; creep, by which the held one relaxes; and
-what remains after the release. The held one is that of the contact. The others are as wide as `[rig]` says, and have
-sensitivities along the fibres of their own. So a trace tells more of the position than any one of its readings, as that
-of a built pad does.
+The response to a press has four parts: held, that of the contact; onset, while the probe moves; creep, by which the
+held part relaxes; and the residue after the release. The others are as wide as `[rig]` says, and each has its own
+sensitivity along the fibres. A trace therefore depends on the position in more ways than any one of its readings, as
+that of a built pad does.
 """
 
 from dataclasses import dataclass
@@ -20,39 +20,31 @@ from padforge.sense.arrays import Array
 from padforge.sense.settings import RigSettings
 
 T = TypeVar("T")
-SMOOTH_MM = 8.0
-"""Length over which the sensitivity changes along a fibre, and a path comes back to its plan: half a wave."""
-SAMPLES = 65
-"""Samples of the sensitivity along the axis of a fibre."""
-KNOTS_PER_WAVE = 8
-"""Knots of an as-built path in each half wave."""
+SMOOTH_MM = 8.0  # half of the shortest wavelength of the sensitivity along a fibre and of the deviation of its path
+SAMPLES = 65  # samples of the sensitivity along the axis of a fibre
+KNOTS_PER_WAVE = 8  # knots of an as-built path in each half wave
 
 
 class PressParts(NamedTuple, Generic[T]):
-    """What there is of each of the parts of a press."""
+    """Responses, or other quantities, of the four parts of a press."""
 
     held: T
-    onset: T  # from which the held response develops, with a lag
-    creep: T  # is lost of it while the probe rests
-    after: T  # remains after the release, with the opposite sign
+    onset: T  # initial response, which becomes the held one with a lag
+    creep: T  # part of the held response that is lost while the probe rests
+    after: T  # residue after the release, with the opposite sign
 
 
 def build_pad(plan: Morphology, rig: RigSettings) -> "BuiltPad":
-    """Return the pad that `[rig]` makes of a plan, the same for the same seed."""
+    """Return the pad as built by a plan and `[rig]`, the same for the same seed."""
     return BuiltPad.sample(plan, rig, np.random.default_rng([2, rig.seed]))
 
 
 @dataclass(frozen=True)
 class BuiltPad:
-    """Fibres of a pad as built.
-
-    Attributes:
-        paths: their paths.
-        sensitivities: along the axis of each, for each part of a response; shapes (F, SAMPLES). Uniform if None.
-    """
+    """Fibres of a pad as built."""
 
     paths: Morphology
-    sensitivities: PressParts[Array] | None = None
+    sensitivities: PressParts[Array] | None = None  # along the axis of each fibre, shapes (F, SAMPLES); None is uniform
 
     @cached_property
     def _lengths(self) -> Array:
@@ -60,16 +52,17 @@ class BuiltPad:
 
     @classmethod
     def sample(cls, plan: Morphology, rig: RigSettings, rng: np.random.Generator) -> "BuiltPad":
-        """Sample the pad that is built by a plan, as far from it as `[rig]` says."""
+        """Sample a pad that is built by a plan, with the deviations that `[rig]` states."""
         paths = _deviate(plan, rig.path_mm, rng) if rig.path_mm else plan
         if not (rig.sensitivity or rig.own_sensitivity):
             return cls(paths)
         held, *others = (_log_sensitivity(plan, rng) for _ in PressParts._fields)
         logarithms = [held := rig.sensitivity * held, *(held + rig.own_sensitivity * each for each in others)]
-        return cls(paths, PressParts(*map(_factors, logarithms)))
+        factors = [np.exp(each) for each in logarithms]
+        return cls(paths, PressParts(*(each / each.mean(axis=1, keepdims=True) for each in factors)))
 
     def stretch(self, positions_mm: Array, contacts: PressParts[Contact]) -> PressParts[Array]:
-        """Compute the relative stretch (Q, F) of the fibres by presses (Q, 2), of which each part has its contact."""
+        """Compute the relative stretch (Q, F) of the fibres by presses (Q, 2), with a contact for each part."""
         presses, parts = self.paths.to_grid(positions_mm), []
         for contact, sensitivity in zip(contacts, self.sensitivities or [None] * len(contacts), strict=True):
             parts.append(signals(self.paths, presses, contact, sensitivity=sensitivity) / self._lengths)
@@ -83,14 +76,13 @@ def press_contacts(contact: Contact, rig: RigSettings) -> PressParts[Contact]:
 
 
 def _deviate(plan: Morphology, deviation_mm: float, rng: np.random.Generator) -> Morphology:
-    """Return a pad whose paths leave their plan by a standard deviation across their axes; ends and sides stay."""
+    """Return a pad whose paths deviate across their axes by this standard deviation; ends and sides stay."""
     from scipy.interpolate import PchipInterpolator
 
     horizontals, knots = plan.layout.counts[0], []
     along, across = (axis[0] for axis in split_axes(plan.knots[None], horizontals))
     extents_mm = plan.unit_mm * (along[:, -1] - along[:, 0])
-    waves = max(int(extents_mm.max() / SMOOTH_MM), 1)
-    at = np.linspace(0, 1, KNOTS_PER_WAVE * waves + 1)
+    at = np.linspace(0, 1, KNOTS_PER_WAVE * _waves(extents_mm.max()) + 1)
     for fibre, (t, v) in enumerate(zip(along, across, strict=True)):
         modes = np.sin(np.pi * np.outer(at, np.arange(1, _waves(extents_mm[fibre]) + 1)))
         offset = deviation_mm / plan.unit_mm * np.sqrt(2 / modes.shape[1]) * modes @ rng.standard_normal(modes.shape[1])
@@ -113,9 +105,3 @@ def _log_sensitivity(plan: Morphology, rng: np.random.Generator) -> Array:
 
 def _waves(extent_mm: float) -> int:
     return max(int(extent_mm / SMOOTH_MM), 1)
-
-
-def _factors(logarithm: Array) -> Array:
-    """Return factors of mean 1 along each fibre."""
-    factors = np.exp(logarithm)
-    return factors / factors.mean(axis=1, keepdims=True)

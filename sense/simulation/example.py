@@ -1,4 +1,4 @@
-"""The example: a pad and a recording that resemble those of the published study, for whoever has no pad yet."""
+"""The example: a pad and a recording that resemble those of the published study, for users without a pad."""
 
 from pathlib import Path
 
@@ -9,29 +9,21 @@ from padforge.sense.recording.run_directory import check_new_folder
 from padforge.sense.settings import RigSettings
 from padforge.sense.simulation.simulated_recording import simulate
 
+# The plan is stored, since a search ends in slightly different fibres on another processor.
 PLAN = Path(__file__).with_name("example_morphology.json")
-"""Stored, since a search ends in slightly different fibres on another processor; its provenance has the settings."""
 PUBLISHED_RECORDING = (
     "https://github.com/tomraven1/sensor_morphology",
     "experiment/UR5RobotControlV3.2/new_test/para5_long.mat",
 )
-"""Repository of the authors, and their recording of the built pad in it."""
+"""Repository of the authors, and the path of their recording of the built pad in it."""
 
 
 def write_example(out: Path) -> Recording:
-    """Write `morphology.json` and `recording/` of the example into a folder, the same ones at every call.
+    """Write `morphology.json` and `recording/` of the example into a folder, and return the recording.
 
     The pad has six fibres with five knots each and is pressed on 45 x 45 mm, as in the published recording; `[rig]` and
-    `[contact]` have their defaults, which were measured on that recording.
-
-    Args:
-        out: folder, which is new, empty, or holds the example already.
-
-    Returns:
-        The recording.
-
-    Raises:
-        InputError: the folder holds something else, or cannot be written.
+    `[contact]` have their defaults, which were measured on that recording. Raises InputError if the folder holds
+    anything but the example, or cannot be written.
     """
     path = out / "morphology.json"
     if not (path.is_file() and sha256(path) == sha256(PLAN)):

@@ -1,10 +1,10 @@
 """Physical model of a simulated pad: what an ADC reads from each fibre while a probe presses.
 
-The response of a fibre is the change of its resistance by the contact model. Effects of a built pad, whose sizes in the
-published recording are the defaults of `[rig]`, are added: it scatters about that of the position, follows the probe
-with a lag, creeps, and has hysteresis (unloaded, a fibre overshoots its rest and comes back within seconds, or
-when it is pressed there again); the rest drifts over minutes. An ADC with white noise reads the middle of the fibre and
-a fixed resistor.
+The response of a fibre is the change of its resistance by the contact model. Effects of a built pad are added, whose
+sizes in the published recording are the defaults of `[rig]`: responses scatter from press to press, follow the probe
+with a lag, creep, and have hysteresis (after a release a fibre overshoots its rest and recovers within seconds, or when
+it is pressed there again); the rest drifts over minutes. An ADC with white noise reads the voltage between the fibre
+and a fixed resistor.
 """
 
 import math
@@ -21,18 +21,18 @@ from padforge.sense.settings import RigSettings
 from padforge.sense.simulation.built_pad import BuiltPad, PressParts, build_pad, press_contacts
 from padforge.sense.simulation.residual_indentation import MAX_LAG, RETURNED, replaced_residues
 
-SUPPLY_V, ADC_STEPS = 3.3, 2**12 - 1  # of the boards and the converter that are simulated
+SUPPLY_V, ADC_STEPS = 3.3, 2**12 - 1  # of the simulated board and its converter
 GAUGE_FACTOR = 0.65  # relative change of a fibre's resistance per strain in a layer
-WEIGHT_GAUGE_FACTOR = 0.4  # and per relative stretch of a contact with weights about 1, pressed FULL_DEPTH_MM deep
+WEIGHT_GAUGE_FACTOR = 0.4  # the same per relative stretch of a contact with weights about 1, FULL_DEPTH_MM deep
 FULL_DEPTH_MM = 5.0
 TRAVEL_S = 0.1  # time that the probe takes from the surface to its depth, and back
 DELAY_S = (0.04, 0.22)  # range of the time from the command to the touch
-RELEASE_S = (0.0, 0.06)  # and to the start of the release
-ONSET_S = 0.15  # time constant by which a response goes from that of the onset to the held one
-CREEP_S = 1.0  # time constant by which it creeps
+RELEASE_S = (0.0, 0.06)  # range of the time from the command to the start of the release
+ONSET_S = 0.15  # time constant of the change from the onset response to the held one
+CREEP_S = 1.0  # time constant of creep
 DRIFT_S = 600.0  # correlation time of the drift
-SURFACE_MM, SURFACE_WAVES = 10.0, 8  # length over which the height of a pad changes, and waves that make it up
-MIN_DEPTH_MM = 1e-3  # to which no press is solved
+SURFACE_MM, SURFACE_WAVES = 10.0, 8  # length over which the height of a pad changes, and number of waves in it
+MIN_DEPTH_MM = 1e-3  # minimum depth for which a contact is solved
 REST_V = (1.7, 2.1)  # range of the voltages at rest; the divider is matched to half the supply only roughly
 
 
@@ -59,7 +59,7 @@ def resistance_changes(
 ) -> PressParts[Array]:
     """Compute the relative changes of resistance (Q, C) by presses (Q, 2) of depths (Q,).
 
-    A layer is pressed as deep, other contacts, which know no depth, respond in proportion to it.
+    A layer is solved for each depth; the response of other contacts, which have no depth, is proportional to it.
     """
     changes = np.zeros((4, len(positions_mm), len(pad.paths.knots)))
     if contact.model == "layer":
@@ -75,20 +75,20 @@ def resistance_changes(
 
 
 class Gains:
-    """Factors on the responses of presses, an interval apart: they scatter from press to press, and wander."""
+    """Random factors of the responses of successive presses: scatter of each press, and slow wander."""
 
     def __init__(self, interval_s: float, channels: int, rig: RigSettings, rng: np.random.Generator) -> None:
         self._channels, self._rig, self._rng = channels, rig, rng
         self._wander = Drift(channels, 1 / interval_s, rng)
 
     def __call__(self, presses: int) -> Array:
-        """Sample those (Q, C) of the next presses."""
+        """Sample the factors (Q, C) of the next presses."""
         scatter = self._rig.response_scatter.sample_gains((presses, self._channels), self._rng)
         return scatter * (1 + self._rig.gain_wander * self._wander(presses))
 
 
 def sample_delays(positions_mm: Array, rig: RigSettings, rng: np.random.Generator) -> Array:
-    """Sample the times (Q, 2), s, from the commands to touch and to release: uneven pads are touched at other times."""
+    """Sample the times (Q, 2), s, from the commands to touch and to release; an uneven surface changes the touch."""
     modes = positions_mm @ (rng.standard_normal((2, SURFACE_WAVES)) / SURFACE_MM)
     surface = np.sqrt(2 / SURFACE_WAVES) * np.cos(modes + rng.uniform(0, 2 * np.pi, SURFACE_WAVES)).sum(axis=1)
     low, high = np.transpose([DELAY_S, RELEASE_S])
@@ -98,10 +98,10 @@ def sample_delays(positions_mm: Array, rig: RigSettings, rng: np.random.Generato
 
 
 class Motion(NamedTuple):
-    """Motion of the probe in the cycles of presses and in the next ones; shapes (Q, 2 readings)."""
+    """Motion of the probe in the cycle of each press and in the next cycle; shapes (Q, 2 readings)."""
 
     depth: Array  # relative, 0 to 1
-    onset: Array  # share of it by which the response is still that of the onset
+    onset: Array  # part of the depth for which the response is still that of the onset
 
 
 def probe_motion(cycle: Cycle, delays_s: Array) -> Motion:
@@ -114,35 +114,35 @@ def probe_motion(cycle: Cycle, delays_s: Array) -> Motion:
 
 
 def scaled(responses: PressParts[Array], gains: Array) -> PressParts[Array]:
-    """Return responses (Q, C) of which those while it is pressed are times gains (Q, C)."""
+    """Multiply the responses (Q, C) during a press, not those after it, by gains (Q, C)."""
     held, onset, creep, after = responses
     return PressParts(gains * held, gains * onset, gains * creep, after)
 
 
 class Strain(NamedTuple):
-    """Strain (R, C) of the fibres, reading by reading, which `Viscoelasticity` makes visible."""
+    """Strain of the fibres at each reading, which `Viscoelasticity` converts to a response; shapes (R, C)."""
 
-    pressed: Array  # while the probe is in the silicone
-    creeping: Array  # is lost of it as it creeps
-    residue: Array  # what becomes of residues at each reading: left behind, less what is taken away
+    pressed: Array  # strain while the probe is in the silicone
+    creeping: Array  # part of it that creep removes
+    residue: Array  # change of the residues: left behind minus taken away
 
 
 def superpose_strain(responses: PressParts[Array], replaced: Array, motion: Motion) -> Strain:
-    """Superpose presses by their responses, and the residues that they replace, both (Q, C)."""
+    """Superpose presses by overlap-add of their two cycles; responses and residues that they replace are (Q, C)."""
     readings = motion.depth.shape[1] // 2
     steps = np.diff(motion.depth, axis=1, prepend=0.0)
     strain = Strain(*np.zeros((3, len(steps) * readings, replaced.shape[1])))
-    for behind, of in ((0, slice(None, readings)), (1, slice(readings, None))):
-        presses, begin = len(steps) - behind, behind * readings
+    for cycle in (0, 1):  # the cycle of a press, and the next one, which overlaps with that of the next press
+        presses, first = len(steps) - cycle, cycle * readings
         pressed = PressParts(*(part[:presses, None] for part in responses))
-        moved = (values[:presses, of, None] for values in (*motion, steps))
-        for part, of_presses in zip(strain, strain_of(pressed, replaced[:presses, None], *moved), strict=True):
-            part[begin:] += of_presses.reshape(-1, part.shape[1])
+        motions = (values[:presses, first : first + readings, None] for values in (*motion, steps))
+        for part, of_presses in zip(strain, strain_of(pressed, replaced[:presses, None], *motions), strict=True):
+            part[first:] += of_presses.reshape(-1, part.shape[1])
     return strain
 
 
 def strain_of(responses: PressParts[Array], replaced: Array, depth: Any, onset: Any, step: Any) -> Strain:
-    """Compute the strain at a depth and its share of the onset, as in `Motion`, reached by a step from another."""
+    """Compute the strain at a depth and onset, as in `Motion`, after a step of the depth since the last reading."""
     up, down = np.maximum(-step, 0), np.maximum(step, 0)
     pressed = depth * responses.held + onset * (responses.onset - responses.held)
     residue = up * (responses.after + RETURNED * replaced) - down * replaced
@@ -150,31 +150,21 @@ def strain_of(responses: PressParts[Array], replaced: Array, depth: Any, onset: 
 
 
 class Viscoelasticity:
-    """Creep, and residues, which decay."""
+    """Creep, a low pass, and residues, which decay."""
 
     def __init__(self, rate_hz: float, rig: RigSettings) -> None:
-        self._creep = _LowPass(rate_hz, CREEP_S)
-        self._decay = np.exp(-1 / (rate_hz * rig.hysteresis_s))
-        self._state: Array | None = None
+        self._creep_decay = np.exp(-1 / (rate_hz * CREEP_S))
+        self._residue_decay = np.exp(-1 / (rate_hz * rig.hysteresis_s))
+        self._states: tuple[Array, Array] | None = None  # of the two filters
 
     def __call__(self, strain: Strain) -> Array:
-        """Compute the visible part (R, C) of further strain, which starts settled."""
-        state = np.zeros_like(strain.residue[:1]) if self._state is None else self._state
-        residue, self._state = lfilter([1.0], [1.0, -self._decay], strain.residue, axis=0, zi=state)
-        return strain.pressed - self._creep(strain.creeping) - residue
-
-
-class _LowPass:
-    """First-order low pass of rows, settled at the first one."""
-
-    def __init__(self, rate_hz: float, time_s: float) -> None:
-        self._decay = np.exp(-1 / (rate_hz * time_s))
-        self._state: Array | None = None
-
-    def __call__(self, rows: Array) -> Array:
-        state = self._decay * rows[:1] if self._state is None else self._state
-        out, self._state = lfilter([1 - self._decay], [1.0, -self._decay], rows, axis=0, zi=state)
-        return out
+        """Compute the response (R, C) to further strain; the first one is settled."""
+        creep_decay, residue_decay = self._creep_decay, self._residue_decay
+        states = self._states or (creep_decay * strain.creeping[:1], np.zeros_like(strain.residue[:1]))
+        creep, creep_state = lfilter([1 - creep_decay], [1.0, -creep_decay], strain.creeping, axis=0, zi=states[0])
+        residue, residue_state = lfilter([1.0], [1.0, -residue_decay], strain.residue, axis=0, zi=states[1])
+        self._states = creep_state, residue_state
+        return strain.pressed - creep - residue
 
 
 class Drift:
@@ -199,7 +189,7 @@ def divider_voltage(rest_v: Array, change: Array) -> Array:
 
 
 def adc_volts(volts: Array) -> Array:
-    """Return voltages as an ADC of ADC_STEPS reads them: whole steps within its range, V."""
+    """Return voltages, V, quantized by an ADC of ADC_STEPS, within its range."""
     return np.clip(np.rint(volts / SUPPLY_V * ADC_STEPS), 0, ADC_STEPS) * (SUPPLY_V / ADC_STEPS)
 
 
@@ -236,8 +226,8 @@ def simulate_readings(
 ) -> Array:
     """Simulate the readings (Q readings, C), V, of presses (Q, 2), one in each cycle.
 
-    Responses (Q, C) are relative changes of resistance; or V, as measured, of which a held press scatters by `noise_v`
-    (C,) about what its position explains, whatever its size.
+    Responses (Q, C) are relative changes of resistance. With `noise_v` (C,) they are V, as measured, and the responses
+    of held presses have noise of that standard deviation, whatever their size.
     """
     presses, channels = responses.held.shape
     # The divider draws first, as in `LivePad`: with the same seed fibres have the same rests there.
@@ -250,7 +240,7 @@ def simulate_readings(
     if noise_v is not None:
         press_noise_v = np.sqrt(np.maximum(noise_v**2 - _reading_noise_v(cycle, rig) ** 2, 0))
     else:
-        # near half of the supply the reading falls by a quarter of the supply for a change of resistance of 1
+        # Near half of the supply the reading falls by a quarter of the supply for a relative change of 1.
         press_noise_v = 4e-3 / SUPPLY_V * rig.floor_mv
     held = responses.held + press_noise_v * rng.standard_normal((presses, channels))
     responses = responses._replace(held=held)
@@ -258,7 +248,7 @@ def simulate_readings(
 
 
 def _reading_noise_v(cycle: Cycle, rig: RigSettings) -> float:
-    """Return the standard deviation of a held press minus the rest before it, by white noise and drift alone, V."""
+    """Return the standard deviation, V, of a held press minus the rest before it by white noise and drift alone."""
     held = np.arange(cycle.held_index, cycle.readings)
     before = np.arange(cycle.down_index // 2, cycle.down_index)
     times_s = np.append(held, before) / cycle.rate_hz
@@ -269,7 +259,7 @@ def _reading_noise_v(cycle: Cycle, rig: RigSettings) -> float:
 
 
 class LivePad:
-    """A simulated pad under a moving tip; one physical model for all that press it in real time."""
+    """A simulated pad under a moving tip, in real time."""
 
     def __init__(
         self, pad: Morphology, contact: Contact, rig: RigSettings, rate_hz: float, rng: np.random.Generator
@@ -280,18 +270,15 @@ class LivePad:
         self._pad, self._contact, self._rig, self._rate_hz = build_pad(pad, rig), contact, rig, rate_hz
         self._depth_mm = max(rig.press_depths_mm)
         self._responses: dict[tuple[float, float], PressParts[Array]] = {}  # (1, C) of the deepest press, by position
-        self._presses: list[_PadPress] = []  # the last of them
+        self._presses: list[_PadPress] = []  # the latest ones
         self._depth, self._n_read = 0.0, 0
 
     def prepare(self) -> None:
-        """Compile and solve what the first press would wait for."""
+        """Compile and solve a contact, so that the first press does not wait for it."""
         self._solve(np.zeros((1, 2)))
 
     def volts(self, positions_mm: Array, depths_mm: Array) -> Array:
-        """Return the readings (R, C), V, at further positions (R, 2) of the tip, from the pad's centre.
-
-        Depths (R,) are below the surface, negative above.
-        """
+        """Return the readings (R, C), V, at further positions (R, 2), from the centre, and depths (R,), < 0 above."""
         strain = Strain(*np.zeros((3, len(positions_mm), self._divider.channels)))
         self._solve(positions_mm[depths_mm > 0])
         for row, depth in enumerate(np.maximum(depths_mm / self._depth_mm, 0).tolist()):
@@ -315,16 +302,16 @@ class LivePad:
         return self._divider(strain)
 
     def _touch(self, position_mm: Array, time_s: float) -> None:
-        """Begin a press, which takes away residues of earlier ones."""
+        """Start a press, which removes residues of earlier ones."""
         response = self._responses[_rounded(position_mm)]
         press = _PadPress(position_mm, time_s, time_s, self._gains(1), response, np.zeros_like(response.held))
         self._presses = [*self._presses[-MAX_LAG:], press]
         press.replaced = self._replaced()
 
     def _slide(self, press: "_PadPress", position_mm: Array) -> Array:
-        """Move a press; return which residues (1, C) it takes away there, less those that it gives back.
+        """Move a press; return the residues (1, C) that it removes at the new position minus those at the old one.
 
-        A press that slides is at any time like one that was made where it is then; it leaves none on its way.
+        A sliding press is at any time like one made at its present position; it leaves no residue on its way.
         """
         before = press.replaced
         press.position_mm, press.response = position_mm, self._responses[_rounded(position_mm)]
@@ -332,17 +319,15 @@ class LivePad:
         return press.replaced - before
 
     def _replaced(self) -> Array:
-        """Return which residues (1, C) the latest press takes away."""
-        positions_mm, touch_s, release_s = (
-            np.array([getattr(each, name) for each in self._presses])
-            for name in ("position_mm", "touch_s", "release_s")
-        )
-        held = np.concatenate([each.response.held for each in self._presses])
-        residues = np.concatenate([each.response.after for each in self._presses])
-        return replaced_residues(positions_mm, touch_s, release_s, residues, held, self._rig)[-1:]
+        """Return the residues (1, C) that the latest press removes."""
+        presses = [
+            (press.position_mm, press.touch_s, press.release_s, press.response.after[0], press.response.held[0])
+            for press in self._presses
+        ]
+        return replaced_residues(*map(np.array, zip(*presses, strict=True)), self._rig)[-1:]
 
     def _solve(self, positions_mm: Array) -> None:
-        """Compute the responses at positions (n, 2), all at once, in place of earlier ones elsewhere."""
+        """Compute the responses at positions (n, 2) together, and forget those at other positions."""
         new = dict.fromkeys(_rounded(position) for position in positions_mm)
         if not new.keys() <= self._responses.keys():
             rounded = np.array(list(new))
@@ -354,18 +339,18 @@ class LivePad:
 
 
 def _rounded(position_mm: Array) -> tuple[float, float]:
-    """Round to hundredths of a millimetre, within which the tip of an arm at rest stays."""
+    """Round to 0.01 mm, since the tip of an arm at rest moves by less."""
     x, y = np.round(position_mm, 2).tolist()
     return x, y
 
 
 @dataclass
 class _PadPress:
-    """A press of a `LivePad`; its response at the full depth."""
+    """A press of a `LivePad`."""
 
     position_mm: Array
     touch_s: float
     release_s: float
     gains: Array
-    response: PressParts[Array]
-    replaced: Array
+    response: PressParts[Array]  # at the full depth
+    replaced: Array  # residues of earlier presses that it removes

@@ -1,9 +1,9 @@
-"""Residual indentation: what a press leaves behind in the silicone, and what the next press there takes away of it.
+"""Residual indentation: a press leaves a dent in the silicone, which the next press at the same position removes.
 
-After a release the surface stays indented for a while, and every fibre off its rest by a share of its response, its
-residue. Where the pad is pressed again meanwhile, the probe fills that dent: the fibres give up their residue and
-answer by as much more, so that what a press reads depends on where the pad was pressed before. When it ends, a part of
-the dent comes back.
+After a release the surface stays indented for a while, and the reading of every fibre differs from its rest by a
+fraction of its response, its residue. If the pad is pressed there again, the probe fills the dent: the fibres lose
+their residue and respond by as much more, so that the response depends on where the pad was pressed before. When the
+press ends, a part of the dent returns.
 """
 
 import numpy as np
@@ -11,26 +11,24 @@ import numpy as np
 from padforge.sense.arrays import Array
 from padforge.sense.settings import RigSettings
 
-MAX_LAG = 32
-"""Earlier presses whose residues are looked at."""
-RETURNED = 0.4
-"""Share of what a press takes away of a residue that comes back when it ends."""
+MAX_LAG = 32  # number of earlier presses whose residues count
+RETURNED = 0.4  # fraction of a removed residue that returns when the press ends
 
 
 def replaced_residues(
     positions_mm: Array, touch_s: Array, release_s: Array, residues: Array, held: Array, rig: RigSettings
 ) -> Array:
-    """Compute what presses, in their order, take away of the residues of those before them; shape (Q, C).
+    """Compute the residues (Q, C) of earlier presses that each of successive presses removes.
 
-    At distance d a press takes the share `memory exp(-d^2 / 2 memory_mm^2)` of what is left of a residue, of which it
-    moves a fibre by the geometric mean of that residue and of its own response: as far as both reach.
+    At distance d a press removes the fraction `memory exp(-d^2 / 2 memory_mm^2)` of what remains of a residue. The
+    effect on a fibre is proportional to the geometric mean of that residue and of the response to the press itself.
 
     Args:
-        positions_mm: centres; shape (Q, 2).
-        touch_s: when they begin; shape (Q,).
-        release_s: when they end; shape (Q,).
-        residues: of each press in all channels at its end; shape (Q, C).
-        held: its held response; shape (Q, C).
+        positions_mm: positions of the presses; shape (Q, 2).
+        touch_s: times at which they begin; shape (Q,).
+        release_s: times at which they end; shape (Q,).
+        residues: residue of each press at its end; shape (Q, C).
+        held: held response of each press; shape (Q, C).
         rig: `memory`, `memory_mm` and `hysteresis_s`.
     """
     replaced, remaining = np.zeros_like(residues), np.ones(len(residues))

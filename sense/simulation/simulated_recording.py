@@ -1,8 +1,7 @@
-"""Simulated recordings of presses, with the responses of the contact model or of a twin; and settings measured for it.
+"""Simulated recordings of presses, by the contact model or a twin; and measured settings for such a simulation.
 
-`measure_rig_settings` estimates the noise, drift and hysteresis of a recorded pad. What remains of a press decays: so
-rests differ from press to press. Their variogram separates what decays within some presses from what drifts over
-minutes.
+`measure_rig_settings` estimates the noise, drift and hysteresis of a recorded pad. The rests before presses differ,
+since the residues of presses decay; their variogram separates this decay, over some presses, from drift over minutes.
 """
 
 from collections.abc import Callable
@@ -20,7 +19,7 @@ from padforge.design import Contact, Morphology, Twin
 from padforge.design.contact import contact_press
 from padforge.design.settings import PadSettings
 from padforge.design.twin import PARTS, TwinChannel, TwinPart
-from padforge.sense.arrays import MAX_FIBRES, MIN_SCALE_V, Array, Indices
+from padforge.sense.arrays import MAX_FIBRES, MIN_SCALE_V, Array
 from padforge.sense.recording.press_plan import (
     PositionTest,
     PressPlan,
@@ -44,10 +43,10 @@ from padforge.sense.simulation.pad_model import (
     simulate_readings,
 )
 
-MIN_SINGULAR = 0.3  # relative; below it both sides of a pad, turned by more than some 28 degrees, count as equal
-JITTER = 0.1  # standard deviation of the interval between readings over its mean: the loop that records is no clock
-MIN_SENSITIVITY = 1e-3  # of a piece of a fibre, below which it counts as that
-MIN_PRESSES = 100  # presses from which noise, drift and hysteresis are measured
+MIN_SINGULAR = 0.3  # relative singular value; both sides of a pad that is turned by over 28 degrees count as equal
+JITTER = 0.1  # standard deviation of the interval between readings over its mean
+MIN_SENSITIVITY = 1e-3  # lower limit of the sensitivity of a piece of a fibre, before its logarithm is taken
+MIN_PRESSES = 100  # minimum number of presses for a measurement of noise, drift and hysteresis
 REST_S = 0.7  # time before a press in which fibres rest
 DECAY_S = np.geomspace(1.0, 100.0, 41)  # time constants of hysteresis that are tried
 
@@ -56,16 +55,15 @@ DECAY_S = np.geomspace(1.0, 100.0, 41)  # time constants of hysteresis that are 
 class PadModel:
     """A pad of C channels to be simulated."""
 
-    corners_mm: Array  # low and high corner of where it is pressed, in the frame of the arm; shape (2, 2)
+    corners_mm: Array  # low and high corner of the pressed area, in the frame of the arm; shape (2, 2)
     free: PositionTest  # which positions (Q, 2) may be pressed
-    # of positions (Q, 2) and depths (Q,), mm; as `simulate_readings`
-    responses: Callable[[Array, Array], PressParts[Array]]
+    responses: Callable[[Array, Array], PressParts[Array]]  # function of positions (Q, 2) and depths (Q,), mm
     source: dict[str, Any]  # description of the pad for the recording, JSON
-    noise_v: Array | None = None  # deviation of responses that no position explains, shape (C,); None for stretches
+    noise_v: Array | None = None  # noise of responses in V; None for relative changes of resistance
 
 
 def model_plan(pad: Morphology, contact: Contact, rig: RigSettings, size: PadSettings | None = None) -> PadModel:
-    """Model a pad that is built as `[rig]` says; `size` says where it is pressed, as `fit_pad_settings`."""
+    """Model a pad that is built as `[rig]` says, and pressed in the area of `size`, see `fit_pad_settings`."""
     size = fit_pad_settings(pad, size)
     keys = {"sensed_mm", "keep_out_mm"} if size.keep_out_mm else {"sensed_mm"}
     source = {"contact": contact.model_dump(mode="json"), "morphology": pad_source(pad)}
@@ -79,8 +77,7 @@ def model_plan(pad: Morphology, contact: Contact, rig: RigSettings, size: PadSet
 
 def model_twin(twin: Twin, rig: RigSettings, size: PadSettings | None = None) -> PadModel:
     """Model the pad of a twin: fibres as built and wired, pressed where the arm pressed; dead channels stay at rest."""
-    live = _live_channels(twin)
-    columns = [twin.channels.index(channel) for channel in live]
+    columns, live = _live_channels(twin)
     fibres = np.array([channel.fibre for channel in live])
     gains_v = np.array([channel.gain_v for channel in live])
     noise_v = np.zeros(len(twin.channels))
@@ -103,7 +100,7 @@ def model_twin(twin: Twin, rig: RigSettings, size: PadSettings | None = None) ->
         held, onset, creep, after = depths_mm[:, None] / FULL_DEPTH_MM * parts
         return PressParts(held, onset, creep, after)
 
-    # Sides along the axes of the arm that span `sensed_mm` along those of the plan.
+    # Least squares for the sides, along the axes of the arm, that span `sensed_mm` along the axes of the plan.
     spans = np.abs(twin.frame.rotate(np.eye(2))).T
     sides, *_ = np.linalg.lstsq(spans, np.array(twin.sensed_mm) / twin.frame.scale, rcond=MIN_SINGULAR)
     half_mm = np.maximum(sides, 0) / 2
@@ -118,13 +115,11 @@ def model_twin(twin: Twin, rig: RigSettings, size: PadSettings | None = None) ->
 
 
 def model_like_twin(pad: Morphology, twin: Twin, rig: RigSettings, size: PadSettings | None = None) -> PadModel:
-    """Model another pad as make_plan, with the sensitivity profiles of a twin and its median gains and noise.
+    """Model another pad by its plan, with the contacts of a twin, and its median gains and noise.
 
-    How its channels will differ is unknown before it is made: fibre i is on channel i, all have the same gain, and
-    their sensitivities vary as those of the twin do.
+    The differences of its channels are unknown before it is made: fibre i is on channel i, and all have the same gain.
     """
-    live = _live_channels(twin)
-    columns = [twin.channels.index(channel) for channel in live]
+    columns, live = _live_channels(twin)
     plan = model_plan(pad, twin.contact(), rig, size)
     noise_v = np.full(len(pad.knots), np.median([channel.noise_v for channel in live]))
     plain, gain_v = twin.contact(), _median_gain(np.array([channel.gain_v for channel in live]))
@@ -149,25 +144,26 @@ def _median_gain(gains_v: Array) -> float:
 
 
 def _share(part: str, rig: RigSettings) -> float:
-    """Return the share of the response that a part is where it was not measured."""
+    """Return the size of a part, relative to the held response, if the twin has no measurement of it."""
     return {"held": 1.0, "onset": 1.0, "creep": rig.creep, "after": rig.hysteresis}[part]
 
 
-def _live_channels(twin: Twin) -> list[TwinChannel]:
-    live = [channel for channel in twin.channels if channel.fibre is not None]
-    if not live:
+def _live_channels(twin: Twin) -> tuple[list[int], list[TwinChannel]]:
+    """Return the channels that read a fibre, and their indices."""
+    columns = [column for column, channel in enumerate(twin.channels) if channel.fibre is not None]
+    if not columns:
         raise InputError("twin: none of its channels reads a fibre, expected one that does")
-    return live
+    return columns, [twin.channels[column] for column in columns]
 
 
 def _measured(twin: Twin, noise_v: Array, source: dict[str, Any]) -> dict[str, Any]:
-    """Return `noise_v` and `source` of a `PadModel` that is like a twin."""
+    """Return the fields `noise_v` and `source` of a `PadModel` that resembles a twin."""
     description = {"presses": twin.presses, "noise": twin.noise, "provenance": dict(twin.provenance)}
     return {"noise_v": twin.scatter.floor * noise_v, "source": source | {"twin": description}}
 
 
 def measured_rig(twin: Twin, rig: RigSettings) -> RigSettings:
-    """Return `[rig]` with what was measured of a pad."""
+    """Return `[rig]` with the values that were measured on a pad."""
     measured = asdict(twin.readings) if twin.readings else {}
     measured |= {"scatter": twin.scatter.share, "scatter_common": twin.scatter.common}
     held = _log_sensitivities(twin.parts.get("held", twin))
@@ -180,7 +176,7 @@ def measured_rig(twin: Twin, rig: RigSettings) -> RigSettings:
 
 
 def _log_sensitivities(part: Twin | TwinPart) -> Array | None:
-    """Return the logarithms of the sensitivities along all fibres, each of zero mean; None where they are uniform."""
+    """Return the logarithms of the sensitivities along all fibres, each of zero mean; None if all are uniform."""
     rows = [np.log(np.maximum(row, MIN_SENSITIVITY)) for row in part.sensitivity or () if row is not None]
     return np.concatenate([row - row.mean() for row in rows]) if rows else None
 
@@ -192,17 +188,17 @@ def simulate(
     size: PadSettings | None = None,
     like: Twin | None = None,
 ) -> Recording:
-    """Simulate a recording of presses, where and as deep as `[rig]` plans them.
+    """Simulate a recording of the presses that `[rig]` plans.
 
     A press takes a cycle of readings: the probe is sent down in its middle, and up at its end.
 
     Args:
-        pad: paths of the fibres; or a twin, which responds, and is pressed, as the pad that it was measured on.
+        pad: paths of the fibres; or a twin, which responds, and is pressed, like the pad that it was measured on.
         rig: plan, depths, rate, seed, noise, drift, creep, hysteresis and scatter; measured values of a twin replace
             them.
         contact: contact model; that of a twin replaces it.
-        size: where the pad is pressed, and its keep-outs; for a twin only the latter.
-        like: twin of another pad, with whose sensitivity, gain and noise `pad` responds.
+        size: pressed area and keep-outs of the pad; for a twin only the keep-outs.
+        like: twin of another pad, with the sensitivity, gain and noise of which `pad` responds.
 
     Returns:
         The recording, the same for the same arguments.
@@ -243,17 +239,7 @@ def simulate(
 
 
 def plan_simulation(pad: Morphology, rig: RigSettings, contact: Contact, size: PadSettings | None = None) -> PressPlan:
-    """Return the presses that `simulate` makes, without simulating them.
-
-    Args:
-        pad: any pad of the same layout.
-        rig: as of `simulate`.
-        contact: as of `simulate`.
-        size: as of `simulate`.
-
-    Raises:
-        InputError: as of `simulate`.
-    """
+    """Return the presses that `simulate` makes on any pad of the same layout, and raise InputError as it does."""
     _check_plan_kind(rig)
     plan = make_plan(pad, rig, np.random.default_rng(rig.seed), size)
     if contact.model == "layer":
@@ -268,7 +254,7 @@ def _check_plan_kind(rig: RigSettings) -> None:
 
 
 def sample_positions(pad: Morphology, presses: int, rng: np.random.Generator, size: PadSettings | None = None) -> Array:
-    """Sample positions (Q, 2), mm, uniformly over what is pressed of the pad, see `fit_pad_settings`."""
+    """Sample positions (Q, 2), mm, uniformly over the pressed area of a pad, see `fit_pad_settings`."""
     size = fit_pad_settings(pad, size)
     return sample_uniform(pad.to_mm(size.sensed), presses, rng, pressable_test(pad, size))
 
@@ -276,14 +262,16 @@ def sample_positions(pad: Morphology, presses: int, rng: np.random.Generator, si
 def measure_rig_settings(recording: Recording) -> dict[str, float]:
     """Measure the `noise_mv`, `drift_mv` and `hysteresis_s` of `[rig]` in a recording.
 
-    Channels that miss readings or are constant are ignored; none are returned for fewer than MIN_PRESSES or no channel.
+    Channels that miss readings or are constant are ignored. Returns {} for fewer than MIN_PRESSES, or without channels.
     """
     down_command, up_command, rate_hz = recording.down_command[:-1], recording.up_command[:-1], recording.rate_hz
     valid = np.isfinite(recording.readings).all(axis=0) & (np.ptp(recording.readings, axis=0) > MIN_SCALE_V)
     if len(down_command) < MIN_PRESSES or not valid.any():
         return {}
     readings, rested = recording.readings[:, valid], ceil(REST_S * rate_hz)
-    baseline = _interval_means(readings, np.maximum(down_command - rested, np.append(0, up_command[:-1])), down_command)
+    first = np.maximum(down_command - rested, np.append(0, up_command[:-1]))
+    rests = zip(first, np.maximum(down_command, first + 1), strict=True)
+    baseline = np.array([readings[start:end].mean(axis=0) for start, end in rests])
     decay_s, drift_v = _fit_variogram(baseline, float(np.median(np.diff(recording.times_s[down_command]))))
     middle = (down_command + up_command) // 2
     second_differences = readings[middle - 1] - 2 * readings[middle] + readings[middle + 1]
@@ -293,11 +281,6 @@ def measure_rig_settings(recording: Recording) -> dict[str, float]:
         "drift_mv": 1e3 * drift_v,
         "hysteresis_s": decay_s,
     }
-
-
-def _interval_means(readings: Array, first: Indices, end: Indices) -> Array:
-    """(Q, C) means of the readings from `first` (Q,) to before `end` (Q,), of one at least."""
-    return np.array([readings[a : max(b, a + 1)].mean(axis=0) for a, b in zip(first, end, strict=True)])
 
 
 def _fit_variogram(baseline: Array, interval_s: float) -> tuple[float, float]:

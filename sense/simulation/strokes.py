@@ -1,7 +1,7 @@
 """Simulated strokes: a finger that touches a simulated pad, slides over it in a straight line, and lifts.
 
-At any time a stroke is like a press where the finger is then, which creeps as it was pressed so far. What a finger
-leaves behind on its way is not simulated: nobody has measured it.
+At any time a stroke is like a press at the present position of the finger that began with the stroke. Residues along
+the stroke are not simulated, since nobody has measured them.
 """
 
 from dataclasses import dataclass
@@ -9,7 +9,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from padforge.design import Contact, Morphology
-from padforge.design.settings import PadSettings
 from padforge.sense.arrays import Array
 from padforge.sense.recording.press_plan import make_plan, sample_uniform
 from padforge.sense.recording.recording import Recording
@@ -22,8 +21,8 @@ from padforge.sense.simulation.simulated_recording import model_plan
 class Strokes:
     """N strokes on a simulated pad."""
 
-    recording: Recording  # a press a stroke, where it ends; `down_command` is its first reading, `up_command` its end
-    positions_mm: Array  # (N, T, 2) of the finger at each reading of a stroke
+    recording: Recording  # one press for each stroke, at its end position
+    positions_mm: Array  # positions (N, T, 2) of the finger, from reading `down_command` to before `up_command`
 
 
 def simulate_strokes(
@@ -33,22 +32,23 @@ def simulate_strokes(
     speed_mm_s: float,
     strokes: int,
     rng: np.random.Generator,
-    size: PadSettings | None = None,
 ) -> Strokes:
-    """Simulate strokes of a speed, as long as the presses of `[rig]`, on the pad that it simulates presses on.
+    """Simulate strokes as long as the presses of `[rig]`, on the pad that `simulate` presses with the same seed.
 
-    They begin anywhere and go any way that stays on the pad; where it is too small for them, they are slower.
+    Start and direction are random, and a stroke stays on the pad; it is slower if the pad is too small for it.
     """
     rig = rig.for_contact(contact)
-    model = model_plan(pad, contact, rig, size)
+    model = model_plan(pad, contact, rig)
+    n_held = rig.readings_per_press // 2
+    n_rest = rig.readings_per_press - n_held
     starts = sample_uniform(model.corners_mm, strokes, rng, model.free)
-    ends = np.array([_end(start, speed_mm_s * _duration_s(rig), model.corners_mm, rng) for start in starts])
-    n_held, n_rest = rig.readings_per_press // 2, rig.readings_per_press - rig.readings_per_press // 2
+    length_mm = speed_mm_s * (n_held / rig.rate_hz)
+    ends = np.array([_end(start, length_mm, model.corners_mm, rng) for start in starts])
     share = np.arange(n_held) / n_held
     paths = starts[:, None] + share[:, None] * (ends - starts)[:, None]
     depth = np.minimum((np.arange(n_held) + 1) / (rig.rate_hz * TRAVEL_S), 1.0) * rig.press_depths_mm[0]
     built = np.random.default_rng(rig.seed)
-    make_plan(pad, rig, built, size)  # the presses of a recording are drawn before the pad is
+    make_plan(pad, rig, built)  # `simulate` samples the presses before the pad
     positions_mm = np.concatenate([np.repeat(starts[:, None], n_rest, axis=1), paths], axis=1).reshape(-1, 2)
     depths_mm = np.tile(np.append(np.zeros(n_rest), depth), strokes)
     readings = LivePad(pad, contact, rig, rig.rate_hz, built).volts(positions_mm, depths_mm)
@@ -64,12 +64,8 @@ def simulate_strokes(
     return Strokes(recording, paths)
 
 
-def _duration_s(rig: RigSettings) -> float:
-    return rig.readings_per_press // 2 / rig.rate_hz
-
-
 def _end(start: Array, length_mm: float, corners_mm: Array, rng: np.random.Generator) -> Array:
-    """Draw the end of a stroke, no nearer to the pad's edge than its corners; shorter where no way is long enough."""
+    """Sample the end of a stroke between the corners, nearer than `length_mm` if no direction has room for that."""
     for shortened in 0.9 ** np.arange(60):
         for angle in rng.uniform(0, 2 * np.pi, 8):
             end = start + shortened * length_mm * np.array([np.cos(angle), np.sin(angle)])

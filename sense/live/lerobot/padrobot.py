@@ -28,7 +28,7 @@ class PadRobotConfig(RobotConfig):
 
 
 class PadRobot(Robot):
-    """The robot of `config.robot` with additional observations `pad.NAME`; actions are those of that robot."""
+    """The robot of `config.robot`, if any, with additional observations `pad.NAME`."""
 
     config_class = PadRobotConfig
     name = "padforge"

@@ -86,7 +86,7 @@ class NozzleThread(threading.Thread):
         except RigFault as fault:
             self.fault = fault
         except Exception as error:  # a thread that dies silently would look like a printer at rest
-            self.fault = RigFault("lost", f"what moves the printer has failed ({error!r})")
+            self.fault = RigFault("lost", f"the thread that moves the printer has failed ({error!r})")
 
     def drain(self) -> list[NozzleState]:
         """Return the states since the last call."""

@@ -108,8 +108,7 @@ class MarlinLink:
     def execute(self, command: str, timeout_s: float = ANSWER_S) -> list[str]:
         """Execute a command exactly once and return the lines of its answer, [] if noise destroyed them.
 
-        Raises:
-            RigFault: "stale" after `timeout_s` without an answer; "lost" if the printer requests unknown lines.
+        RigFault("stale") after `timeout_s` without an answer; RigFault("lost") if the printer requests unknown lines.
         """
         self._number += 1
         self._history.append(number_line(self._number, command))

@@ -157,16 +157,14 @@ class WorkerProcess:
         self._control = control
         if not self._program_running.wait(ANSWER_S):
             raise CommandRejected("refused", "the arm's program does not run", UNLOCK_ADVICE)
-        return (
-            identity
-            | control.identity
-            | {
-                "host": self._host,
-                "rate_hz": reader.rate_hz,
-                "controller": ".".join(map(str, reader.version)),
-                "tcp": [*(round(1e3 * value, 3) for value in tcp[:3]), *(round(value, 6) for value in tcp[3:])],
-            }
-        )
+        return {
+            **identity,
+            **control.identity,
+            "host": self._host,
+            "rate_hz": reader.rate_hz,
+            "controller": ".".join(map(str, reader.version)),
+            "tcp": [*(round(1e3 * value, 3) for value in tcp[:3]), *(round(value, 6) for value in tcp[3:])],
+        }
 
     def _ask_identity(self) -> dict[str, str]:
         """Return the arm's identity by its dashboard; reject an arm that is not in remote control."""

@@ -10,18 +10,13 @@ UNDER_WAY = 1 << 15  # bit of the same register: the operation is in progress
 
 
 class UrRtdeControl:
-    """A connection to ur-rtde's program on the arm. Methods raise an error if the link is lost; lengths are m.
-
-    Attributes:
-        moving: whether the last move is in progress.
-        identity: version of the driver.
-    """
+    """A connection to ur-rtde's program on the arm. Methods raise an error if the link is lost; lengths are m."""
 
     def __init__(self, host: str) -> None:
         """Send ur-rtde's program and set its watchdog; RuntimeError if there is no arm."""
         import rtde_control
 
-        self.moving = False
+        self.moving = False  # whether the last move is in progress
         self._progress = 0  # latest value of the register
         self._previous_operation = 0  # number of the operation before the current move
         self._control: Any = rtde_control.RTDEControlInterface(host)

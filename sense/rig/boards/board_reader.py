@@ -29,13 +29,7 @@ class BlockReader(threading.Thread):
     """A thread that drains a port into a buffer, until it is stopped or something fails."""
 
     def __init__(self, port: str, receive: Callable[[], tuple[float, list[Any]]], rate_hz: float) -> None:
-        """Prepare the thread.
-
-        Args:
-            port: name of the port, for messages.
-            receive: waits up to about `POLL_S` for blocks and returns host time and blocks; its error ends the thread.
-            rate_hz: samples a second.
-        """
+        """Prepare the thread; `receive` waits about `POLL_S` for blocks, and returns the host time and these."""
         super().__init__(name=f"reader of {port}", daemon=True)
         self._port, self._receive = port, receive
         self._capacity = round(BUFFER_S * rate_hz)
@@ -108,11 +102,7 @@ class BlockReader(threading.Thread):
 class SerialBoard(ABC):
     """A board at a serial port; its subclasses implement the protocols.
 
-    Args:
-        port: name of the port, which `connect` opens.
-        baud: speed of the port.
-        rate_hz: samples a second.
-        inputs: input of each fibre, from 0; () for all inputs in order.
+    `rate_hz` is the number of samples a second, `inputs` the input of each fibre, from 0; () for all inputs in order.
     """
 
     def __init__(self, port: str, baud: int, rate_hz: float, inputs: Sequence[int] = ()) -> None:
@@ -166,12 +156,8 @@ class SampleClock:
 
     A block cannot arrive before its last sample was measured, and some blocks arrive with hardly any delay. The host
     time is therefore modelled as the highest straight line below all arrivals of the last minute: late blocks have no
-    influence, and the slope is the relative rate of the board's clock. A delay common to all blocks cannot be observed
-    and remains in the times.
-
-    Args:
-        period_s: nominal period of one count of the board.
-        max_skew: maximum relative error of that period.
+    influence, and the slope is the relative rate of the board's clock, limited to `max_skew`. A delay common to all
+    blocks cannot be observed and remains in the times.
     """
 
     def __init__(self, period_s: float, max_skew: float) -> None:

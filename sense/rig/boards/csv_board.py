@@ -39,16 +39,10 @@ def parse_numbers(line: bytes) -> list[float] | None:
 
 
 class CsvBoard(SerialBoard):
-    """A board at a serial port that prints lines of numbers; implements `Board`.
+    """A board at a serial port that prints lines of numbers, in units of `count_v`; implements `Board`.
 
-    A first column that always ascends is taken for the board's time, and is not an input.
-
-    Args:
-        port: name of the port, which `connect` opens.
-        baud: speed of the port.
-        rate_hz: lines a second; `connect` fails if the measured rate differs by more than 5 %.
-        inputs: column of each fibre, from 0, not counting the time; () for all columns.
-        count_v: factor from printed numbers to volts.
+    A first column that always ascends is taken for the board's time, and is not an input. `connect` fails if the
+    measured rate differs from `rate_hz` by more than 5 %.
     """
 
     def __init__(self, port: str, baud: int, rate_hz: float, inputs: Sequence[int] = (), count_v: float = 1.0) -> None:

@@ -179,12 +179,8 @@ class LineBoard(SerialBoard):
         return cls(find_line_port(rig), rig.baud, rig.board_rate_hz, inputs)
 
     def read(self) -> BoardSamples:
-        """Return all samples since the last call, volts; see `Board`.
-
-        Raises:
-            RigFault: "data" if the buffer overflowed, or the board was reset or sends impossible times.
-        """
-        blocks = self._drain()  # raises where the board is not connected
+        """Return all samples since the last call, volts; RigFault("data") for a reset or impossible times."""
+        blocks = self._drain()  # raises if the board is not connected
         return self._assembler.assemble(blocks)
 
     def _start(self, stream: SerialStream) -> dict[str, Any]:
