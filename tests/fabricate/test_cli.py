@@ -123,7 +123,8 @@ def test_lines_and_documents_of_checks(tmp_path, golden, figures):
     invoke(tmp_path / "crossed.json", "--formats", "stl", "--out", tmp_path)
     lines = []
     (tmp_path / "plain.toml").write_text("")
-    checks = ("mould.stl", "plain"), ("crossed.json", "two"), ("crossed.json", "small"), ("mould.stl", "small")
+    checks = (("mould.stl", "plain"), ("crossed.json", "two"), ("crossed.json", "small"), ("mould.stl", "small"))
+    words: list[Any] = []
     for file, name in checks:
         spec = f"{name}.toml"
         words = ["check", tmp_path / file, "--spec", tmp_path / spec]
