@@ -70,6 +70,7 @@ WHOLE = [[-40, -40], [40, -40], [40, 40], [-40, 40]]  # a keep-out
     ("settings", "words", "said"),
     [
         ("", "init", "pad.toml: exists already"),
+        ("", "init --preset published", "pad.toml: exists already"),
         ("", "init other.toml --preset mine", "'mine' is not one of 'published'"),
         ("[search]\nsteps = 0\n", "run", "pad.toml: [search] steps: got 0"),
         ("", "design check none.json", "none.json"),

@@ -133,6 +133,13 @@ def test_page_follows_mouse_keys_and_other_pages(program: Program, browser: Chro
     for each, before in zip(shown, first, strict=True):
         assert browser.ask(each) != before
     assert browser.ask("document.querySelectorAll('#violations path').length") > 0
+    view = browser.ask("view")
+    broken = {fibre for rule in view["rules"] for fibre in rule["fibres"]}
+    classes = browser.ask("layers.fibres.map(fibre => [...fibre.group.classList])")
+    assert broken
+    assert {number for number, names in enumerate(classes, 1) if "broken" in names} == broken
+    # the colours end at three times the ambiguity of straight fibres
+    assert float(browser.ask(TEXT.format("limit"))) == pytest.approx(3 * view["straight_mm"][0], rel=0.05)
     control_key(browser, "z")
     browser.wait_for("document.getElementById('undo').disabled")
     assert browser.ask(CENTRE.format(".knot .dot", 0)) == pytest.approx(begin, abs=0.5)

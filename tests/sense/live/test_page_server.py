@@ -189,8 +189,8 @@ def test_browser_shows_the_pad(page: LivePage, browser: Chromium) -> None:
     assert len(points) == 3  # the track, and where the finger is now
     x, y = (float(part) for part in points[-1].split(","))
     assert [x, y] == browser.ask("['cx', 'cy'].map(name => +document.querySelector('.position').getAttribute(name))")
-    edge, latest, before = (box_of(browser, f"#pad .{part}") for part in ("edge", "r90", "trail"))
-    assert latest[2] / edge[2] == pytest.approx(2 * 3.0 / 40)
+    edge, half, latest, before = (box_of(browser, f"#pad .{part}") for part in ("edge", "r50", "r90", "trail"))
+    assert [circle[2] / edge[2] for circle in (half, latest)] == pytest.approx([2 * 1.5 / 40, 2 * 3.0 / 40])
     assert (latest[0] - before[0]) / edge[2] == pytest.approx(1 / 40)
     assert latest[1] == pytest.approx(edge[1])
     bars = browser.ask(
@@ -199,6 +199,12 @@ def test_browser_shows_the_pad(page: LivePage, browser: Chromium) -> None:
     assert bars == [[0, 0.5], [-1, 1], [0, 0]]
     bad = browser.ask("[...document.querySelectorAll('.fibre')].map(row => row.classList.contains('bad'))")
     assert bad == [False, True, True]
+    # no place is shown for what no single press explains
+    several = VIEW["presses"][-1] | {"unlike": True, "text": "press 8: several fingers"}
+    page.show(VIEW | {"presses": [*VIEW["presses"][:-1], several]})
+    browser.wait_for("document.getElementById('position').textContent == 'several fingers?'")
+    assert browser.ask("document.getElementById('radii').textContent") == "press 8: several fingers"
+    assert [browser.ask(count.format(f"#pad .{name}")) for name in ("trail", "r50", "r90", "position")] == [1, 0, 0, 0]
 
 
 HAND = VIEW | {"paths": [[[-20, 0], [0, 1], [20, 0]]], "commands": [{"key": "s", "command": "skip", "text": HOSTILE}]}
