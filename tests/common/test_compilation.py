@@ -83,7 +83,8 @@ def test_kernels_are_compiled_anew_when_what_they_call_has_changed(
     if is_chosen:
         monkeypatch.setenv("NUMBA_CACHE_DIR", str(root / "chosen"))
     inner, _, outer = KERNELS.rpartition("@kernel")
-    (root / "design/inner.py").write_text(inner)
+    (root / "design/kernels").mkdir()
+    (root / "design/kernels/inner.py").write_text(inner)
     (root / "design/outer.py").write_text(
         inner.partition("@")[0] + "from inner_of_a_test import inner\n@kernel" + outer
     )
@@ -91,12 +92,12 @@ def test_kernels_are_compiled_anew_when_what_they_call_has_changed(
     def compute() -> tuple[int, int]:
         """Do what a new process does; returns the result, and how many kernels are compiled for it."""
         compilation.cache_folder.cache_clear()
-        monkeypatch.setitem(sys.modules, "inner_of_a_test", loaded(root / "design/inner.py"))
+        monkeypatch.setitem(sys.modules, "inner_of_a_test", loaded(root / "design/kernels/inner.py"))
         module = loaded(root / "design/outer.py")
         return module.outer(1), sum(module.outer.stats.cache_misses.values())
 
     assert [compute(), compute()] == [(4, 1), (4, 0)]
-    (root / "design/inner.py").write_text(inner.replace("x + 1", "x + 2"))
+    (root / "design/kernels/inner.py").write_text(inner.replace("x + 1", "x + 2"))
     assert [compute(), compute()] == [(6, 1), (6, 0)]
     base = root / ("chosen" if is_chosen else "common/__pycache__")
     assert len({path.parents[1] for path in root.rglob("*.nbc")}) == len(list(base.iterdir())) == 2
