@@ -9,6 +9,7 @@ import pytest
 from padforge.design import Contact, Morphology, signals
 from padforge.design.published.networks import (
     SimulatedPresses,
+    fit_batch,
     fresh_presses,
     localisation_error,
     training_presses,
@@ -33,6 +34,16 @@ def test_networks_ignore_the_signals_of_failed_fibres():
     changed[:, failed] = np.nan
     errors = presses.position_errors(network, failed, changed, presses.test_positions)
     np.testing.assert_array_equal(errors, presses.test_errors(network, failed))
+
+
+def test_networks_are_scaled_by_their_training_samples_alone():
+    rng = np.random.default_rng(0)
+    x, y = rng.uniform(-1, 1, (1, 60, 3)), rng.uniform(-1, 1, (60, 2))
+    checked = rng.uniform(-9, 9, (1, 20, 3)), rng.uniform(-9, 9, (20, 2))
+    [network] = fit_batch(x, y, [rng], hidden=3, epochs=2, validation=checked)
+    for scaler, samples in ((network.inputs, x[0]), (network.targets, y)):
+        np.testing.assert_array_equal(scaler.transform(samples).min(axis=0), -1)
+        np.testing.assert_array_equal(scaler.transform(samples).max(axis=0), 1)
 
 
 def test_localisation_error_of_the_published_pad_is_below_the_square_grid(published):

@@ -57,3 +57,11 @@ def test_locate_looks_at_the_readings_nearest_to_a_moment(few) -> None:
         table = np.genfromtxt("places.csv", delimiter=",", names=True)
         expected_mm = model.predict(recording, until=moment.until(touched, recording.up_command)).positions_mm
         np.testing.assert_allclose(np.column_stack([table["x_mm"], table["y_mm"]]), expected_mm, atol=1e-4)
+    # read three times as often, it is the same moment
+    commands = {name: 3 * getattr(recording, name) for name in ("down_command", "up_command")}
+    times_s = (recording.times_s[:, None] + np.arange(3) / (3 * recording.rate_hz)).ravel()
+    replace(recording, readings=recording.readings.repeat(3, axis=0), times_s=times_s, **commands).save("fast", {})
+    assert few("locate", "--model", "model", "fast", "--at", "0.3s")[0] == 0
+    table = np.genfromtxt("places.csv", delimiter=",", names=True)
+    fast_mm = np.column_stack([table["x_mm"], table["y_mm"]])
+    assert np.abs(fast_mm - expected_mm).mean() < 0.1
