@@ -52,6 +52,7 @@ def test_locate_looks_at_the_readings_nearest_to_a_moment(few) -> None:
     recording.save("short", {})
     touched = first_readings(recording.readings, recording.times_s, recording.down_command, recording.up_command)
     moments = {"lift+0.22s": Moment("lift", 3), "end": Moment("lift", 0), "0.3s": Moment("touch", 4)}
+    expected_mm = np.empty((0, 2))
     for words, moment in moments.items():
         assert few("locate", "--model", "model", "short", "--at", words)[0] == 0
         table = np.genfromtxt("places.csv", delimiter=",", names=True)
