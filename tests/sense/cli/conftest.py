@@ -3,6 +3,7 @@
 import shutil
 import sys
 from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,7 @@ from padforge.design import Morphology
 from padforge.sense import Evaluation, calibrate
 from padforge.sense.health import trace_model
 from padforge.sense.localizer.model import LocalizerModel
+from padforge.sense.localizer.torch_network import EnsembleMlp
 from padforge.sense.report.calibration import calibrate_into
 from padforge.sense.rig.operation import record_simulated
 from padforge.sense.settings import LocalizerSettings, RigSettings
@@ -54,7 +56,7 @@ def make_model(folder: Path, presses: int) -> Path:
     (folder / "pad.toml").write_text(SPEC)
     spec = Spec.load(folder / "pad.toml")
     recording = record_simulated(spec, Morphology.straight(2), folder / "rec", {"presses": presses})
-    with mock.patch.object(trace_model, "MAX_STEPS", 80), blank_pictures(), few_moments():
+    with mock.patch.object(trace_model, "MAX_STEPS", 80), blank_pictures(), few_moments(), single_precision():
         calibrate_into(recording, folder / "model", spec.section(LocalizerSettings))
     return folder
 
@@ -65,10 +67,21 @@ def make_deep_presses(folder: Path) -> Path:
     recording = simulate(pad, rig)
     recording = replace(recording, forces_n=3.0 * recording.depths_mm)
     recording.save(folder / "rec", {})
-    with few_moments():
+    with few_moments(), single_precision():
         localizer, _ = calibrate(recording, LocalizerSettings(members=1, hidden=32, layers=1, epochs=12))
     localizer.save(folder / "model")
     return folder
+
+
+def single_precision() -> AbstractContextManager[Any]:
+    """Train alike on processors with and without bfloat16, so that outputs of one are those of the other."""
+    return mock.patch.object(EnsembleMlp, "forward_bfloat16", EnsembleMlp.forward)
+
+
+@pytest.fixture(autouse=True)
+def alike_on_all_processors() -> Iterator[None]:
+    with single_precision():
+        yield
 
 
 @pytest.fixture(autouse=True)
