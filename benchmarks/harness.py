@@ -196,7 +196,7 @@ def run_benches(
         if measure_round(bench, measured, report, repeat):
             measured.pace_s = min(other.pace_s for other in rounds.values())
             documents[bench.name] = _to_document(bench, measured)
-            figure = _draw(bench.name, _medians(documents[bench.name]["rows"]), bench.error_label)
+            figure = draw_times(bench.name, _medians(documents[bench.name]["rows"]), bench.error_label)
             save_figure(figure, out / f"{bench.name}.png")
             write_json(out / "bench.json", _to_content(documents))
 
@@ -302,7 +302,7 @@ def _time(seconds: float) -> str:
     return f"{1e3 * seconds:.1f} ms" if seconds < 1 else f"{seconds:.2f} s"
 
 
-def _draw(name: str, medians: Sequence[Row], error_label: str) -> Figure:
+def draw_times(name: str, medians: Sequence[Row], error_label: str) -> Figure:
     """Draw a work-precision diagram: error against run time, a panel per case, a curve per way."""
     rows = [row for row in medians if row["error"] is not None]
     scale, unit = (1e3, "ms") if min(row["seconds"] for row in rows) < 0.1 else (1, "s")

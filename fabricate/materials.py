@@ -95,9 +95,13 @@ PRODUCTS = {
     "adhesive": ("one part, sticks to cured silicone", "Smooth-On Sil-Poxy, DOWSIL 732"),
     "filament": ("1.75 mm", "Prusament PLA"),
     "resin": ("for 405 nm; test that silicone cures on it", "Formlabs Clear"),
-    "connectors": ("crimped on both ends of a fibre, to wire of 0.14 mm²", "ferrules of 0.25 mm², Weidmüller H0,25"),
+    "connectors": (
+        "crimped on both ends of a fibre, to wire of 0.14 mm²",
+        "ferrules without collar, 0.25 mm², 5 to 8 mm long; 4 mm² for a cord of 2 mm",
+    ),
     "wire": ("stranded, 0.14 mm² (AWG 26)", "LiY 0.14 mm²"),
     "resistors": ("metal film, 1 %, 0.25 W", "Yageo MFR-25"),
+    "capacitors": ("ceramic; 10 to 100 nF on a Due, 1 nF at an input of a multiplexer", "Kemet C320"),
     "board": (
         "12 or more bits; an input a fibre, 3.3 V",
         "Arduino Due (12 fibres); Teensy 4.1 or ESP32 with a 74HC4067 multiplexer (16)",

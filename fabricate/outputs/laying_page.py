@@ -19,6 +19,7 @@ from padforge.fabricate.settings import MouldSettings, PrinterSettings
 
 Document = Mapping[str, Any]
 
+MAX_SOURCE_OHM = 10_000  # resistance of a fibre above which an input needs a capacitor
 SURPLUS_PERCENT = 10  # silicone that stays in the cup and on the stick
 WASTE_PERCENT = 20  # fibre that breaks or is cut too short
 PRINT_MM_S = 50.0  # mean speed along lines of filament, a rule of thumb
@@ -252,17 +253,21 @@ def _pad_lines(document: Document) -> Iterator[str]:
 def _order_lines(document: Document) -> Iterator[str]:
     order, fibre, silicone = document["order"], document["fibre"], document["silicone"]
     n_fibres, resin = len(document["fibres"]), document["settings"]["printer"]["resin"]
+    dividers = Counter(entry["divider_ohm"] for entry in document["fibres"] if entry["divider_ohm"] is not None)
+    values = ", ".join(f"{count} of {_ohms(ohm)}" for ohm, count in sorted(dividers.items()))
+    thick = f", {fibre['diameter_mm']:g} mm" if f"{fibre['diameter_mm']:g} mm" not in fibre["name"] else ""
     amounts = {
-        "fibre": f"{order['fibre_m']:.2f} m of {fibre['name']}, {fibre['diameter_mm']:g} mm",
+        "fibre": f"{order['fibre_m']:.2f} m of {fibre['name']}{thick}",
         "silicone": f"{silicone['mass_g']:.0f} g of {silicone['name']}",
-        "adhesive": f"{sum(document['adhesive']['steps_ml']):.2f} ml",
+        "adhesive": f"up to {sum(document['adhesive']['steps_ml']):.2f} ml in the tracks",
         "resin" if resin else "filament": f"{order['plastic_g']:.0f} g of {PLASTICS[resin][0]}",
         "connectors": f"{2 * n_fibres}",
         "wire": f"{2 * n_fibres} pieces, from the pad to the board",
-        "resistors": f"{n_fibres}, of values by the resistance of the fibre",
+        "resistors": values or f"{n_fibres}, of values by the resistance of the fibre",
+        "capacitors": f"{n_fibres}" if any(ohm > MAX_SOURCE_OHM for ohm in dividers) else "",
         "board": f"for {n_fibres} fibres",
     }
-    rows = [(kind, amount, *PRODUCTS[kind]) for kind, amount in amounts.items()]
+    rows = [(kind, amount, *PRODUCTS[kind]) for kind, amount in amounts.items() if amount]
     yield from _table_lines(("kind", "amount", "properties", "for example"), rows)
     yield ""
     yield (
@@ -414,7 +419,7 @@ def _lay_lines(document: Document) -> Iterator[str]:
     )
     yield (
         f"3. After each step, fill the tracks over the fibres with {adhesive['name']}. Keep the tracks that cross above"
-        " clear. Let it cure before the next step."
+        " clear. Let it cure before the next step, a day if in doubt."
     )
     yield (
         "4. Measure the resistance of every fibre again, write it down, and measure between all fibres: no two may be"
@@ -427,7 +432,9 @@ def _lay_lines(document: Document) -> Iterator[str]:
             lengths_mm = (f"{entry[key]:.1f} mm" for key in ("in_pad_mm", "cut_mm"))
             sealed = f"{volume_ml:.2f} ml" if entry["number"] == numbers[-1] else ""
             rows.append((step, entry["number"], entry["fibre"], f"{entry['depth_mm']:.3g} mm", *lengths_mm, sealed))
-    yield from _table_lines(("step", "number", "fibre", "depth", "in the pad", "cut to", "then seal with"), rows)
+    yield from _table_lines(
+        ("step", "number", "fibre", "track depth", "in the pad", "cut to", "then seal with up to"), rows
+    )
     if "laying.gcode" in document["files"]:
         yield ""
         yield (

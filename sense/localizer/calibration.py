@@ -26,12 +26,13 @@ from padforge.sense.localizer.evaluation import (
     TRAINED_OUT,
     Evaluation,
     conformal,
+    distances,
     evaluate,
     held_back_presses,
 )
 from padforge.sense.localizer.features import MODULATED, FeatureSet, PressFeatures, compute_features
-from padforge.sense.localizer.model import LocalizerModel
-from padforge.sense.localizer.moments import complete_at, count_complete
+from padforge.sense.localizer.model import Localization, LocalizerModel
+from padforge.sense.localizer.moments import N_PRESS_WINDOWS, complete_at, count_complete
 from padforge.sense.localizer.network import (
     MAX_LOG_ERROR,
     MIN_LOG_ERROR,
@@ -59,14 +60,46 @@ MIN_DEPTH_RANGE_MM = 0.2  # range of the central 90 % of depths, at or below whi
 PRIOR_COUNT = 2  # weight of the expected error of a member in the calibration of its scale, in presses
 SCALE_SUBSETS = 6  # maximum sets of failed fibres of a size for the calibration of scales
 SIZE_KEYS = "members", "hidden", "layers"
-# Prior for the uncertainty: experience with localizers of other pads, simulated and published, with the defaults of
-# SIZE_KEYS, trained out, and 255 to 4000 training presses. It differs by 5 % between pads, and by less between splits.
-DOUBLE_ERROR_PRESSES = 165.0  # with n training presses, new presses err 1 + this / n times as much as expected
-MEAN_RATIO = 0.67  # mean ratio of distance to expected radius, with that growth included
-FAILURE_RATIO_DECREASE = 0.15  # decrease of that ratio, relative, per share of failed fibres
-CONTRADICTION = 2.5  # standard errors by which calibration presses may differ from this experience
+CONTRADICTION = 2.5  # standard errors by which calibration presses may differ from the experience with other pads
 INTERVAL_SUBSETS = 32  # maximum sets of failed fibres of a size for the calibration of intervals
 MOMENT_SUBSETS = 4  # the same where there are several moments
+
+
+@dataclass(frozen=True)
+class Experience:
+    """Errors of 26 other localizers at a moment of a press, as a prior for the radii.
+
+    They were of 10 pads, simulated and published, with the defaults of `SIZE_KEYS`, trained out, and 235 to 3500
+    training presses. The mean ratio of distance to expected radius differed by `PAD_SPREAD` between them.
+    """
+
+    growth_presses: float  # with n training presses, new presses err 1 + this / n times as much as expected
+    mean_ratio: float  # mean ratio of distance to expected radius, with that growth included
+
+    @staticmethod
+    def at(n_complete: int) -> "Experience":
+        """Return the experience when `n_complete` windows of a press are complete."""
+        return TOUCH if n_complete < N_PRESS_WINDOWS else REST if n_complete == N_PRESS_WINDOWS else RELEASE
+
+    def growth(self, n_trained: int) -> float:
+        """Return the ratio of the errors on new presses to the expected ones after `n_trained` presses."""
+        return 1 + self.growth_presses / n_trained
+
+    def ratio(self, n_trained: int, failed_share: float) -> float:
+        """Return the mean ratio of distance to expected radius with a share of the fibres failed.
+
+        Errors grow less where fibres have failed, since they are large anyway.
+        """
+        return self.mean_ratio * (1 - FAILURE_DECREASE * failed_share * (1 - 1 / self.growth(n_trained)))
+
+
+TOUCH = Experience(growth_presses=70, mean_ratio=0.78)
+REST = Experience(growth_presses=180, mean_ratio=0.84)
+RELEASE = Experience(growth_presses=190, mean_ratio=0.73)
+FAILURE_DECREASE = 1.1
+"""Decrease of the growth of errors, relative, per share of failed fibres."""
+PAD_SPREAD = 0.1
+"""Standard deviation of the mean ratio between pads, relative."""
 
 
 @dataclass(frozen=True)
@@ -278,27 +311,55 @@ def calibrate_uncertainty(
         on_progress: called with the stage of the work.
         n_trained: number of training presses, if the experience with other pads serves as a prior.
     """
-    is_typical = False
     if model.method == "ensemble":
-        model, is_typical = _calibrate_scales(model, moments, positions_mm, levels, on_progress, n_trained)
+        model = _calibrate_scales(model, moments, positions_mm, levels, on_progress, n_trained)
     uncalibrated = replace(model, interval_factors=np.ones_like(model.interval_factors))
     n_sets = MOMENT_SUBSETS if len(moments) > 1 else INTERVAL_SUBSETS
-    factors = []
+    subsets = [failure_subsets(model.fibres, level, n_sets) for level in range(levels)]
+    predictions: list[list[list[Localization]]] = []
     for presses in moments:
-        on_progress(len(factors), len(moments), "radii")
-        predictions = (
-            [uncalibrated.predict_features(presses, subset) for subset in failure_subsets(model.fibres, level, n_sets)]
-            for level in range(levels)
-        )
-        row = []
-        for level, of_level in enumerate(predictions):
-            ratio = MEAN_RATIO * (1 - FAILURE_RATIO_DECREASE * level / model.fibres) if is_typical else None
-            row.append(conformal(of_level, positions_mm, measures, ratio))
-        factors.append(row)
+        on_progress(len(predictions), len(moments), "radii")
+        predictions.append([[uncalibrated.predict_features(presses, each) for each in sets] for sets in subsets])
+    prior_ratios = None
+    if n_trained:
+        shares = np.arange(levels) / model.fibres
+        experience = [Experience.at(n_complete) for n_complete in range(1, len(moments) + 1)]
+        expected = np.array([[each.ratio(n_trained, share) for share in shares] for each in experience])
+        prior_ratios = _adapt_ratios(expected, predictions, positions_mm)
+    factors = [
+        [
+            conformal(of_level, positions_mm, measures, None if prior_ratios is None else prior_ratios[moment, level])
+            for level, of_level in enumerate(of_moment)
+        ]
+        for moment, of_moment in enumerate(predictions)
+    ]
     if len(moments) > 1:
         factors = [factors[0], *factors]  # a placeholder for 0 complete windows, where nothing is predicted
-    n_presses = len(positions_mm) + PRIOR_PRESSES * is_typical
+    n_presses = len(positions_mm) + PRIOR_PRESSES * (prior_ratios is not None)
     return replace(model, interval_factors=np.clip(factors, 1e-6, 1e6), radii_presses=n_presses)
+
+
+def _adapt_ratios(
+    expected: Array, predictions: Sequence[Sequence[Sequence[Localization]]], positions_mm: Array
+) -> Array | None:
+    """Adapt the mean ratios of distance to radius of other pads to a pad; None if its presses contradict them.
+
+    The pad differs from the others by one factor, which is estimated from its presses and from `PAD_SPREAD`.
+
+    Args:
+        expected: by moment and number of failed fibres; shape (K, L).
+        predictions: at each moment, for each number of failed fibres, with some sets of them.
+        positions_mm: of the presses; shape (Q, 2).
+    """
+    ratios = [
+        [np.mean([distances(each.positions_mm, positions_mm) / each.r50_mm for each in sets]) for sets in of_moment]
+        for of_moment in predictions
+    ]
+    log_factor = float(np.log(np.array(ratios) / expected).mean())
+    variance = 1 / (RATIO_SHAPE * len(positions_mm))  # of the mean of gamma distributed ratios
+    if abs(log_factor) > CONTRADICTION * np.hypot(PAD_SPREAD, np.sqrt(variance)):
+        return None
+    return expected * np.exp(log_factor * PAD_SPREAD**2 / (PAD_SPREAD**2 + variance))
 
 
 def _n_levels(options: LocalizerSettings, fibres: int) -> int:
@@ -312,25 +373,22 @@ def _calibrate_scales(
     levels: int,
     on_progress: OnProgress,
     n_trained: int | None,
-) -> tuple[LocalizerModel, bool]:
+) -> LocalizerModel:
     """Scale the expected errors of members to their errors on presses that were not used in training.
 
     This corrects the weights of the members: the Bayesian localizer is overconfident after few or badly placed presses,
     since training presses are augmented by the response that it predicts them with. After `n_trained` presses, the mean
-    of the scales is known from other pads, and these presses determine the ratios between members alone, unless they
-    contradict it.
-
-    Returns:
-        The model, and whether the experience with other pads was used.
+    of the scales is known from other pads, and these presses determine the ratios between members alone.
     """
     targets = (positions_mm - model.scaler.origin_mm) / model.scaler.scale_mm
     subsets = [subset for level in range(levels) for subset in failure_subsets(model.fibres, level, SCALE_SUBSETS)]
 
-    # 1. Ratios of error to expected error, with the names of the networks that answer together
-    group_ratios: list[tuple[list[str], Array]] = []
+    # 1. Ratios of error to expected error of each member, with the expected ratio as the prior
+    member_ratios: dict[str, list[Array]] = {}
     first = int(len(moments) > 1)
     for n_complete, presses in enumerate(moments, first):
         on_progress(n_complete - first, len(moments), "expected errors")
+        growth = Experience.at(n_complete).growth(n_trained) if n_trained else 1.0
         rows = np.flatnonzero(count_complete(presses.complete) == n_complete)  # the next press may cut off some
         names = active_networks(model.networks, n_complete, presses.complete.shape[1], bool(model.bayes))
         for failed in subsets if len(rows) else ():
@@ -339,29 +397,17 @@ def _calibrate_scales(
             outputs = predict_members(model.networks, *inputs, *model.corrected)
             predicted, log_error = (half[:, :, :2] for half in np.split(outputs, 2, axis=2))
             expected = np.exp(np.clip(log_error, MIN_LOG_ERROR, MAX_LOG_ERROR)).mean(axis=2)
-            group_ratios.append((names, (np.abs(predicted - targets[rows]).mean(axis=2) / expected).mean(axis=1)))
+            ratio = (np.abs(predicted - targets[rows]).mean(axis=2) / expected).mean(axis=1)
+            if n_trained:
+                ratio *= growth / ratio.mean()
+            ratio = (PRIOR_COUNT * growth + len(positions_mm) * ratio) / (PRIOR_COUNT + len(positions_mm))
+            for name in names:
+                members = 1 if name == RESIDUAL else len(model.networks[name]["last.b"])
+                member_ratios.setdefault(name, []).append(ratio[:members])
+                ratio = ratio[members:]
 
-    # 2. Comparison with other pads
-    presses, expected_ratio, is_typical = len(positions_mm), 1.0, False
-    if n_trained:
-        growth = 1 + DOUBLE_ERROR_PRESSES / n_trained
-        excess = np.mean([ratio.mean() for _, ratio in group_ratios]) / growth - 1
-        is_typical = bool(abs(excess) < CONTRADICTION * RATIO_SHAPE**-0.5 / np.sqrt(presses))
-        if is_typical:
-            expected_ratio = growth
-            group_ratios = [(names, growth * ratio / ratio.mean()) for names, ratio in group_ratios]
-
-    # 3. Scale of each member, with its expected error as the prior
-    ratios: dict[str, list[Array]] = {}
-    for names, ratio in group_ratios:
-        for name in names:
-            members = 1 if name == RESIDUAL else len(model.networks[name]["last.b"])
-            ratios.setdefault(name, []).append(ratio[:members])
-            ratio = ratio[members:]
-    log_scales = {
-        name: np.log((PRIOR_COUNT * expected_ratio + presses * np.mean(ratio, axis=0)) / (PRIOR_COUNT + presses))
-        for name, ratio in ratios.items()
-    }
+    # 2. Scale of each member
+    log_scales = {name: np.log(np.mean(ratios, axis=0)) for name, ratios in member_ratios.items()}
 
     def scaled(name: str, weights: Weights) -> Weights:
         if name not in log_scales:
@@ -372,7 +418,7 @@ def _calibrate_scales(
         return {**weights, "last.b": bias}
 
     networks = {name: scaled(name, weights) for name, weights in model.networks.items()}
-    return replace(model, networks=networks, residual_network=scaled(RESIDUAL, model.residual_network)), is_typical
+    return replace(model, networks=networks, residual_network=scaled(RESIDUAL, model.residual_network))
 
 
 def check_trained(

@@ -30,7 +30,7 @@ MOMENT_SETS = 3  # maximum sets of failed fibres of a size at each moment
 NO_MOMENTS: dict[str, Any] = {"by_moment": [], "focus": {}}
 TRAINED_OUT = 0.5  # share of the steps of a training from which on errors are within 5 % of those of a complete one
 PRIOR_PRESSES = 100  # weight of the experience with other pads in radii, in presses
-RATIO_SHAPE = 2.3
+RATIO_SHAPE = 2.1
 """Shape of the gamma distribution of the ratio of distance to expected radius on other pads; it does not depend on the
 pad, the moment or the failed fibres."""
 N_PRIOR = 200  # quantiles that represent this distribution
