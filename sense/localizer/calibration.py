@@ -325,7 +325,7 @@ def calibrate_uncertainty(
         shares = np.arange(levels) / model.fibres
         experience = [Experience.at(n_complete) for n_complete in range(1, len(moments) + 1)]
         expected = np.array([[each.ratio(n_trained, share) for share in shares] for each in experience])
-        prior_ratios = _adapt_ratios(expected, predictions, positions_mm)
+        prior_ratios = adapt_ratios(expected, predictions, positions_mm)
     factors = [
         [
             conformal(of_level, positions_mm, measures, None if prior_ratios is None else prior_ratios[moment, level])
@@ -339,7 +339,7 @@ def calibrate_uncertainty(
     return replace(model, interval_factors=np.clip(factors, 1e-6, 1e6), radii_presses=n_presses)
 
 
-def _adapt_ratios(
+def adapt_ratios(
     expected: Array, predictions: Sequence[Sequence[Sequence[Localization]]], positions_mm: Array
 ) -> Array | None:
     """Adapt the mean ratios of distance to radius of other pads to a pad; None if its presses contradict them.

@@ -4,10 +4,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.special import gammaincinv
 
 from padforge.sense import Recording
+from padforge.sense.localizer.calibration import RELEASE, TOUCH, adapt_ratios
 from padforge.sense.localizer.evaluation import (
     PRIOR_PRESSES,
+    RATIO_SHAPE,
     conformal,
     error_row,
     errors_by_loss,
@@ -118,10 +121,10 @@ def make_localization(ratios: np.ndarray) -> Localization:
 @pytest.mark.parametrize("presses", [15, 30, 1000])
 def test_radii_of_few_presses_differ_less_from_draw_to_draw(presses: int) -> None:
     """Ratios as other pads have them, of the mean that is known: shares are right, and no lottery."""
-    rng, many = np.random.default_rng(presses), np.random.default_rng(0).gamma(2.3, 0.67 / 2.3, 20_000)
+    rng, many = np.random.default_rng(presses), np.random.default_rng(0).gamma(RATIO_SHAPE, 0.67 / RATIO_SHAPE, 20_000)
     shares: dict[float | None, list[float]] = {None: [], 0.67: []}
     for _ in range(100):
-        found = [make_localization(rng.gamma(2.3, 0.67 / 2.3, presses))]
+        found = [make_localization(rng.gamma(RATIO_SHAPE, 0.67 / RATIO_SHAPE, presses))]
         for prior in shares:
             shares[prior].append(float((many <= conformal(found, np.zeros((presses, 2)), None, prior)[2]).mean()))
     assert np.mean(shares[0.67]) == pytest.approx(0.9, abs=0.01)
@@ -134,7 +137,27 @@ def test_prior_counts_as_so_many_presses() -> None:
     spread, r50, r90 = conformal([far], np.zeros((PRIOR_PRESSES, 2)), None, 1.0)
     assert r90 == pytest.approx(10.0)
     assert 2.0 < r50 < 10.0
-    assert spread == pytest.approx(np.sqrt((100 + 1 + 1 / 2.3) / 2), rel=0.01)
+    assert spread == pytest.approx(np.sqrt((100 + 1 + 1 / RATIO_SHAPE) / 2), rel=0.01)
+
+
+@pytest.mark.parametrize(("presses", "factor", "low", "high"), [(5000, 1.2, 1.18, 1.22), (10, 1.2, 1.0, 1.15)])
+def test_ratios_of_other_pads_are_adapted_to_presses_as_far_as_these_are_many(
+    presses: int, factor: float, low: float, high: float
+) -> None:
+    expected = np.array([[0.7, 0.6], [0.9, 0.8]])
+    quantiles = gammaincinv(RATIO_SHAPE, (np.arange(presses) + 0.5) / presses) / RATIO_SHAPE
+    found = [[[make_localization(factor * mean * quantiles)] for mean in of_moment] for of_moment in expected]
+    adapted = adapt_ratios(expected, found, np.zeros((presses, 2)))
+    assert adapted is not None
+    assert ((adapted >= low * expected) & (adapted <= high * expected)).all()
+    contradicting = [[[make_localization(3 * quantiles)] for _ in of_moment] for of_moment in expected]
+    assert adapt_ratios(expected, contradicting, np.zeros((presses, 2))) is None
+
+
+def test_errors_grow_more_after_few_presses_at_the_end_of_a_press_and_with_all_fibres() -> None:
+    assert RELEASE.growth(300) > RELEASE.growth(3000) > 1
+    assert RELEASE.growth(300) > TOUCH.growth(300)
+    assert RELEASE.ratio(300, 3 / 8) < RELEASE.ratio(300, 0) == RELEASE.mean_ratio
 
 
 def test_radii_of_few_presses_say_so() -> None:
