@@ -34,7 +34,7 @@ SIMULATED = 1275
 TEST = 400
 """Presses that are not trained on, and on which errors are measured."""
 MAX_FAILURES = 3
-EPOCHS = (6, 12, 23, 45, 90, 180, 360)
+EPOCHS = (11, 22, 45, 90, 180)
 WAYS: dict[str, dict[str, Any]] = {
     "as by default": {},
     "networks of 128 x 4": {"hidden": 128, "layers": 4},
