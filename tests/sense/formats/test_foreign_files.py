@@ -124,7 +124,7 @@ def test_import_csv_says_what_is_left_out(tmp_path: Path) -> None:
         return load(tmp_path, table(lines=lines)).source["note"]
 
     assert note([*rows(), "7.8,1.8"]) == "line 158, the last, is cut off and left out"
-    assert note([*rows()[:70], rows()[70] + rows()[71], *rows()[72:]]) == "line 72 is left out: 9 values, expected 5"
+    assert note([*rows()[:70], rows()[70] + ",1", *rows()[71:]]) == "line 72 is left out: 6 values, expected 5"
     back = rows()
     back[70] = "0.000," + back[70].split(",", 1)[1]
     assert note(back) == "line 72 is left out: times go back"
@@ -133,6 +133,33 @@ def test_import_csv_says_what_is_left_out(tmp_path: Path) -> None:
     assert (
         load(tmp_path, table(lines=[*rows()[:30], "1.500,#N/A,ovf,inf,1.8", *rows()[31:]])).source.get("note") is None
     )
+
+
+@pytest.mark.parametrize("cut", [6, 9, 12, 13, 20, None])
+@pytest.mark.parametrize("unit", ["s", "ms"])
+def test_import_csv_reads_the_line_that_follows_a_torn_one_in_the_same_line(
+    tmp_path: Path, cut: int | None, unit: str
+) -> None:
+    lines = rows(lambda i: f"{TIMES[i]:.3f}" if unit == "s" else str(10000 + 50 * i))
+    lines[70:72] = [lines[70][:cut] + lines[71]]
+    recording = load(tmp_path, table(lines=lines), f"time=t:{unit},fibres=c*")
+    np.testing.assert_allclose(recording.readings, np.delete(VOLTS, 70, axis=0), atol=1e-9)
+    np.testing.assert_allclose(np.diff(recording.times_s)[69:71], [0.1, 0.05])
+    note = "line 72 is left out up to where another line begins in it: one was cut off"
+    assert str(recording.source["note"]).startswith(note)
+
+
+def test_import_csv_leaves_out_a_torn_line_whose_continuation_is_uncertain(tmp_path: Path) -> None:
+    def note(lines: list[str], header: str = "t,c0,c1,c2,c3") -> str:
+        return load(tmp_path, table(header, lines)).source["note"]
+
+    left_out = "line 72 is left out: 6 values, expected 5"
+    late = rows()
+    late[70:72] = [late[70][:12] + late[80]]  # of a later time than the next line
+    assert note(late) == left_out
+    last = [",".join([*line.split(",")[1:], line.split(",")[0]]) for line in rows()]
+    last[70:72] = [last[70][:9] + last[71]]
+    assert note(last, "c0,c1,c2,c3,t") == left_out
 
 
 def test_import_csv_refuses_two_runs_by_their_line(tmp_path: Path) -> None:
