@@ -8,15 +8,14 @@ is a run of equal positions; if no line or every line has one, presses are detec
 
 import csv
 import re
-from collections.abc import Iterator, Sequence
-from itertools import repeat
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
 from padforge.common.files import atomic_file, reraise_write_error
 from padforge.common.validation import InputError, naming_file, short_repr
-from padforge.sense.arrays import MAX_FIBRES, Array
+from padforge.sense.arrays import MAX_FIBRES
 from padforge.sense.formats.annotations import check_export
 from padforge.sense.formats.assembly import MEASURES, Arrays, ForeignArrays, assemble_recording
 from padforge.sense.formats.columns import (
@@ -30,7 +29,7 @@ from padforge.sense.formats.columns import (
     read_entries,
 )
 from padforge.sense.recording.recording import Recording
-from padforge.sense.recording.tables import Table, read_table
+from padforge.sense.recording.tables import UNKNOWN, Table, read_table
 
 QUANTITIES = ("time", "rate", "fibres", "x", "y", "depth", "reached", "force", "press")
 """Quantities that a column may hold."""
@@ -164,18 +163,16 @@ def _exported_entries(table: Table) -> list[ColumnEntry]:
 
 
 def export_csv(recording: Recording, path: str | Path) -> None:
-    """Write a recording as CSV, atomically; importing it gives the same numbers.
-
-    Args:
-        recording: recording to write.
-        path: path of the file, which is replaced.
-
-    Raises:
-        InputError: the file cannot be written.
-    """
+    """Write a recording as CSV, atomically; importing it gives the same numbers. A file at the path is replaced."""
     path = check_export(recording, path)
     measures = {name: getattr(recording, MEASURES[quantity]) for name, quantity in _MEASURED.items()}
     measures = {name: values for name, values in measures.items() if not np.isnan(values).all()}
+    positions = np.where(np.isnan(recording.presses_mm), UNKNOWN, recording.presses_mm)
+    of_press = np.column_stack([positions, *measures.values()])
+    of_press = np.vstack([of_press, np.full_like(of_press[:1], np.nan)])  # the last row is that of no press
+    press = np.full(len(recording.times_s), -1)
+    for number, span in enumerate(zip(recording.down_command, recording.up_command, strict=True)):
+        press[slice(*span)] = number
     with (
         reraise_write_error(path),
         atomic_file(path) as temporary,
@@ -183,23 +180,5 @@ def export_csv(recording: Recording, path: str | Path) -> None:
     ):
         writer = csv.writer(file)
         writer.writerow(["time_s", *(f"fibre_{i}_v" for i in range(recording.fibres)), "x_mm", "y_mm", *measures])
-        press_cells = _press_cells(recording, list(measures.values()))
-        for time, volts, press in zip(recording.times_s, recording.readings, press_cells, strict=True):
-            writer.writerow([float(time), *_cells(volts), *press])
-
-
-def _press_cells(recording: Recording, measures: list[Array]) -> Iterator[list[float | str]]:
-    """Yield the cells of position and measures of each reading; they are empty while the pad is not pressed."""
-    idle: list[float | str] = [""] * (2 + len(measures))
-    end = 0
-    of_presses = zip(recording.presses_mm, *measures, recording.down_command, recording.up_command, strict=True)
-    for (x, y), *press_measures, down, up in of_presses:
-        yield from repeat(idle, int(down) - end)
-        cells = ["?", "?"] if np.isnan(x) else [float(x), float(y)]
-        end = int(up)
-        yield from repeat(cells + _cells(press_measures), end - int(down))
-    yield from repeat(idle, len(recording.times_s) - end)
-
-
-def _cells(values: "np.ndarray | list") -> list[float | str]:
-    return ["" if value != value else value for value in np.asarray(values).tolist()]  # NaN is missing
+        for row in np.column_stack([recording.times_s, recording.readings, of_press[press]]).tolist():
+            writer.writerow(["" if value != value else "?" if value == UNKNOWN else value for value in row])
