@@ -102,11 +102,10 @@ def import_bag(path: str | Path, columns: str = "", presses: Arrays = ()) -> Rec
     with np.errstate(all="ignore"):  # damaged numbers are refused later
         if columns:
             return _import_mapped(path, columns, presses)
-        check_no_presses(path, presses)
-        return _import_exported(path)
+        return _import_exported(path, presses)
 
 
-def _import_exported(path: Path) -> Recording:
+def _import_exported(path: Path, presses: Arrays) -> Recording:
     """Read an exported bag: the exact recording if all messages agree with it, otherwise that of the messages."""
     number_topics = (ros.READINGS, ros.PRESSED, ros.PLACE, ros.REACHED, ros.FORCE)
     raw, types = read_bag(path, {*number_topics, ros.RECORDING}.__contains__)
@@ -117,6 +116,7 @@ def _import_exported(path: Path) -> Recording:
         )
     notes = []
     with naming_file(path):
+        check_no_presses(presses)
         for name, topic in raw.items():
             if topic.msgtype != ros.TOPICS[name].msgtype:
                 raise InputError(f"{name} is of {short_repr(topic.msgtype)}, expected {ros.TOPICS[name].msgtype}")

@@ -17,7 +17,7 @@ from padforge.sense.formats.csv_recording import read_presses
 from padforge.sense.formats.import_export import import_file
 from padforge.sense.recording.doubts import find_doubts
 
-from .foreign import array, make, pose, write_bag, write_ros1_bag
+from .foreign import array, header, make, pose, write_bag, write_ros1_bag
 
 N = 156
 TIMES = np.arange(N) / 20
@@ -232,11 +232,11 @@ def test_presses_of_a_table_of_their_own(tmp_path: Path) -> None:
     begin = np.flatnonzero(np.diff(PRESSED, prepend=0) == 1)
     lines = [f"{TIMES[i]:.3f},{SPOTS[i, 0]},{SPOTS[i, 1]},0.6,2.5" for i in begin]
     (tmp_path / "lab.csv").write_text(table())
-    for header, mapping in (
+    for names, mapping in (
         ("down_s,x_mm,y_mm,duration_s,force_n", ""),
         ("at,px,py,for,f", "down=at,duration=for,x=px,y=py,force=f"),
     ):
-        (tmp_path / "presses.csv").write_text(table(header, [*lines, "99,0,0,0.6,2.5"]))
+        (tmp_path / "presses.csv").write_text(table(names, [*lines, "99,0,0,0.6,2.5"]))
         recording = import_file(tmp_path / "lab.csv", MAPPING, presses=tmp_path / "presses.csv", press_columns=mapping)
         check(recording)
         assert recording.down_command.tolist() == begin.tolist()
@@ -404,6 +404,28 @@ def test_import_bag_reads_fields_of_messages(tmp_path: Path) -> None:
     np.testing.assert_allclose(recording.presses_mm[4], [0, 5], atol=1e-9)
     with pytest.raises(InputError, match=r"'position\.q' is no field"):
         import_bag(path, "fibres=/all.position.q")
+
+
+def test_import_bag_finds_a_position_below_other_fields(tmp_path: Path) -> None:
+    still = make("TwistWithCovariance", make("Twist", *[make("Vector3", 0.0, 0.0, 0.0)] * 2), np.zeros(36))
+    messages = []
+    for i in range(N):
+        place = make("Pose", make("Point", *SPOTS[i] / 1000, 0.0), make("Quaternion", 0.0, 0.0, 0.0, 1.0))
+        odometry = make("Odometry", header(), "base", make("PoseWithCovariance", place, np.zeros(36)), still)
+        messages += [("/odom", TIMES[i], odometry), ("/skin", TIMES[i], array("Float64MultiArray", VOLTS[i]))]
+    recording = import_bag(write_bag(tmp_path / "bag", messages), "fibres=/skin,positions=/odom")
+    check(recording)
+    np.testing.assert_allclose(recording.presses_mm[4], [0, 5], atol=1e-9)
+
+
+def test_import_bag_refuses_several_numbers_for_one(tmp_path: Path) -> None:
+    channels = [make("ChannelFloat32", "c", np.ones(n, np.float32)) for n in (2, 3)]
+    topics = {"/f": array("Float64MultiArray", np.ones(2)), "/cloud": make("PointCloud", header(), [], channels)}
+    path = write_bag(tmp_path / "bag", [(name, i / 20, topics[name]) for i in range(9) for name in topics])
+    with pytest.raises(InputError, match=r"depth is '/f' of .*MultiArray', name one .* /f.FIELD: .*'data'"):
+        import_bag(path, "fibres=/f.data,depth=/f")
+    with pytest.raises(InputError, match=r"fibres is '/cloud' of .*, name one of its fields as /cloud.FIELD: 'header"):
+        import_bag(path, "fibres=/cloud")
 
 
 def test_import_bag_reads_bags_of_ros_1(tmp_path: Path) -> None:
