@@ -15,7 +15,7 @@ import numpy as np
 
 from padforge.common.files import atomic_file, reraise_write_error
 from padforge.common.validation import InputError, naming_file, short_repr
-from padforge.sense.arrays import MAX_FIBRES
+from padforge.sense.arrays import MAX_FIBRES, Array
 from padforge.sense.formats.annotations import check_export
 from padforge.sense.formats.assembly import MEASURES, Arrays, ForeignArrays, assemble_recording
 from padforge.sense.formats.columns import (
@@ -44,7 +44,7 @@ PRESS_COLUMNS = {
     "force": "force_n",
 }
 """Quantities of a table of presses, and the names of their columns."""
-_MEASURED = {"depth_mm": "depth", "reached_mm": "reached", "force_n": "force"}
+_MEASURED = {PRESS_COLUMNS[quantity]: quantity for quantity in MEASURES}
 
 
 def import_csv(path: str | Path, columns: str = "", encoding: str = "", presses: Arrays = ()) -> Recording:
@@ -90,18 +90,16 @@ def read_presses(path: Path, columns: str = "", encoding: str = "") -> Arrays:
         if "down" not in named or len(named & {"up", "duration"}) != 1:
             allowed = "down (down_s) and one of up (up_s) and duration (duration_s)"
             raise InputError(f"columns are {', '.join(table.names)}, expected {allowed}; --press-columns names others")
-        arrays = {
-            entry.quantity: (entry, values)
-            for entry, values in _read_matched(table, match_columns(entries, table.names))
-        }
-    times = {
-        name: values * (entry.factor or 1.0)
-        for name, (entry, values) in arrays.items()
-        if name in ("down", "up", "duration")
-    }
-    times["up"] = times["up"] if "up" in times else times["down"] + times["duration"]
-    others = [array for name, array in arrays.items() if name not in times]
-    return [*((ColumnEntry(f"{name}_command", name, 1.0), times[name]) for name in ("down", "up")), *others]
+        arrays = {array[0].quantity: array for array in _read_matched(table, match_columns(entries, table.names))}
+
+    def pop_seconds(quantity: str) -> Array:
+        entry, values = arrays.pop(quantity)
+        return values * (entry.factor or 1.0)
+
+    down = pop_seconds("down")
+    up = pop_seconds("up") if "up" in arrays else down + pop_seconds("duration")
+    commands = [(ColumnEntry("down_command", "down", 1.0), down), (ColumnEntry("up_command", "up", 1.0), up)]
+    return [*commands, *arrays.values()]
 
 
 def describe_table(path: Path, encoding: str = "") -> list[str]:

@@ -5,15 +5,15 @@ repairs it.
 """
 
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import replace
-from functools import partial
+from functools import cache, partial
 from heapq import merge
 from itertools import repeat
 from operator import itemgetter
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,9 +36,12 @@ from padforge.sense.formats.columns import (
     parse_columns,
 )
 from padforge.sense.formats.hdf5_mat import check_no_presses
-from padforge.sense.formats.ros_writer import load_typestore, write_mcap
 from padforge.sense.recording.recording import NOTE, Recording
 from padforge.sense.recording.run_directory import STATE_COLUMNS
+
+if TYPE_CHECKING:
+    from rosbags.interfaces import Connection
+    from rosbags.typesys.store import Typestore
 
 SUFFIXES = (".mcap", ".db3", ".bag")
 METADATA = "metadata.yaml"  # a folder with this file is a rosbag2 bag
@@ -50,6 +53,23 @@ _FIELDS = dict.fromkeys(QUANTITIES, "data") | {
 }
 """Numbers of a message that are a quantity, by the paths that std_msgs and geometry_msgs have."""
 _Arrays = list[tuple[ColumnEntry, NDArray[Any]]]
+
+
+def load_typestore(purpose: str) -> "Typestore":
+    """Return the message definitions of ROS 2; raise InputError, naming the purpose, if rosbags is not installed."""
+    try:
+        import rosbags.typesys  # noqa: F401
+    except ImportError as error:
+        raise InputError(f"{purpose} needs rosbags: pip install 'padforge[formats]'") from error
+    return _typestore()
+
+
+@cache
+def _typestore() -> "Typestore":
+    """Return one store for all files, since it compiles code for every type of message."""
+    from rosbags.typesys import Stores, get_typestore
+
+    return get_typestore(Stores.ROS2_HUMBLE)
 
 
 def read_bag(
@@ -315,5 +335,39 @@ def export_bag(
         *(zip(repeat(topic), stamps[topic].tolist(), messages[topic]) for topic in messages), key=itemgetter(1)
     )
     with reraise_write_error(path), atomic_files(path.parent) as folder:
-        bag = write_mcap(folder / f"{UNFINISHED}{path.stem}", store, in_order)
+        bag = _write_mcap(folder / f"{UNFINISHED}{path.stem}", store, in_order)
         bag.replace(folder / path.name)
+
+
+def _write_mcap(folder: Path, store: "Typestore", messages: Iterable[tuple[str, int, memoryview]]) -> Path:
+    """Write messages (topic, stamp in ns, CDR) as a rosbag2 folder, and return its .mcap file."""
+    from rosbags.rosbag2 import StoragePlugin, Writer
+
+    connections: dict[str, Connection] = {}
+    with Writer(folder, version=8, storage_plugin=StoragePlugin.MCAP) as writer:
+        for topic, stamp, message in messages:
+            if topic not in connections:
+                msgtype, description, _ = ros.TOPICS[topic]
+                writer.set_custom_data(topic, description)
+                options = {"typestore": store, "offered_qos_profiles": [_qos(is_latched=topic == ros.RECORDING)]}
+                connections[topic] = writer.add_connection(topic, msgtype, **options)
+            writer.write(connections[topic], stamp, message)
+    return folder / f"{folder.name}.mcap"
+
+
+def _qos(is_latched: bool) -> Any:
+    """Return a quality of service; subscribers that connect later get the last message of a latched topic."""
+    from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
+
+    never = QosTime(2147483647, 4294967295)
+    return Qos(
+        history=QosHistory.KEEP_LAST,
+        depth=1 if is_latched else 10,
+        reliability=QosReliability.RELIABLE,
+        durability=QosDurability.TRANSIENT_LOCAL if is_latched else QosDurability.VOLATILE,
+        deadline=never,
+        lifespan=never,
+        liveliness=QosLiveliness.AUTOMATIC,
+        liveliness_lease_duration=never,
+        avoid_ros_namespace_conventions=False,
+    )
