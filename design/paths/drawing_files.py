@@ -5,6 +5,7 @@ import io
 import re
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from xml.etree import ElementTree
@@ -14,7 +15,7 @@ import numpy as np
 
 from padforge.common.files import check_file, read_bytes
 from padforge.common.validation import InputError, short_repr
-from padforge.design.morphology import Array, Ints
+from padforge.design.morphology import Array
 
 if TYPE_CHECKING:
     from ezdxf.path import Path as BezierPath
@@ -87,59 +88,40 @@ def _is_pad(curve: DrawnCurve) -> bool:
     return "pad" in (group.lower() for group in curve.groups)
 
 
-def _join(curves: list[DrawnCurve], tolerance: float) -> Iterator[DrawnCurve]:
-    """Join curves whose ends coincide or, where they coincide with no other, are within the tolerance."""
+def _join(curves: Sequence[DrawnCurve], tolerance: float) -> Iterator[DrawnCurve]:
+    """Join curves whose ends are within the tolerance, in units of the drawing."""
+    from ezdxf import edgeminer
+
     if not curves:
         return
-    # 1. end 2 k is the start of curve k, end 2 k + 1 its end: which other end is each one joined to?
-    ends = np.array([curve.points[end] for curve in curves for end in (0, -1)])
-    coincident = 1e-6 * max(float(np.ptp(ends, axis=0).max()), 1e-9)  # relative to the size of the drawing
-    partners = _pair_ends(ends, np.arange(len(ends)), coincident, curves)
-    gaps = _pair_ends(ends, np.setdiff1d(np.arange(len(ends)), list(partners)), tolerance, curves)
-    partners |= gaps
-    # 2. walk from every free end to the other end of its chain
-    remaining = set(range(len(curves)))
-    for start in range(len(ends)):
-        if start in partners or start // 2 not in remaining:
-            continue
-        chain: list[int] = []
-        end: int | None = start
-        while end is not None:
-            chain.append(end)
-            remaining.discard(end // 2)
-            end = partners.get(end ^ 1)
-        first, last = curves[chain[0] // 2], curves[chain[-1] // 2]
-        pieces = [curves[end // 2].points[:: 1 - 2 * (end % 2)].copy() for end in chain]
-        for before, after, end in zip(pieces, pieces[1:], chain[1:], strict=False):
-            if end in gaps:
-                before[-1] = after[0] = (before[-1] + after[0]) / 2
+    size = float(np.ptp(np.vstack([curve.points[[0, -1]] for curve in curves]), axis=0).max())
+    tolerance = min(tolerance, 1e-3 * size)  # of a drawing in m whose unit is not stated
+    edges = [
+        edgeminer.make_edge(curve.points[0], curve.points[-1], payload=number) for number, curve in enumerate(curves)
+    ]
+    deposit = edgeminer.Deposit(edges, gap_tol=tolerance)
+
+    def first_curve(chain: "Sequence[edgeminer.Edge]") -> int:
+        return min(edge.payload for edge in chain)
+
+    for curve in curves:
+        for end in (0, -1):
+            if deposit.degree(curve.points[end]) > 2:
+                x, y = curve.ends[end]
+                raise InputError(f"{curve.name}: more than two curves end at ({x:g}, {y:g}) in the drawing")
+    for chain in sorted(edgeminer.find_all_simple_chains(deposit), key=first_curve):
+        if len(chain) > 1 and edgeminer.is_loop(chain, gap_tol=tolerance):
+            name = curves[first_curve(chain)].name
+            raise InputError(f"{name}: part of a ring, or drawn twice, expected curves from border to border")
+        if chain[0].payload > chain[-1].payload:
+            chain = edgeminer.reverse_chain(chain)
+        first, last = curves[chain[0].payload], curves[chain[-1].payload]
+        pieces = [curves[edge.payload].points[:: -1 if edge.is_reverse else 1].copy() for edge in chain]
+        for before, after in pairwise(pieces):
+            before[-1] = after[0] = (before[-1] + after[0]) / 2
         name = first.name if len(chain) == 1 else f"{first.name} to {last.name}"
-        drawn_ends = np.array([first.ends[chain[0] % 2], last.ends[1 - chain[-1] % 2]])
-        yield DrawnCurve(name, np.vstack(pieces), drawn_ends, first.groups)
-    if remaining:
-        name = curves[min(remaining)].name
-        raise InputError(f"{name}: part of a ring, or drawn twice, expected curves from border to border")
-
-
-def _pair_ends(ends: Array, candidates: Ints, tolerance: float, curves: Sequence[DrawnCurve]) -> dict[int, int]:
-    """Return, for each candidate that has one, the other end within the tolerance."""
-    from scipy.spatial import KDTree
-
-    if len(candidates) < 2:
-        return {}
-    points = ends[candidates]
-    nearest = KDTree(points).query(points, k=min(3, len(points)), distance_upper_bound=tolerance)
-    partners: dict[int, int] = {}
-    for end, row in zip(candidates.tolist(), zip(*(values.tolist() for values in nearest), strict=True), strict=True):
-        close = [int(candidates[at]) for distance, at in zip(*row, strict=True) if distance <= tolerance]
-        close = [other for other in close if other != end]
-        if len(close) > 1:
-            curve = curves[end // 2]
-            x, y = curve.ends[end % 2]
-            raise InputError(f"{curve.name}: more than two curves end at ({x:g}, {y:g}) in the drawing")
-        if close:
-            partners[end] = close[0]
-    return partners
+        ends = np.array([first.ends[int(chain[0].is_reverse)], last.ends[int(not chain[-1].is_reverse)]])
+        yield DrawnCurve(name, np.vstack(pieces), ends, first.groups)
 
 
 def _shorten(error: Exception) -> str:
@@ -238,24 +220,18 @@ def _iterate_shapes(
 def _flatten_shape(shape: Any) -> Iterator[tuple[Array, bool]]:
     """Flatten every part of a shape to a polyline, and say whether it is closed."""
     from ezdxf.path import Path as BezierPath
-    from svgelements import Close, CubicBezier, Move, Path, QuadraticBezier
+    from svgelements import Close, Move, Path
 
     outline: Any = abs(Path(shape))
     outline.approximate_arcs_with_cubics()
     for part in outline.as_subpaths():
-        segments: list[Any] = [segment for segment in part if not isinstance(segment, Move)]
-        if not segments:
-            continue
         path = BezierPath(tuple(part[0].end))
+        segments: list[Any] = [segment for segment in part if not isinstance(segment, Move)]
         for segment in segments:
-            end = segment.end
-            if isinstance(segment, CubicBezier):
-                path.curve4_to(tuple(end), tuple(segment.control1), tuple(segment.control2))
-            elif isinstance(segment, QuadraticBezier):
-                path.curve3_to(tuple(end), tuple(segment.control))
-            elif end is not None:
-                path.line_to(tuple(end))
-        yield _flatten(path), isinstance(segments[-1], Close)
+            *controls, end = [tuple(point) for point in list(segment)[1:]]
+            (path.line_to, path.curve3_to, path.curve4_to)[len(controls)](end, *controls)
+        if segments:
+            yield _flatten(path), isinstance(segments[-1], Close)
 
 
 def read_dxf(path: Path) -> DrawnPlan:

@@ -245,12 +245,11 @@ def _check_fit(line: Array, path: _FibrePath, layout: Layout, tolerance_mm: floa
     """Compare a fibre (n, 2), grid units, with its path, and refuse a difference beyond the tolerance."""
     family = layout.family(path.fibre)
     fitted = (line - np.array(layout.extent) / 2) * layout.unit_mm
-    drawn = path.points if family == 0 else path.points[:, ::-1]
-    to_fitted = shapely.distance(shapely.points(drawn), shapely.LineString(fitted))
-    to_drawn = shapely.distance(shapely.points(fitted), shapely.LineString(drawn))
-    error_mm = float(max(to_fitted.max(), to_drawn.max()))
+    drawn = shapely.LineString(path.points if family == 0 else path.points[:, ::-1])
+    error_mm = float(shapely.hausdorff_distance(shapely.LineString(fitted), drawn))
     if error_mm > max(tolerance_mm, path.error_mm) * 1.05:
-        position = _format_position(fitted[int(np.argmax(to_drawn))], 0)
+        farthest = int(np.argmax(shapely.distance(shapely.points(fitted), drawn)))
+        position = _format_position(fitted[farthest], 0)
         error = f"{MAX_KNOTS} knots keep within {error_mm:.3g} mm of it, at {position}"
         raise InputError(f"{path.name}: {error}; allowed is {tolerance_mm:g} mm (--tolerance-mm)")
     return ImportedFibre(path.name, path.error_mm, error_mm)

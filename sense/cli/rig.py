@@ -143,7 +143,7 @@ def record(
 
 def _bag_path(target: Path, dry_run: bool, resume: bool) -> Path:
     """Return the path of the bag of a recording; raise InputError if it cannot be written."""
-    from padforge.sense.formats.ros_writer import load_typestore
+    from padforge.sense.formats.ros_recording import load_typestore
 
     if dry_run:
         raise InputError("--mcap exports what is recorded, and --dry-run keeps nothing")

@@ -103,32 +103,29 @@ def _parse_entry(text: str, quantities: Sequence[str]) -> ColumnEntry:
             f"where QUANTITY is one of {', '.join(quantities)}"
         )
     if quantity == "rate":
-        return ColumnEntry(quantity, name, _parse_rate(name))
+        rate_hz = _parse_number(name.lower().removesuffix("hz"))
+        if rate_hz <= 0:
+            raise InputError(f"rate is {short_repr(name)}, allowed is a number of readings a second")
+        return ColumnEntry(quantity, name, rate_hz)
     return ColumnEntry(quantity, name, None if unit is None else _parse_unit(quantity, unit))
-
-
-def _parse_rate(text: str) -> float:
-    try:
-        rate_hz = float(text.lower().removesuffix("hz"))
-    except ValueError:
-        rate_hz = 0.0
-    if not (isfinite(rate_hz) and rate_hz > 0):
-        raise InputError(f"rate is {short_repr(text)}, allowed is a number of readings a second")
-    return rate_hz
 
 
 def _parse_unit(quantity: str, unit: str) -> float:
     units = UNITS[quantity]
-    if unit in units:
-        return units[unit]
-    try:
-        factor = float(unit) if unit.isascii() and "_" not in unit else 0.0
-    except ValueError:
-        factor = 0.0
-    if not isfinite(factor) or factor == 0 or quantity == "press":
+    factor = units.get(unit) or _parse_number(unit)
+    if factor == 0 or quantity == "press":
         allowed = f"{', '.join(units)} or a factor" if units else "none"
         raise InputError(f"unit of {quantity} is {short_repr(unit)}, allowed is {allowed}")
     return factor
+
+
+def _parse_number(text: str) -> float:
+    """Return a finite number, or 0 for any other text."""
+    try:
+        number = float(text) if text.isascii() and "_" not in text else 0.0
+    except ValueError:
+        return 0.0
+    return number if isfinite(number) else 0.0
 
 
 def matches(name: str, pattern: str) -> bool:

@@ -8,8 +8,7 @@ is a run of equal positions; if no line or every line has one, presses are detec
 
 import csv
 import re
-from collections.abc import Iterator, Sequence
-from itertools import repeat
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -30,7 +29,7 @@ from padforge.sense.formats.columns import (
     read_entries,
 )
 from padforge.sense.recording.recording import Recording
-from padforge.sense.recording.tables import Table, read_table
+from padforge.sense.recording.tables import UNKNOWN, Table, read_table
 
 QUANTITIES = ("time", "rate", "fibres", "x", "y", "depth", "reached", "force", "press")
 """Quantities that a column may hold."""
@@ -45,7 +44,7 @@ PRESS_COLUMNS = {
     "force": "force_n",
 }
 """Quantities of a table of presses, and the names of their columns."""
-_MEASURED = {"depth_mm": "depth", "reached_mm": "reached", "force_n": "force"}
+_MEASURED = {PRESS_COLUMNS[quantity]: quantity for quantity in MEASURES}
 
 
 def import_csv(path: str | Path, columns: str = "", encoding: str = "", presses: Arrays = ()) -> Recording:
@@ -91,18 +90,16 @@ def read_presses(path: Path, columns: str = "", encoding: str = "") -> Arrays:
         if "down" not in named or len(named & {"up", "duration"}) != 1:
             allowed = "down (down_s) and one of up (up_s) and duration (duration_s)"
             raise InputError(f"columns are {', '.join(table.names)}, expected {allowed}; --press-columns names others")
-        arrays = {
-            entry.quantity: (entry, values)
-            for entry, values in _read_matched(table, match_columns(entries, table.names))
-        }
-    times = {
-        name: values * (entry.factor or 1.0)
-        for name, (entry, values) in arrays.items()
-        if name in ("down", "up", "duration")
-    }
-    times["up"] = times["up"] if "up" in times else times["down"] + times["duration"]
-    others = [array for name, array in arrays.items() if name not in times]
-    return [*((ColumnEntry(f"{name}_command", name, 1.0), times[name]) for name in ("down", "up")), *others]
+        arrays = {array[0].quantity: array for array in _read_matched(table, match_columns(entries, table.names))}
+
+    def pop_seconds(quantity: str) -> Array:
+        entry, values = arrays.pop(quantity)
+        return values * (entry.factor or 1.0)
+
+    down = pop_seconds("down")
+    up = pop_seconds("up") if "up" in arrays else down + pop_seconds("duration")
+    commands = [(ColumnEntry("down_command", "down", 1.0), down), (ColumnEntry("up_command", "up", 1.0), up)]
+    return [*commands, *arrays.values()]
 
 
 def describe_table(path: Path, encoding: str = "") -> list[str]:
@@ -164,18 +161,16 @@ def _exported_entries(table: Table) -> list[ColumnEntry]:
 
 
 def export_csv(recording: Recording, path: str | Path) -> None:
-    """Write a recording as CSV, atomically; importing it gives the same numbers.
-
-    Args:
-        recording: recording to write.
-        path: path of the file, which is replaced.
-
-    Raises:
-        InputError: the file cannot be written.
-    """
+    """Write a recording as CSV, atomically; importing it gives the same numbers. A file at the path is replaced."""
     path = check_export(recording, path)
     measures = {name: getattr(recording, MEASURES[quantity]) for name, quantity in _MEASURED.items()}
     measures = {name: values for name, values in measures.items() if not np.isnan(values).all()}
+    positions = np.where(np.isnan(recording.presses_mm), UNKNOWN, recording.presses_mm)
+    of_press = np.column_stack([positions, *measures.values()])
+    of_press = np.vstack([of_press, np.full_like(of_press[:1], np.nan)])  # the last row is that of no press
+    press = np.full(len(recording.times_s), -1)
+    for number, span in enumerate(zip(recording.down_command, recording.up_command, strict=True)):
+        press[slice(*span)] = number
     with (
         reraise_write_error(path),
         atomic_file(path) as temporary,
@@ -183,23 +178,5 @@ def export_csv(recording: Recording, path: str | Path) -> None:
     ):
         writer = csv.writer(file)
         writer.writerow(["time_s", *(f"fibre_{i}_v" for i in range(recording.fibres)), "x_mm", "y_mm", *measures])
-        press_cells = _press_cells(recording, list(measures.values()))
-        for time, volts, press in zip(recording.times_s, recording.readings, press_cells, strict=True):
-            writer.writerow([float(time), *_cells(volts), *press])
-
-
-def _press_cells(recording: Recording, measures: list[Array]) -> Iterator[list[float | str]]:
-    """Yield the cells of position and measures of each reading; they are empty while the pad is not pressed."""
-    idle: list[float | str] = [""] * (2 + len(measures))
-    end = 0
-    of_presses = zip(recording.presses_mm, *measures, recording.down_command, recording.up_command, strict=True)
-    for (x, y), *press_measures, down, up in of_presses:
-        yield from repeat(idle, int(down) - end)
-        cells = ["?", "?"] if np.isnan(x) else [float(x), float(y)]
-        end = int(up)
-        yield from repeat(cells + _cells(press_measures), end - int(down))
-    yield from repeat(idle, len(recording.times_s) - end)
-
-
-def _cells(values: "np.ndarray | list") -> list[float | str]:
-    return ["" if value != value else value for value in np.asarray(values).tolist()]  # NaN is missing
+        for row in np.column_stack([recording.times_s, recording.readings, of_press[press]]).tolist():
+            writer.writerow(["" if value != value else "?" if value == UNKNOWN else value for value in row])

@@ -6,7 +6,8 @@ JSON. The states of an arm are not exported. Other files are read by a mapping (
 """
 
 import json
-from collections.abc import Sequence
+import re
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -36,15 +37,7 @@ CYCLE, DOWN_AT = 40, 20  # readings of a published press, and the one at which t
 
 
 def export_hdf5(recording: Recording, path: str | Path) -> None:
-    """Write a recording as HDF5, atomically; importing it gives the same numbers.
-
-    Args:
-        recording: recording to write.
-        path: path of the file, which is replaced.
-
-    Raises:
-        InputError: the file cannot be written.
-    """
+    """Write a recording as HDF5, atomically; importing it gives the same numbers. A file at the path is replaced."""
     import h5py
 
     path = check_export(recording, path)
@@ -72,14 +65,11 @@ def import_hdf5(path: str | Path, columns: str = "", presses: Arrays = ()) -> Re
     """
     path, columns = check_import(path, columns)
     if columns:
-        entries = [entry._replace(name=entry.name.removeprefix("/")) for entry in parse_columns(columns)]
         with open_hdf5(path) as file:
-            matched = match_columns(entries, file.names)
-            arrays = read_entries(matched, lambda i: file.read(file.names[i]))
-        source = {"kind": "hdf5", "file": path.name, "columns": columns}
-        return assemble_recording(ForeignArrays(path, arrays, source, order_notes(matched)), presses)
-    check_no_presses(path, presses)
+            mapped = _map_arrays(path, "hdf5", columns, "/", file.names, file.read)
+        return assemble_recording(mapped, presses)
     with open_hdf5(path) as file:
+        check_no_presses(presses)
         if (file_format := file.read_text("format")) != FORMAT:
             raise InputError(
                 f"format is {file_format!r}, expected {FORMAT!r}; columns (--columns) say what other datasets hold, "
@@ -109,36 +99,32 @@ def import_mat(path: str | Path, columns: str = "", presses: Arrays = ()) -> Rec
     path, columns = check_import(path, columns)
     content = flatten_variables(load_mat(path, ()))
     with naming_file(path):
+        for name, value in content.items():
+            is_named = not columns or re.search(rf"= */?{re.escape(name)}\b", columns)
+            if is_named and isinstance(value, str) and "only MATLAB" in value:
+                raise InputError(f"{name} is {value}")
         if not columns:
-            if missing := [name for name in ("voltage", "tim") if name not in content]:
-                _refuse_tables(content, list(content))
-                problem = f"has no variable {', '.join(missing)} (found {join_names(sorted(content))})"
-                raise InputError(
-                    f"{problem}; --columns says what others hold, as time=data.t,fibres=data.v or fibres=x[1:5]"
-                )
-            check_no_presses(path, presses)
-            return _import_published(path, content)
-        entries = [
-            entry._replace(name=entry.name.removeprefix("/").replace("/", ".")) for entry in parse_columns(columns)
-        ]
-        _refuse_tables(content, [entry.name.partition(".")[0] for entry in entries])
-        matched = match_columns(entries, names := list(content))
-        arrays = read_entries(matched, lambda i: _matrix(content, names[i]))
-    source = {"kind": "mat", "file": path.name, "columns": columns}
-    return assemble_recording(ForeignArrays(path, arrays, source, order_notes(matched)), presses)
+            return _import_published(path, content, presses)
+        mapped = _map_arrays(path, "mat", columns, ".", list(content), lambda name: _matrix(content, name))
+    return assemble_recording(mapped, presses)
 
 
-def _refuse_tables(content: dict[str, Any], names: Sequence[str]) -> None:
-    """Raise InputError, with advice, if one of these variables is a table of MATLAB."""
-    for name, value in content.items():
-        if name in names and isinstance(value, str) and "only MATLAB" in value:
-            raise InputError(f"{name} is {value}")
+def _map_arrays(
+    path: Path, kind: str, columns: str, separator: str, names: Sequence[str], read: Callable[[str], Array]
+) -> ForeignArrays:
+    """Return the arrays that a mapping names; its names may be paths that begin with a slash."""
+    entries = [
+        entry._replace(name=entry.name.removeprefix("/").replace("/", separator)) for entry in parse_columns(columns)
+    ]
+    matched = match_columns(entries, names)
+    arrays = read_entries(matched, lambda i: read(names[i]))
+    return ForeignArrays(path, arrays, {"kind": kind, "file": path.name, "columns": columns}, order_notes(matched))
 
 
-def check_no_presses(path: Path, presses: Arrays) -> None:
+def check_no_presses(presses: Arrays) -> None:
     """Raise InputError if there is a separate table of presses for a complete recording."""
     if presses:
-        raise InputError(f"{path}: holds presses of its own, expected --columns for readings beside --presses")
+        raise InputError("holds presses of its own, expected --columns for readings beside --presses")
 
 
 def describe_arrays(path: Path) -> list[str]:
@@ -161,7 +147,11 @@ def _first_values(values: Array) -> str:
     return ", begins " + ", ".join(f"{value:.6g}" for value in values.ravel()[:3].tolist())
 
 
-def _import_published(path: Path, content: dict[str, Any]) -> Recording:
+def _import_published(path: Path, content: dict[str, Any], presses: Arrays) -> Recording:
+    if missing := [name for name in ("voltage", "tim") if name not in content]:
+        problem = f"has no variable {', '.join(missing)} (found {join_names(sorted(content))})"
+        raise InputError(f"{problem}; --columns says what others hold, as time=data.t,fibres=data.v or fibres=x[1:5]")
+    check_no_presses(presses)
     voltage, times = _matrix(content, "voltage"), _matrix(content, "tim").ravel()
     n_cycles = len(voltage) // CYCLE if voltage.ndim == 2 else 0
     if n_cycles == 0:

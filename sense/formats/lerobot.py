@@ -5,7 +5,6 @@ has the uniform rate that the format requires, and `observation.time` the measur
 episode. `lerobot.datasets` of https://github.com/huggingface/lerobot (0.6) reads them.
 """
 
-import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -46,9 +45,10 @@ def export_lerobot(recording: Recording, path: Path, annotations: ModelAnnotatio
     """
     path = check_export(recording, path, annotations)
     try:
+        import pandas  # noqa: F401
         import pyarrow  # noqa: F401
     except ImportError as error:
-        raise InputError(f"{path}: LeRobot needs pyarrow: pip install 'padforge[formats]'") from error
+        raise InputError(f"{path}: LeRobot needs {error.name}: pip install 'padforge[formats]'") from error
     check_new_folder(path)
     if not recording.has_position.any():
         raise InputError(f"{path}: no position of a press is known, and a dataset needs what was commanded")
@@ -114,6 +114,7 @@ def _build_columns(
 def _write(
     folder: Path, columns: Mapping[str, _Column], names: Mapping[str, list[str] | None], lengths: Indices, fps: float
 ) -> None:
+    import pandas
     import pyarrow as pa
 
     ends = np.cumsum(lengths)
@@ -140,13 +141,8 @@ def _write(
         episodes |= {f"stats/{name}/{statistic}": [part[statistic] for part in parts] for statistic in parts[0]}
     episodes |= {f"meta/episodes/{name}": np.zeros(len(lengths), np.int64) for name in ("chunk_index", "file_index")}
     _write_table(folder / "meta" / "episodes" / _file_name(0), pa.table(episodes))
-    # The index of the pandas table is the text of the only task.
-    index = {"metadata": None, "field_name": "task", "name": "task", "pandas_type": "unicode", "numpy_type": "object"}
-    column = dict.fromkeys(("field_name", "name"), "task_index") | dict.fromkeys(("pandas_type", "numpy_type"), "int64")
-    about = {"index_columns": ["task"], "column_indexes": [], "columns": [{"metadata": None} | column, index]}
-    tasks = pa.table({"task_index": pa.array([0], pa.int64()), "task": [TASK]})
-    tasks = tasks.replace_schema_metadata({"pandas": json.dumps(about | {"pandas_version": "2.0.0"})})
-    _write_table(folder / "meta" / "tasks.parquet", tasks)
+    tasks = pandas.DataFrame({"task_index": [0]}, index=pandas.Index([TASK], dtype=object, name="task"))
+    tasks.to_parquet(folder / "meta" / "tasks.parquet")
     write_json(folder / "meta" / "info.json", _info(columns, names, lengths, fps))
     write_json(folder / "meta" / "stats.json", {name: _statistics(values) for name, values in columns.items()})
 

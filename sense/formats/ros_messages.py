@@ -208,7 +208,10 @@ def decode(raw: RawMessages, paths: Sequence[str]) -> TopicSeries:
     rows, width = bytearray(), 0
     for index in range(len(raw.messages)):
         message = raw.decode(index)
-        row = b"".join(_numbers(message, path, raw.msgtype).tobytes() for path in paths)
+        try:
+            row = b"".join(np.asarray(get_field(message, path), np.float64).tobytes() for path in paths)
+        except (TypeError, ValueError) as error:
+            raise InputError(f"message {index} has no array of numbers at {' or '.join(paths)}") from error
         if not row:
             raise InputError(f"message {index} has no {paths[0]}")
         width = width or len(row)
@@ -228,21 +231,6 @@ def get_field(message: Any, path: str) -> Any:
         except AttributeError as error:
             raise InputError(f"{path!r} is no field, expected a path of names such as header.stamp.sec") from error
     return message
-
-
-def _numbers(message: Any, path: str, msgtype: str) -> Array:
-    try:
-        return np.asarray(get_field(message, path), np.float64).ravel()
-    except (TypeError, ValueError) as error:
-        raise InputError(f"{msgtype} has no numbers at {path!r}") from error
-
-
-def decode_text(raw: RawMessages) -> str:
-    """Return the text of the last message of RECORDING; "" if it is damaged."""
-    try:
-        return raw.decode(-1).data
-    except InputError:
-        return ""
 
 
 def _empty(store: "Typestore", msgtype: str, **fields: Any) -> Any:
@@ -277,10 +265,10 @@ def encode_recording(store: "Typestore", recording: Recording, epoch_s: float, t
     return store.serialize_cdr(_empty(store, TOPICS[RECORDING].msgtype, data=text), TOPICS[RECORDING].msgtype)
 
 
-def from_text(text: str, readings: Array) -> tuple[Recording, float, str] | None:
-    """Return the recording in a text, its epoch and its digest; None if the text does not fit the readings (R, C)."""
+def decode_recording(raw: RawMessages, readings: Array) -> tuple[Recording, float, str] | None:
+    """Return the recording in RECORDING, its epoch and digest; None if it does not fit the readings (R, C)."""
     try:
-        document = json.loads(text)
+        document = json.loads(raw.decode(-1).data)
         if document["format"] != FORMAT:
             return None
         arrays: dict[str, Any] = {name: np.array(document[name], np.float64) for name in (*_NUMBERS, *_INDICES)}

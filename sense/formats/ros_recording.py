@@ -5,14 +5,15 @@ repairs it.
 """
 
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
+from contextlib import suppress
 from dataclasses import replace
-from functools import partial
+from functools import cache, partial
 from heapq import merge
 from itertools import repeat
 from operator import itemgetter
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,54 +36,48 @@ from padforge.sense.formats.columns import (
     parse_columns,
 )
 from padforge.sense.formats.hdf5_mat import check_no_presses
-from padforge.sense.formats.ros_writer import load_typestore, write_mcap
 from padforge.sense.recording.recording import NOTE, Recording
 from padforge.sense.recording.run_directory import STATE_COLUMNS
+
+if TYPE_CHECKING:
+    from rosbags.interfaces import Connection
+    from rosbags.typesys.store import Typestore
 
 SUFFIXES = (".mcap", ".db3", ".bag")
 METADATA = "metadata.yaml"  # a folder with this file is a rosbag2 bag
 QUANTITIES = ("fibres", "positions", "x", "y", "depth", "reached", "force", "press")
 """Quantities that topics may hold."""
-_NUMBERS = ("Float32", "Float64", "Int8", "Int16", "Int32", "Int64", "UInt8", "UInt16", "UInt32", "UInt64")
-_SCALARS = {f"std_msgs/msg/{name}": ("data",) for name in _NUMBERS}
-_ARRAYS = {f"{msgtype}MultiArray": paths for msgtype, paths in _SCALARS.items()}
-_POSITIONS = {
-    f"geometry_msgs/msg/{name}": (f"{prefix}x", f"{prefix}y")
-    for name, prefix in {
-        "Point": "",
-        "PointStamped": "point.",
-        "Pose": "position.",
-        "PoseStamped": "pose.position.",
-        "PoseWithCovariance": "pose.position.",
-        "PoseWithCovarianceStamped": "pose.pose.position.",
-    }.items()
+_FIELDS = dict.fromkeys(QUANTITIES, "data") | {
+    "positions": r"(.*\.)?(position|point)\.[xy]|[xy]",
+    "force": r"(.*\.)?force\.[xyz]|data",
 }
-_FORCES = {
-    f"geometry_msgs/msg/{name}": tuple(f"{prefix}force.{axis}" for axis in "xyz")
-    for name, prefix in {"Wrench": "", "WrenchStamped": "wrench."}.items()
-}
-_TYPES: dict[str, Mapping[str, tuple[str, ...]]] = {
-    **dict.fromkeys(QUANTITIES, _SCALARS),
-    "fibres": _ARRAYS | _SCALARS,
-    "positions": _POSITIONS,
-    "force": _FORCES | _SCALARS,
-    "press": {"std_msgs/msg/Bool": ("data",)},
-}
-"""Types of messages that may contain a quantity, and the paths of its numbers in them."""
+"""Numbers of a message that are a quantity, by the paths that std_msgs and geometry_msgs have."""
 _Arrays = list[tuple[ColumnEntry, NDArray[Any]]]
 
 
-class BagContent(NamedTuple):
-    """Content of a bag, by the names of topics."""
+def load_typestore(purpose: str) -> "Typestore":
+    """Return the message definitions of ROS 2; raise InputError, naming the purpose, if rosbags is not installed."""
+    try:
+        import rosbags.typesys  # noqa: F401
+    except ImportError as error:
+        raise InputError(f"{purpose} needs rosbags: pip install 'padforge[formats]'") from error
+    return _typestore()
 
-    topics: dict[str, ros.RawMessages]  # requested topics that have messages
-    types: dict[str, str]  # types of all topics
+
+@cache
+def _typestore() -> "Typestore":
+    """Return one store for all files, since it compiles code for every type of message."""
+    from rosbags.typesys import Stores, get_typestore
+
+    return get_typestore(Stores.ROS2_HUMBLE)
 
 
-def read_bag(path: Path, is_wanted: Callable[[str], bool], limit: int | None = None) -> BagContent:
-    """Read the messages of the topics of a bag for which `is_wanted` is true, at most `limit` of each topic.
+def read_bag(
+    path: Path, is_wanted: Callable[[str], bool], limit: int | None = None
+) -> tuple[dict[str, ros.RawMessages], dict[str, str]]:
+    """Read the topics of a bag, a file of `SUFFIXES` or a folder of such files with METADATA.
 
-    A bag is a file of `SUFFIXES`, or a folder of such files with METADATA.
+    Returns, by the names of topics, at most `limit` messages of each one for which `is_wanted` is true, and all types.
     """
     store = load_typestore(f"{path}: a bag of ROS")
     from rosbags.highlevel import AnyReader
@@ -109,7 +104,7 @@ def read_bag(path: Path, is_wanted: Callable[[str], bool], limit: int | None = N
     except Exception as error:  # rosbags raises many kinds on files that are cut off
         reason = " ".join(f"{error or type(error).__name__}".replace(str(path), path.name).split())[:200]
         raise InputError(f"{path}: no bag, or cut off or damaged ({reason})") from error
-    return BagContent(topics, types)
+    return topics, types
 
 
 def import_bag(path: str | Path, columns: str = "", presses: Arrays = ()) -> Recording:
@@ -127,11 +122,10 @@ def import_bag(path: str | Path, columns: str = "", presses: Arrays = ()) -> Rec
     with np.errstate(all="ignore"):  # damaged numbers are refused later
         if columns:
             return _import_mapped(path, columns, presses)
-        check_no_presses(path, presses)
-        return _import_exported(path)
+        return _import_exported(path, presses)
 
 
-def _import_exported(path: Path) -> Recording:
+def _import_exported(path: Path, presses: Arrays) -> Recording:
     """Read an exported bag: the exact recording if all messages agree with it, otherwise that of the messages."""
     number_topics = (ros.READINGS, ros.PRESSED, ros.PLACE, ros.REACHED, ros.FORCE)
     raw, types = read_bag(path, {*number_topics, ros.RECORDING}.__contains__)
@@ -142,12 +136,13 @@ def _import_exported(path: Path) -> Recording:
         )
     notes = []
     with naming_file(path):
+        check_no_presses(presses)
         for name, topic in raw.items():
             if topic.msgtype != ros.TOPICS[name].msgtype:
                 raise InputError(f"{name} is of {short_repr(topic.msgtype)}, expected {ros.TOPICS[name].msgtype}")
         topics = {name: ros.decode(raw[name], ros.TOPICS[name].paths) for name in number_topics if name in raw}
         if ros.RECORDING in raw:
-            if (recording := _restore(ros.decode_text(raw[ros.RECORDING]), topics)) is not None:
+            if (recording := _restore(raw[ros.RECORDING], topics)) is not None:
                 return recording
             notes = [f"was changed since it was exported; {ros.RECORDING} is left out"]
         arrays = _to_arrays(topics)
@@ -155,9 +150,9 @@ def _import_exported(path: Path) -> Recording:
     return assemble_recording(ForeignArrays(path, arrays, source, notes, is_own=True))
 
 
-def _restore(text: str, topics: Mapping[str, ros.TopicSeries]) -> Recording | None:
+def _restore(raw: ros.RawMessages, topics: Mapping[str, ros.TopicSeries]) -> Recording | None:
     """Return the exact recording in the text of a bag; None if its messages differ from it."""
-    restored = ros.from_text(text, topics[ros.READINGS].values)
+    restored = ros.decode_recording(raw, topics[ros.READINGS].values)
     if restored is None:
         return None
     recording, epoch_s, digest = restored
@@ -220,23 +215,14 @@ def _find_commands(pressed: ros.TopicSeries, readings: Indices) -> tuple[Indices
 def _import_mapped(path: Path, columns: str, presses: Arrays) -> Recording:
     entries = parse_columns(columns, QUANTITIES)
     # The name of a topic has no point; after a point follows the path of a field in its messages.
-    topics = [entry.name.partition(".")[0] for entry in entries]
-    raw, types = read_bag(path, lambda name: any(matches(name, re.sub(r"\[.*", "", topic)) for topic in topics))
+    wanted = [re.sub(r"\[.*", "", entry.name).partition(".")[::2] for entry in entries]
+    raw, types = read_bag(path, lambda name: any(matches(name, topic) for topic, _ in wanted))
     names = sorted(types)  # the order in a bag is arbitrary
+    fields = [f"{name}.{field}" for topic, field in wanted if field for name in names if matches(name, topic)]
     arrays: _Arrays = []
     with naming_file(path):
-        matched = match_columns([entry for entry in entries if "." not in entry.name], names)
-        series = [(entry, _decode_entry(entry, "", raw)) for entry, _ in matched]
-        for entry in entries:
-            topic, _, field = entry.name.partition(".")
-            field, _, index = field.partition("[")
-            if field:
-                columns_of_field = match_columns([entry._replace(name=topic, index=index and f"[{index}")], names)
-                matched += columns_of_field
-                series += [
-                    (each._replace(name=f"{each.name}.{field}"), _decode_entry(each, field, raw))
-                    for each, _ in columns_of_field
-                ]
+        matched = match_columns(entries, names := list(dict.fromkeys([*names, *fields])))
+        series = [(entry, _decode_entry(entry, raw)) for entry, _ in matched]
         clock = next(topic.stamps for entry, topic in series if entry.quantity == "fibres")
         arrays.append((ColumnEntry("time", ""), clock / 1e9))
         for entry, topic in series:
@@ -254,43 +240,42 @@ def _import_mapped(path: Path, columns: str, presses: Arrays) -> Recording:
     return assemble_recording(ForeignArrays(path, arrays, source, order_notes(matched), is_held=True), presses)
 
 
-def _decode_entry(entry: ColumnEntry, field: str, raw: Mapping[str, ros.RawMessages]) -> ros.TopicSeries:
-    """Return the numbers of a topic, if its type may contain the quantity, or of a field of its messages."""
-    name, types = entry.name, _TYPES[entry.quantity]
-    what = f"{entry.quantity} is {short_repr(name)}"
+def _decode_entry(entry: ColumnEntry, raw: Mapping[str, ros.RawMessages]) -> ros.TopicSeries:
+    """Return the numbers of a topic that are a quantity, or those at a field of its messages."""
+    name, _, field = entry.name.partition(".")
+    what = f"{entry.quantity} is {short_repr(entry.name)}"
     if name not in raw:
         raise InputError(f"{what}, which has no messages")
-    topic = raw[name]
-    kind = topic.msgtype
     with naming_file(what):
-        if field:
-            value = ros.get_field(topic.decode(0), field)
-            kind = getattr(value, "__msgtype__", "")
-        if kind in types:
-            return ros.decode(topic, [f"{field}.{path}".lstrip(".") for path in types[kind]])
-        if field and not kind:
-            return ros.decode(topic, [field])
-        fields = join_names(list(_number_fields(topic)))
-    has = f"name one of its fields as {name}.FIELD: {fields}" if fields != "nothing" else "which holds no numbers"
-    raise InputError(f"{what} of {short_repr(kind)}, {has}")
+        counts = _number_fields(raw[name], field)
+        paths = [path for path in counts if re.fullmatch(_FIELDS[entry.quantity], path.removeprefix(f"{field}."))]
+        paths = [field] if field in counts else paths
+        is_vector = field in counts or entry.quantity == "fibres" or all(counts[path] == 1 for path in paths)
+        if is_vector and 0 < len(paths) <= 3:  # with several positions or forces, one is to be named
+            return ros.decode(raw[name], paths)
+        fields = join_names(list(counts))
+    has = f"name one of its fields as {name}.FIELD: {fields}" if counts else "which holds no numbers"
+    raise InputError(f"{what} of {short_repr(raw[name].msgtype)}, {has}")
 
 
-def _number_fields(topic: ros.RawMessages) -> dict[str, int]:
-    """Return the paths of numbers in the first message of a topic, and the number of numbers at each."""
-    fields = dict[str, int]()
+def _number_fields(topic: ros.RawMessages, field: str = "") -> dict[str, int]:
+    """Return the paths of numbers in the first message of a topic, at or below a field, and how many are at each."""
+    counts = dict[str, int]()
 
     def visit(value: Any, path: str) -> None:
-        if isinstance(value, list) and value and hasattr(value[0], "__msgtype__"):
-            for name in vars(value[0]):
-                visit([getattr(item, name) for item in value], f"{path}.{name}")
-        elif hasattr(value, "__msgtype__"):
-            for name in vars(value):
-                visit(getattr(value, name), f"{path}.{name}")
-        elif np.asarray(value).dtype.kind in "fiub" and not path.endswith("__msgtype__"):
-            fields[path.lstrip(".")] = np.size(value)
+        item = value[0] if isinstance(value, list) and value else value
+        if hasattr(item, "__msgtype__"):
+            for name in vars(item):
+                visit(ros.get_field(value, name), f"{path}.{name}".lstrip("."))
+            return
+        with suppress(ValueError):  # of a list of arrays of different lengths
+            numbers = np.asarray(value)
+            if numbers.dtype.kind in "fiub":
+                counts[path] = numbers.size
 
-    visit(topic.decode(0), "")
-    return fields
+    message = topic.decode(0)
+    visit(ros.get_field(message, field) if field else message, field)
+    return counts
 
 
 def describe_bag(path: Path) -> list[str]:
@@ -350,5 +335,39 @@ def export_bag(
         *(zip(repeat(topic), stamps[topic].tolist(), messages[topic]) for topic in messages), key=itemgetter(1)
     )
     with reraise_write_error(path), atomic_files(path.parent) as folder:
-        bag = write_mcap(folder / f"{UNFINISHED}{path.stem}", store, in_order)
+        bag = _write_mcap(folder / f"{UNFINISHED}{path.stem}", store, in_order)
         bag.replace(folder / path.name)
+
+
+def _write_mcap(folder: Path, store: "Typestore", messages: Iterable[tuple[str, int, memoryview]]) -> Path:
+    """Write messages (topic, stamp in ns, CDR) as a rosbag2 folder, and return its .mcap file."""
+    from rosbags.rosbag2 import StoragePlugin, Writer
+
+    connections: dict[str, Connection] = {}
+    with Writer(folder, version=8, storage_plugin=StoragePlugin.MCAP) as writer:
+        for topic, stamp, message in messages:
+            if topic not in connections:
+                msgtype, description, _ = ros.TOPICS[topic]
+                writer.set_custom_data(topic, description)
+                options = {"typestore": store, "offered_qos_profiles": [_qos(is_latched=topic == ros.RECORDING)]}
+                connections[topic] = writer.add_connection(topic, msgtype, **options)
+            writer.write(connections[topic], stamp, message)
+    return folder / f"{folder.name}.mcap"
+
+
+def _qos(is_latched: bool) -> Any:
+    """Return a quality of service; subscribers that connect later get the last message of a latched topic."""
+    from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
+
+    never = QosTime(2147483647, 4294967295)
+    return Qos(
+        history=QosHistory.KEEP_LAST,
+        depth=1 if is_latched else 10,
+        reliability=QosReliability.RELIABLE,
+        durability=QosDurability.TRANSIENT_LOCAL if is_latched else QosDurability.VOLATILE,
+        deadline=never,
+        lifespan=never,
+        liveliness=QosLiveliness.AUTOMATIC,
+        liveliness_lease_duration=never,
+        avoid_ros_namespace_conventions=False,
+    )

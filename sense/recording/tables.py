@@ -92,6 +92,7 @@ class Table:
         dates: dict[int, list[str]] = {column: [] for column in columns if column in dialect.dates}
         words: dict[int, dict[int, str]] = {column: {} for column in columns}  # invalid cells by column and line
         torn: list[tuple[int, int]] = []  # lines with a wrong number of values, and that number
+        ends: list[tuple[int, int, list[str]]] = []  # of lines with too many: index of the row, line and last cells
         garbled: list[int] = []
         n_headers = last = 0
         for line, row in _split(_iterate_lines(self.path, self.encoding, garbled=garbled), dialect.separator):
@@ -103,6 +104,8 @@ class Table:
                 cells = cells[:width] if len(cells) != dialect.width else cells + [""] * (width - dialect.width)
             if len(cells) != width:
                 torn.append((line, len(cells)))
+                if width < len(cells) < 2 * width:
+                    ends.append((len(self._lines), line, cells[-width:]))
             elif not any(cells):
                 continue
             elif self.has_header and cells in (self.names, self.units):
@@ -118,15 +121,43 @@ class Table:
                     numbers.append(value)
         if not self._lines:
             raise InputError(f"{self.path}: has no line of values below its header")
-        self._report(words, torn, n_headers, last)
+        values = np.frombuffer(numbers, np.float64).reshape(-1, len(columns))
+        for column, texts in dates.items():
+            values[:, list(columns).index(column)] = _parse_dates(texts, f"{self.path}: {self.names[column]}")
+        values, joined = self._insert_ends(values, columns, ends)
+        self._report(words, [item for item in torn if item[0] not in joined], n_headers, last)
+        if joined:
+            self.notes.append(f"{name_lines(joined)} left out up to where another line begins in it: one was cut off")
         if garbled:
             self.notes.append(f"{name_lines(garbled)} read without bytes that are no text")
         if self.encoding == FALLBACK:
             self.notes.append(f"its text is no UTF-8 and was read as {FALLBACK} (--encoding names another)")
-        values = np.frombuffer(numbers, np.float64).reshape(-1, len(columns))
-        for column, texts in dates.items():
-            values[:, list(columns).index(column)] = _parse_dates(texts, f"{self.path}: {self.names[column]}")
         return values
+
+    def _insert_ends(
+        self, values: Array, columns: Sequence[int], ends: list[tuple[int, int, list[str]]]
+    ) -> tuple[Array, list[int]]:
+        """Insert the rows that follow in the same line after one that was cut off; return the values and these lines.
+
+        The first cell of such a row follows the last of the row before it without a separator. The place where it
+        begins is certain only in a column that ascends, if one number alone lies between those above and below.
+        """
+        if not ends or 0 not in columns:
+            return values, []
+        first = list(columns).index(0)
+        if (np.diff(values[:, first]) < 0).any():
+            return values, []
+        rows, inserted, joined = list[int](), list[list[float]](), list[int]()
+        bounds = [-np.inf, *values[:, first], np.inf]
+        for row, line, cells in ends:
+            starts = [_parse(cells[0][i:], self.dialect, 0, may_be_unknown=False) for i in range(len(cells[0]))]
+            between = {start for start in starts if start is not None and bounds[row] < start < bounds[row + 1]}
+            numbers = [_parse(cells[column], self.dialect, column, may_be_unknown=False) for column in columns]
+            numbers[first] = between.pop() if len(between) == 1 else None
+            if (complete := [number for number in numbers if number is not None]) == numbers:
+                self._lines.insert(row + len(rows), line)
+                rows, inserted, joined = [*rows, row], [*inserted, complete], [*joined, line]
+        return np.insert(values, rows, np.reshape(inserted, (-1, len(columns))), axis=0), joined
 
     def _report(self, words: dict[int, dict[int, str]], torn: list[tuple[int, int]], n_headers: int, last: int) -> None:
         """Add notes on what was omitted; raise InputError if it is too much."""

@@ -11,7 +11,7 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, W
 from rosbags.typesys import Stores, get_typestore
 
 STORE = get_typestore(Stores.ROS2_HUMBLE)
-PACKAGES = ("std_msgs", "geometry_msgs", "builtin_interfaces")
+PACKAGES = ("std_msgs", "geometry_msgs", "builtin_interfaces", "sensor_msgs", "nav_msgs")
 Message = tuple[str, float, Any]
 """Topic, time in s and message."""
 

@@ -17,7 +17,7 @@ from padforge.sense.formats.csv_recording import read_presses
 from padforge.sense.formats.import_export import import_file
 from padforge.sense.recording.doubts import find_doubts
 
-from .foreign import array, make, pose, write_bag, write_ros1_bag
+from .foreign import array, header, make, pose, write_bag, write_ros1_bag
 
 N = 156
 TIMES = np.arange(N) / 20
@@ -124,7 +124,7 @@ def test_import_csv_says_what_is_left_out(tmp_path: Path) -> None:
         return load(tmp_path, table(lines=lines)).source["note"]
 
     assert note([*rows(), "7.8,1.8"]) == "line 158, the last, is cut off and left out"
-    assert note([*rows()[:70], rows()[70] + rows()[71], *rows()[72:]]) == "line 72 is left out: 9 values, expected 5"
+    assert note([*rows()[:70], rows()[70] + ",1", *rows()[71:]]) == "line 72 is left out: 6 values, expected 5"
     back = rows()
     back[70] = "0.000," + back[70].split(",", 1)[1]
     assert note(back) == "line 72 is left out: times go back"
@@ -133,6 +133,33 @@ def test_import_csv_says_what_is_left_out(tmp_path: Path) -> None:
     assert (
         load(tmp_path, table(lines=[*rows()[:30], "1.500,#N/A,ovf,inf,1.8", *rows()[31:]])).source.get("note") is None
     )
+
+
+@pytest.mark.parametrize("cut", [6, 9, 12, 13, 20, None])
+@pytest.mark.parametrize("unit", ["s", "ms"])
+def test_import_csv_reads_the_line_that_follows_a_torn_one_in_the_same_line(
+    tmp_path: Path, cut: int | None, unit: str
+) -> None:
+    lines = rows(lambda i: f"{TIMES[i]:.3f}" if unit == "s" else str(10000 + 50 * i))
+    lines[70:72] = [lines[70][:cut] + lines[71]]
+    recording = load(tmp_path, table(lines=lines), f"time=t:{unit},fibres=c*")
+    np.testing.assert_allclose(recording.readings, np.delete(VOLTS, 70, axis=0), atol=1e-9)
+    np.testing.assert_allclose(np.diff(recording.times_s)[69:71], [0.1, 0.05])
+    note = "line 72 is left out up to where another line begins in it: one was cut off"
+    assert str(recording.source["note"]).startswith(note)
+
+
+def test_import_csv_leaves_out_a_torn_line_whose_continuation_is_uncertain(tmp_path: Path) -> None:
+    def note(lines: list[str], header: str = "t,c0,c1,c2,c3") -> str:
+        return load(tmp_path, table(header, lines)).source["note"]
+
+    left_out = "line 72 is left out: 6 values, expected 5"
+    late = rows()
+    late[70:72] = [late[70][:12] + late[80]]  # of a later time than the next line
+    assert note(late) == left_out
+    last = [",".join([*line.split(",")[1:], line.split(",")[0]]) for line in rows()]
+    last[70:72] = [last[70][:9] + last[71]]
+    assert note(last, "c0,c1,c2,c3,t") == left_out
 
 
 def test_import_csv_refuses_two_runs_by_their_line(tmp_path: Path) -> None:
@@ -205,11 +232,11 @@ def test_presses_of_a_table_of_their_own(tmp_path: Path) -> None:
     begin = np.flatnonzero(np.diff(PRESSED, prepend=0) == 1)
     lines = [f"{TIMES[i]:.3f},{SPOTS[i, 0]},{SPOTS[i, 1]},0.6,2.5" for i in begin]
     (tmp_path / "lab.csv").write_text(table())
-    for header, mapping in (
+    for names, mapping in (
         ("down_s,x_mm,y_mm,duration_s,force_n", ""),
         ("at,px,py,for,f", "down=at,duration=for,x=px,y=py,force=f"),
     ):
-        (tmp_path / "presses.csv").write_text(table(header, [*lines, "99,0,0,0.6,2.5"]))
+        (tmp_path / "presses.csv").write_text(table(names, [*lines, "99,0,0,0.6,2.5"]))
         recording = import_file(tmp_path / "lab.csv", MAPPING, presses=tmp_path / "presses.csv", press_columns=mapping)
         check(recording)
         assert recording.down_command.tolist() == begin.tolist()
@@ -377,6 +404,28 @@ def test_import_bag_reads_fields_of_messages(tmp_path: Path) -> None:
     np.testing.assert_allclose(recording.presses_mm[4], [0, 5], atol=1e-9)
     with pytest.raises(InputError, match=r"'position\.q' is no field"):
         import_bag(path, "fibres=/all.position.q")
+
+
+def test_import_bag_finds_a_position_below_other_fields(tmp_path: Path) -> None:
+    still = make("TwistWithCovariance", make("Twist", *[make("Vector3", 0.0, 0.0, 0.0)] * 2), np.zeros(36))
+    messages = []
+    for i in range(N):
+        place = make("Pose", make("Point", *SPOTS[i] / 1000, 0.0), make("Quaternion", 0.0, 0.0, 0.0, 1.0))
+        odometry = make("Odometry", header(), "base", make("PoseWithCovariance", place, np.zeros(36)), still)
+        messages += [("/odom", TIMES[i], odometry), ("/skin", TIMES[i], array("Float64MultiArray", VOLTS[i]))]
+    recording = import_bag(write_bag(tmp_path / "bag", messages), "fibres=/skin,positions=/odom")
+    check(recording)
+    np.testing.assert_allclose(recording.presses_mm[4], [0, 5], atol=1e-9)
+
+
+def test_import_bag_refuses_several_numbers_for_one(tmp_path: Path) -> None:
+    channels = [make("ChannelFloat32", "c", np.ones(n, np.float32)) for n in (2, 3)]
+    topics = {"/f": array("Float64MultiArray", np.ones(2)), "/cloud": make("PointCloud", header(), [], channels)}
+    path = write_bag(tmp_path / "bag", [(name, i / 20, topics[name]) for i in range(9) for name in topics])
+    with pytest.raises(InputError, match=r"depth is '/f' of .*MultiArray', name one .* /f.FIELD: .*'data'"):
+        import_bag(path, "fibres=/f.data,depth=/f")
+    with pytest.raises(InputError, match=r"fibres is '/cloud' of .*, name one of its fields as /cloud.FIELD: 'header"):
+        import_bag(path, "fibres=/cloud")
 
 
 def test_import_bag_reads_bags_of_ros_1(tmp_path: Path) -> None:
