@@ -47,12 +47,12 @@ class _Source(NamedTuple):
 
 
 class _Moments(NamedTuple):
-    """Moments at which the presses of a batch are read, of which the first S slide."""
+    """Moments at which the presses of a batch are read, of which the first ones slide."""
 
     counts: Indices  # complete windows; shape (B,)
     last: Indices  # latest reading of the press; shape (B,)
-    end: Array  # latest reading of a slide, which may be longer than `PRESS_WINDOWS`; shape (S,)
-    velocity: Array  # scaled distance per reading; shape (S, 2)
+    end: Array  # latest reading of a slide, which may be longer than `PRESS_WINDOWS`; shape (n,)
+    velocity: Array  # scaled distance per reading; shape (n, 2)
     correlation_length: float  # of residuals, scaled
 
 
@@ -103,7 +103,7 @@ class PressSampler:
             noise: standard deviation of noise on the scaled features.
 
         Returns:
-            Inputs (B, D), and the positions (B, 2) by the Bayesian localizer, or 0 without one.
+            Inputs (B, I), and the positions (B, 2) by the Bayesian localizer, or 0 without one.
         """
         moments = self._sample_moments(len(rows))
         fibres, n_features = self._source.residual.shape[1:]
@@ -160,7 +160,7 @@ def _compute_inputs(
         moments: `_Moments` of the presses.
         noise: standard deviation of noise on the features.
         rng: random number generator.
-        x: 0; shape (B, D). Masked features, and windows that are not complete, stay 0.
+        x: 0; shape (B, I). Masked features, and windows that are not complete, stay 0.
     """
     side, (fibres, size), n_timed = len(source.table), source.residual.shape[1:], source.complete.shape[1]
     residual, features, latest = np.empty(size), np.empty(size), np.empty(N_LATEST)
@@ -228,10 +228,10 @@ def _trace_slide(
 ) -> tuple[Any, Any, Any, Any]:
     """Trace a finger from its target back to its touch, for `PRESS_WINDOWS` and then `LATEST_WINDOWS`.
 
-    With R_m(x) the response of window m to a press at x, L = `LAST_INSTANT_WINDOW`, x(t) the position of the finger and
+    With R_m(x) the response of window m to a press at x, i = `LAST_INSTANT_WINDOW`, x(t) the position of the finger and
     t_m the middle of window m, the response of window k at time t is the superposition of delayed increments
 
-        R_min(k, L)(x(t)) + sum over n = 1 .. k - L of [R_(L + n) - R_(L + n - 1)](x(t - (t_(L + n) - t_L))).
+        R_min(k, i)(x(t)) + sum over n = 1 .. k - i of [R_(i + n) - R_(i + n - 1)](x(t - (t_(i + n) - t_i))).
 
     Args:
         target: position of the finger at the end; shape (2,).
@@ -242,8 +242,8 @@ def _trace_slide(
         side: of the table.
 
     Returns:
-        Windows k (J,), the correlation (J,) of their residuals with that of the press at rest, and for each increment
-        n the cells (N, J, 2) of the table and the positions (N, J, 2) in them.
+        Windows k and the correlation of their residuals with that of the press at rest, for all windows; and for each
+        increment n, by window, the cells (i, j) of the table and the positions (u, v) in them.
     """
     n_windows, n_increments = N_PRESS_WINDOWS + len(latest_windows), N_PRESS_WINDOWS - LAST_INSTANT_WINDOW
     windows, correlation = np.empty(n_windows, np.int64), np.empty(n_windows)

@@ -404,7 +404,7 @@ class CrossValidation:
         return [error_row(n_failed, level, *self.presses[1:]) for n_failed, level in enumerate(predictions)]
 
     def widening(self, predictions: Predictions) -> Array:
-        """Return (K, 3 + T) factors, 1 or more, with which intervals hold on these presses."""
+        """Return (L, 3 + T) factors, 1 or more, with which intervals hold on these presses."""
         return np.maximum([conformal(level, *self.presses[1:]) for level in predictions], 1.0)
 
 

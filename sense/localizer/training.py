@@ -418,14 +418,14 @@ class Training:
         return self._recent[self._presses.rng.integers(len(self._recent))]
 
     def sample_batch(self) -> tuple[Floats, Floats]:
-        """Sample inputs (1, B, D) and the targets of the network (B, 2 + T)."""
+        """Sample inputs (1, B, I) and the targets of the network (B, 2 + T)."""
         rows = self._presses.sample_rows(self._batch)
         targets = self._augment_position(self._presses.targets[rows])
         x, position = self._presses.inputs(rows, targets, INPUT_NOISE)
         return x[None], targets - position
 
     def _fit_directions(self) -> tuple[Tensor, Tensor]:
-        """Return the directions (D, n) in which inputs vary most, and the shares (n,) by which these are shrunk."""
+        """Return the directions (I, n) in which inputs vary most, and the shares (n,) by which these are shrunk."""
         x = np.concatenate([self.sample_batch()[0][0] for _ in range(COMMON_BATCHES)]).astype(np.float64)
         n_inputs = x.shape[1]
         largest = max(n_inputs - COMMON_DIRECTIONS, 0), n_inputs - 1
@@ -434,7 +434,7 @@ class Training:
         return torch.from_numpy(directions.astype(np.float32)), torch.from_numpy(shrinkage.astype(np.float32))
 
     def scale_down(self, x: Tensor) -> Tensor:
-        """Scale (..., D) inputs down, most strongly in the directions in which they vary most."""
+        """Scale (..., I) inputs down, most strongly in the directions in which they vary most."""
         return (x - x @ self._directions * self._shrinkage @ self._directions.T) / COMMON_SQUARE**0.5
 
     def scale_up(self, x: Tensor) -> Tensor:
