@@ -283,18 +283,15 @@ def calibrate_uncertainty(
         model, is_typical = _calibrate_scales(model, moments, positions_mm, levels, on_progress, n_trained)
     uncalibrated = replace(model, interval_factors=np.ones_like(model.interval_factors))
     n_sets = MOMENT_SUBSETS if len(moments) > 1 else INTERVAL_SUBSETS
-    factors = []
-    for presses in moments:
+    factors: list[list[Array]] = []  # by moment, then by number of failed fibres
+    for features in moments:
         on_progress(len(factors), len(moments), "radii")
-        predictions = (
-            [uncalibrated.predict_features(presses, subset) for subset in failure_subsets(model.fibres, level, n_sets)]
-            for level in range(levels)
-        )
-        row = []
-        for level, of_level in enumerate(predictions):
-            ratio = MEAN_RATIO * (1 - FAILURE_RATIO_DECREASE * level / model.fibres) if is_typical else None
-            row.append(conformal(of_level, positions_mm, measures, ratio))
-        factors.append(row)
+        factors.append([])
+        for n_failed in range(levels):
+            subsets = failure_subsets(model.fibres, n_failed, n_sets)
+            predictions = [uncalibrated.predict_features(features, failed) for failed in subsets]
+            ratio = MEAN_RATIO * (1 - FAILURE_RATIO_DECREASE * n_failed / model.fibres) if is_typical else None
+            factors[-1].append(conformal(predictions, positions_mm, measures, ratio))
     if len(moments) > 1:
         factors = [factors[0], *factors]  # a placeholder for 0 complete windows, where nothing is predicted
     n_presses = len(positions_mm) + PRIOR_PRESSES * is_typical
@@ -323,44 +320,48 @@ def _calibrate_scales(
     Returns:
         The model, and whether the experience with other pads was used.
     """
-    targets = (positions_mm - model.scaler.origin_mm) / model.scaler.scale_mm
-    subsets = [subset for level in range(levels) for subset in failure_subsets(model.fibres, level, SCALE_SUBSETS)]
+    positions = (positions_mm - model.scaler.origin_mm) / model.scaler.scale_mm
+    subsets = [
+        failed for n_failed in range(levels) for failed in failure_subsets(model.fibres, n_failed, SCALE_SUBSETS)
+    ]
 
-    # 1. Ratios of error to expected error, with the names of the networks that answer together
-    group_ratios: list[tuple[list[str], Array]] = []
+    # 1. Mean ratio of error to expected error of each member, by moment and set of failed fibres; beside it the names
+    # of the networks that answer at the moment, whose members follow each other in this order
+    networks_and_ratios: list[tuple[list[str], Array]] = []
     first = int(len(moments) > 1)
-    for n_complete, presses in enumerate(moments, first):
+    for n_complete, features in enumerate(moments, first):
         on_progress(n_complete - first, len(moments), "expected errors")
-        rows = np.flatnonzero(count_complete(presses.complete) == n_complete)  # the next press may cut off some
-        names = active_networks(model.networks, n_complete, presses.complete.shape[1], bool(model.bayes))
+        rows = np.flatnonzero(count_complete(features.complete) == n_complete)  # the next press may cut off some
+        names = active_networks(model.networks, n_complete, features.complete.shape[1], bool(model.bayes))
         for failed in subsets if len(rows) else ():
-            fibre_mask = presses.fibre_mask[rows] & ~np.isin(np.arange(model.fibres), failed)
-            inputs = presses.inputs[rows], fibre_mask, presses.complete[rows]
+            fibre_mask = features.fibre_mask[rows] & ~np.isin(np.arange(model.fibres), failed)
+            inputs = features.inputs[rows], fibre_mask, features.complete[rows]
             outputs = predict_members(model.networks, *inputs, *model.corrected)
             predicted, log_error = (half[:, :, :2] for half in np.split(outputs, 2, axis=2))
-            expected = np.exp(np.clip(log_error, MIN_LOG_ERROR, MAX_LOG_ERROR)).mean(axis=2)
-            group_ratios.append((names, (np.abs(predicted - targets[rows]).mean(axis=2) / expected).mean(axis=1)))
+            error = np.abs(predicted - positions[rows]).mean(axis=2)
+            expected_error = np.exp(np.clip(log_error, MIN_LOG_ERROR, MAX_LOG_ERROR)).mean(axis=2)
+            networks_and_ratios.append((names, (error / expected_error).mean(axis=1)))
 
     # 2. Comparison with other pads
-    presses, expected_ratio, is_typical = len(positions_mm), 1.0, False
+    n_presses, expected_ratio, is_typical = len(positions_mm), 1.0, False
     if n_trained:
         growth = 1 + DOUBLE_ERROR_PRESSES / n_trained
-        excess = np.mean([ratio.mean() for _, ratio in group_ratios]) / growth - 1
-        is_typical = bool(abs(excess) < CONTRADICTION * RATIO_SHAPE**-0.5 / np.sqrt(presses))
+        excess = np.mean([ratios.mean() for _, ratios in networks_and_ratios]) / growth - 1
+        is_typical = bool(abs(excess) < CONTRADICTION * RATIO_SHAPE**-0.5 / np.sqrt(n_presses))
         if is_typical:
             expected_ratio = growth
-            group_ratios = [(names, growth * ratio / ratio.mean()) for names, ratio in group_ratios]
+            networks_and_ratios = [(names, growth * ratios / ratios.mean()) for names, ratios in networks_and_ratios]
 
-    # 3. Scale of each member, with its expected error as the prior
-    ratios: dict[str, list[Array]] = {}
-    for names, ratio in group_ratios:
+    # 3. Scale of each member: the mean of its ratios, with `expected_ratio` as the prior
+    ratios_of: dict[str, list[Array]] = {}  # by network
+    for names, ratios in networks_and_ratios:
         for name in names:
-            members = 1 if name == RESIDUAL else len(model.networks[name]["last.b"])
-            ratios.setdefault(name, []).append(ratio[:members])
-            ratio = ratio[members:]
+            n_members = 1 if name == RESIDUAL else len(model.networks[name]["last.b"])
+            ratios_of.setdefault(name, []).append(ratios[:n_members])
+            ratios = ratios[n_members:]
     log_scales = {
-        name: np.log((PRIOR_COUNT * expected_ratio + presses * np.mean(ratio, axis=0)) / (PRIOR_COUNT + presses))
-        for name, ratio in ratios.items()
+        name: np.log((PRIOR_COUNT * expected_ratio + n_presses * np.mean(ratios, axis=0)) / (PRIOR_COUNT + n_presses))
+        for name, ratios in ratios_of.items()
     }
 
     def scaled(name: str, weights: Weights) -> Weights:
