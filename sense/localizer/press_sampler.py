@@ -87,8 +87,7 @@ class PressSampler:
         self._n_timed = presses.complete.shape[1]
         self._bayes = tuple(stage.map_arrays(torch.from_numpy) for stage in bayes)
         self.n_inputs = fibres * (n_features + 1) + self._n_timed + (N_SUMMARY if bayes else 0)
-        self._phase, self._cumulative_shares = phase, np.cumsum(phase.shares)
-        self._speed, self._per_mm = presses.speed, presses.per_mm
+        self._phase, self._speed, self._per_mm = phase, presses.speed, presses.per_mm
 
     def sample_rows(self, batch: int) -> Indices:
         """Sample the rows (B,) of a batch of presses."""
@@ -122,7 +121,7 @@ class PressSampler:
 
     def _sample_moments(self, batch: int) -> _Moments:
         """Sample moments of the phase; a single one with Bayesian localizers, since each serves one stage."""
-        n_moments, rng, shares = 1 if self._bayes else batch, self.rng, self._cumulative_shares
+        n_moments, rng, shares = 1 if self._bayes else batch, self.rng, np.cumsum(self._phase.shares)
         offsets = np.searchsorted(shares, rng.random(n_moments) * shares[-1], side="right")
         counts = np.full(batch, self._phase.first + offsets)
         begin, end = (_ENDS[np.minimum(counts + k, N_PRESS_WINDOWS + 1)] for k in (0, 1))
