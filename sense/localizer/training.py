@@ -185,15 +185,50 @@ class TrainedNetworks(NamedTuple):
 
 @dataclass
 class TrainingTask:
-    """Training of one network."""
+    """Training of one member of a network."""
 
-    name: str  # of its phase, or `RESIDUAL`
+    name: str  # of the network: that of its phase, or `RESIDUAL`
     phase: Phase
     options: LocalizerSettings
     steps: int  # usual number
-    bayes: tuple[BayesianLocalizer, ...] = ()  # that it corrects
-    seed: int = 0
+    bayes: Sequence[BayesianLocalizer] = ()  # that it corrects
+    start: Weights | None = None  # to continue from
+    spread: float = 1.0  # factor on `AUGMENTATION`
     seconds: float | None = None  # limit in place of `steps`
+
+
+def run_trainings(
+    tasks: Sequence[TrainingTask],
+    presses: TrainingPresses,
+    table: Floats,
+    rng: np.random.Generator,
+    on_progress: OnProgress = ignore_progress,
+) -> tuple[dict[str, Weights], list[int]]:
+    """Run trainings in threads; return the networks by name, and the steps that each training has taken."""
+    totals = [task.steps if task.seconds is None else max(1, round(task.seconds)) for task in tasks]
+    seeds = rng.integers(2**63, size=len(tasks)).tolist()
+    on_progress(0, sum(totals), "")
+
+    def train(number: int) -> tuple[Weights, int]:
+        task, seed = tasks[number], seeds[number]
+        training = Training(presses, table, task.options, seed, task.phase, task.bayes, task.start, task.spread)
+        fitted = fit_network(
+            dict(training.network.named_parameters()),
+            training.loss,
+            task.steps,
+            task.options.learning_rate,
+            seconds=task.seconds,
+            on_progress=partial(update, number),
+        )
+        return training.weights(fitted), training.n_steps
+
+    with one_thread(), joint_progress(totals, on_progress) as update:
+        trained = dict(run_tasks((number, partial(train, number)) for number in range(len(tasks))))
+    members: dict[str, list[Weights]] = {}
+    for number, task in enumerate(tasks):
+        members.setdefault(task.name, []).append(trained[number][0])
+    networks = {name: stack_members(weights) for name, weights in members.items()}
+    return networks, [trained[number][1] for number in range(len(tasks))]
 
 
 def train_members(
@@ -252,34 +287,14 @@ def train_members(
         phase = RESIDUAL_PHASE if n_timed else phases["press"]
         n_steps = round(steps * phase.length)
         tasks.append(TrainingTask(RESIDUAL, phase, options.model_copy(update=smaller), n_steps, bayes))
-    for task, seed in zip(tasks, rng.integers(2**63, size=len(tasks)).tolist(), strict=True):
-        task.seed = seed
     if time_budget is not None:
         remaining_s = max(0.0, time_budget - (time.monotonic() - begin))
         longest = makespan([task.steps for task in tasks], cores)
         for task in tasks:
             task.seconds = remaining_s * task.steps / longest
-    totals = [task.steps if task.seconds is None else max(1, round(task.seconds)) for task in tasks]
-    on_progress(0, sum(totals), "")
 
     # 3. Training
-    def train(number: int) -> tuple[Weights, int]:
-        """Return the weights of a network and the steps it has taken."""
-        task = tasks[number]
-        training = Training(presses, table, task.options, task.seed, task.phase, task.bayes)
-        fitted = fit_network(
-            dict(training.network.named_parameters()),
-            training.loss,
-            task.steps,
-            options.learning_rate,
-            seconds=task.seconds,
-            on_progress=partial(update, number),
-        )
-        return training.weights(fitted), training.n_steps
-
-    with one_thread(), joint_progress(totals, on_progress) as update:
-        trained = dict(run_tasks((number, partial(train, number)) for number in range(len(tasks))))
-    weights, n_steps = zip(*(trained[number] for number in range(len(tasks))), strict=True)
+    trained, n_steps = run_trainings(tasks, presses, table, rng, on_progress)
     missing = [max(0, min(MIN_STEPS, task.steps) - done) for task, done in zip(tasks, n_steps, strict=True)]
     if time_budget is not None and any(missing):
         needed_s = time.monotonic() - begin + pace_s * makespan(missing, cores)
@@ -287,12 +302,9 @@ def train_members(
             f"time budget: got {time_budget:.3g} s for the training, in which a network took {min(n_steps)} steps; "
             f"expected at least {MIN_STEPS}, about {math.ceil(needed_s)} s"
         )
-    networks = {
-        name: stack_members([weights[number] for number, task in enumerate(tasks) if task.name == name])
-        for name in phases
-    }
     trained_share = min(min(done / task.steps, 1.0) for task, done in zip(tasks, n_steps, strict=True))
-    return TrainedNetworks(networks, bayes, weights[-1] if has_bayes else {}, trained_share)
+    networks = {name: trained[name] for name in phases}
+    return TrainedNetworks(networks, bayes, trained.get(RESIDUAL, {}), trained_share)
 
 
 def training_steps(presses: int, options: LocalizerSettings) -> int:
@@ -462,22 +474,15 @@ def retrain(
     Returns:
         The retrained networks and residual network.
     """
-    n_timed, options = presses.complete.shape[1], LocalizerSettings(max_failures=max_failures)
-    phases = {**PHASES[n_timed], RESIDUAL: RESIDUAL_PHASE if n_timed else PHASES[0]["press"]}
-    starts = {name: unstack_members(weights) for name, weights in networks.items()}
+    n_timed = presses.complete.shape[1]
+    options = LocalizerSettings(max_failures=max_failures, learning_rate=RETRAINING_RATE)
+    starts = [(name, weights, PHASES[n_timed][name], ()) for name, weights in networks.items()]
     if residual_network:
-        starts[RESIDUAL] = unstack_members(residual_network)
-    seeds = {name: rng.integers(2**63, size=len(members)).tolist() for name, members in starts.items()}
-
-    def train(name: str) -> Weights:
-        members, phase, corrected = [], phases[name], bayes if name == RESIDUAL else ()
-        for start, seed in zip(starts[name], seeds[name], strict=True):
-            training = Training(presses, table, options, seed, phase, corrected, start, RETRAINING_SPREAD)
-            parameters, steps = dict(training.network.named_parameters()), round(RETRAINING_STEPS * phase.length)
-            members.append(training.weights(fit_network(parameters, training.loss, steps, RETRAINING_RATE)))
-        return stack_members(members)
-
-    with one_thread():
-        trained = dict(run_tasks((name, partial(train, name)) for name in starts))
-    residual_network = trained.pop(RESIDUAL, residual_network)
-    return {name: trained[name] for name in networks}, residual_network
+        starts += [(RESIDUAL, residual_network, RESIDUAL_PHASE if n_timed else PHASES[0]["press"], bayes)]
+    tasks = [
+        TrainingTask(name, phase, options, round(RETRAINING_STEPS * phase.length), corrected, member, RETRAINING_SPREAD)
+        for name, weights, phase, corrected in starts
+        for member in unstack_members(weights)
+    ]
+    trained, _ = run_trainings(tasks, presses, table, rng)
+    return {name: trained[name] for name in networks}, trained.get(RESIDUAL, residual_network)
