@@ -168,8 +168,7 @@ class PressLoop:
         """Start times at 0, or 1 s after the last reading of a resumed recording; discard buffered samples."""
         self._board.read()
         self._arm.drain()
-        last_s = self._recorder.last_s
-        self._zero_s = clock.now() - (last_s + 1 if np.isfinite(last_s) else 0.0)
+        self._zero_s = clock.now() - max(self._recorder.last_s + 1, 0.0)
 
     def _press(self, press: int, position_mm: Array, depth_mm: float) -> Future[Any]:
         """Make a press; return the queued call that writes it to the disk."""
