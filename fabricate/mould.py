@@ -68,9 +68,9 @@ def cylinder(x: float, y: float, diameter_mm: float, sides: int = 64) -> shapely
 
 def _tray(outline: BaseGeometry, hollows: Iterable[BaseGeometry], floor: float, depth: float, flare: float = 0) -> Body:
     """Build an open tray with rectangular hollows of a depth, whose walls lean outwards by `flare` in all."""
-    top, flare_per_mm = floor + depth, flare / depth
-    cuts = tuple(Prism(hollow, floor, top + 1, flare + flare_per_mm) for hollow in hollows)  # to 1 mm above the top
-    return Body((Prism(outline, 0, top),), cuts)
+    rim, flare_per_mm = floor + depth, flare / depth
+    cuts = tuple(Prism(hollow, floor, rim + 1, flare + flare_per_mm) for hollow in hollows)  # to 1 mm above the rim
+    return Body((Prism(outline, 0, rim),), cuts)
 
 
 def terraces(height_mm: float, terrace_mm: float) -> list[float]:
@@ -85,8 +85,8 @@ def mould_body(plan: Plan, wells: Sequence[BaseGeometry] = ()) -> Body:
         InputError: pins that do not fit on the walls.
     """
     ridges = []
-    for layer, top in enumerate(plan.ridges):
-        ridges += ridge_prisms(plan, plan.layer_fibres(layer), top | wells[layer] if wells else top)
+    for layer, top_outline in enumerate(plan.ridges):
+        ridges += ridge_prisms(plan, plan.layer_fibres(layer), top_outline | wells[layer] if wells else top_outline)
     tray = tray_body(plan)
     return replace(tray, adds=(*ridges, *(number for number in number_prisms(plan) if number), *tray.adds))
 
@@ -105,20 +105,20 @@ def tray_body(plan: Plan) -> Body:
 
 
 def ridge_prisms(
-    plan: Plan, fibres: Sequence[int], top: BaseGeometry, tolerance_mm: float | None = None
+    plan: Plan, fibres: Sequence[int], top_outline: BaseGeometry, tolerance_mm: float | None = None
 ) -> list[Prism]:
     """Build the terraces of the ridges of some fibres of a layer, the upper first; a ridge without taper has one.
 
     Args:
         plan: plan of the mould.
         fibres: indices of the fibres.
-        top: outline of the uppermost terrace.
+        top_outline: outline of the uppermost terrace.
         tolerance_mm: maximum deviation of the other outlines; None for that of the settings.
     """
     floor, height = plan.settings.mould.floor_mm, plan.heights_mm[plan.layer_indices[fibres[0]]]
     prisms = []
     for below in terraces(height, plan.settings.terrace_mm):  # a sloping side is printed as steps
-        outline = plan.outline(fibres, below, tolerance_mm) if below else top
+        outline = plan.outline(fibres, below, tolerance_mm) if below else top_outline
         prisms.append(Prism(outline, floor - INTO_FLOOR_MM, floor + height - below))
     return prisms
 
@@ -136,8 +136,8 @@ def registration_pins(plan: Plan) -> list[Prism]:
     Raises:
         InputError: they do not fit on the walls.
     """
-    top, pin = plan.settings.mould.floor_mm + plan.silicone_mm, _pin_mm(plan)
-    return [Prism(cylinder(x, y, pin), top - INTO_FLOOR_MM, top + pin) for x, y in _pin_positions(plan)]
+    rim, pin = plan.settings.mould.floor_mm + plan.silicone_mm, _pin_mm(plan)
+    return [Prism(cylinder(x, y, pin), rim - INTO_FLOOR_MM, rim + pin) for x, y in _pin_positions(plan)]
 
 
 def _pin_mm(plan: Plan) -> float:

@@ -270,7 +270,7 @@ def sum_crossings(
 
 
 @kernel
-def sum_border_slopes(points: Any, slope: Any, shares: Any, zone: float, weight: float, grad_slope: Any) -> float:
+def sum_end_slopes(points: Any, slope: Any, shares: Any, zone: float, weight: float, grad_slope: Any) -> float:
     """Integrate the excess of slopes over 1 (45 degrees) within `zone` of either end of their fibre.
 
     The gradient is by the slopes; points and shares are treated as constants.

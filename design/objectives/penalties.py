@@ -24,9 +24,9 @@ from padforge.design.kernels.pchip import (
 )
 from padforge.design.kernels.rule_penalties import (
     add_arc_gradient,
-    sum_border_slopes,
     sum_closeness,
     sum_crossings,
+    sum_end_slopes,
     sum_excess_turns,
     sum_order,
 )
@@ -69,7 +69,7 @@ class Penalties(NamedTuple):
     """Penalties of the rules that can be broken, and the gradient of their sum by the knots.
 
     Attributes:
-        values: penalties by the key of `[rules]`.
+        values: penalties by their name in PENALTIES.
         grad_along: gradient by the coordinates along the fibres; shape (F, N + 2).
         grad_across: gradient by those across the fibres; shape (F, N + 2).
     """
@@ -299,13 +299,13 @@ def _common_tracks(fibres: FibreSamples, gradient: Gradient) -> float | None:
     return weight * total
 
 
-def _borders(fibres: FibreSamples, gradient: Gradient) -> float | None:
-    """Penalise slopes of more than 45 degrees near the walls at which fibres end."""
+def _end_slopes(fibres: FibreSamples, gradient: Gradient) -> float | None:
+    """Penalise slopes of more than 45 degrees within `border_mm` of the walls at which fibres end."""
     zone = fibres.rules.border_mm / fibres.layout.unit_mm
     if zone == 0:
         return None
     weight = 1 / len(fibres.arc) / fibres.mean_run
-    return sum_border_slopes(fibres.points, fibres.slope, fibres.shares, zone, weight, gradient.slope)
+    return sum_end_slopes(fibres.points, fibres.slope, fibres.shares, zone, weight, gradient.slope)
 
 
 def _keep_outs(fibres: FibreSamples, gradient: Gradient) -> float | None:
@@ -345,11 +345,13 @@ PENALTIES: dict[str, Callable[[FibreSamples, Gradient], float | None]] = {
     "max_crossings": _max_crossings,
     "min_crossing_angle_deg": _crossing_angles,
     "max_common_track_mm": _common_tracks,
-    "border_mm": _borders,
+    "end_slopes": _end_slopes,
     "keep_out_mm": _keep_outs,
     "max_length_mm": _lengths,
 }
-"""Penalties by the key of `[rules]`. They return None if the rule cannot be broken on this pad."""
+"""Penalties by the key of their rule in `[rules]`; None if it cannot be broken on this pad. Two have other names:
+`folds` belongs to `min_gap_mm`, and `end_slopes` keeps fibres from running along the walls at which they end.
+"""
 
 
 def _excess_crossings(fibres: FibreSamples, pairs: list[tuple[int, int]], limit: float, gradient: Gradient) -> float:

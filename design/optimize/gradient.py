@@ -53,6 +53,8 @@ FINE_STEPS = 200
 """The first steps of repair, which move only the fibres that break rules."""
 REPAIR_CHECKS = 20
 """Steps of repair between two exact checks of the rules."""
+MEAN_ERROR_RATE = 0.03
+"""Weight of the errors of a step in their running means."""
 KNOTS_PER_TURN = 3
 """Knots of a rounded turn: one at its peak and a shoulder to either side."""
 
@@ -377,9 +379,14 @@ class GradientSearch:
     def _objective(self, curves: FibreCurves, noise_factor: float) -> tuple[float, Array]:
         """Return the sum of the relative error and the weighted terms, and its gradient (3, F, n) by the curves.
 
-        Presses and failures are random. The error is computed under one contact, drawn in proportion to its
-        contribution to the relative error; for the others, running means of earlier steps stand in. With the weight
-        1 / probability the gradient is, on average, that of the mean over all contacts.
+        The relative error R depends on the errors e_ck under each contact c with k failed fibres. A step computes them
+        on random presses and failures, under one contact alone; running means of earlier steps stand in for the others.
+        The contact is drawn with the probability
+
+            p_c = sum over k of (dR / de_ck) e_ck / R,
+
+        its share of R (the shares add up to 1, since R is homogeneous of degree 1). The part of the gradient that comes
+        from its errors is divided by p_c, so that on average over the draws it is the gradient by all contacts.
         """
         search, pad, shares = self.problem.search, self.problem.pad, failure_shares(self.problem.search.max_failures)
         straight_errors = self.problem.straight_errors
@@ -391,22 +398,24 @@ class GradientSearch:
                 break
         masks = sample_failures(pad.layout.fibres, shares, self.rng)
         # 2. a random contact
-        value, grad_means = objective.relative_error(self._mean_errors, straight_errors, shares)
-        probabilities = (grad_means * self._mean_errors).sum(axis=1) / value
-        index = int(self.rng.choice(len(probabilities), p=probabilities))
-        contact, scale = self.problem.contacts[index], self.scales[index]
+        relative_error, grad_means = objective.relative_error(self._mean_errors, straight_errors, shares)
+        probabilities = (grad_means * self._mean_errors).sum(axis=1) / relative_error
+        drawn = int(self.rng.choice(len(probabilities), p=probabilities))
+        contact, scale = self.problem.contacts[drawn], self.scales[drawn]
         scatter = objective.scatter_of_full_scale(search.response_scatter.scaled(noise_factor), contact, scale)
-        # 3. the errors under it, and the mean over all contacts
+        # 3. the errors under it, by set of failed fibres, and their running means, by number of failed fibres
         errors, differentiate = self._errors(curves, presses, masks, contact, scale, scatter)
-        averages = objective.averages(masks, straight_errors.shape[1])
-        self._mean_errors[index] += 0.03 * (averages @ errors - self._mean_errors[index])
+        means_of_sets = objective.averages(masks, straight_errors.shape[1])
+        self._mean_errors[drawn] += MEAN_ERROR_RATE * (means_of_sets @ errors - self._mean_errors[drawn])
+        # 4. the relative error with these means, and its gradient: by the means, by the errors, by the curves
         total, grad_means = objective.relative_error(self._mean_errors, straight_errors, shares)
-        gradient = differentiate(grad_means[index] @ averages) / probabilities[index]
-        # 4. the terms that `[search]` weighs
+        grad_errors = grad_means[drawn] @ means_of_sets
+        gradient = differentiate(grad_errors) / probabilities[drawn]
+        # 5. the terms that `[search]` weighs
         for weight, term in weighted_terms(search):
             if term.loss is not None:
-                value, grad_curves = term.loss(curves, self.problem.contacts[0], pad)
-                total, gradient = total + weight * value, gradient + weight * grad_curves
+                loss, grad_curves = term.loss(curves, self.problem.contacts[0], pad)
+                total, gradient = total + weight * loss, gradient + weight * grad_curves
         return total, gradient
 
     def _errors(
@@ -418,7 +427,10 @@ class GradientSearch:
         scale: float,
         scatter: Scatter,
     ) -> tuple[Array, Differentiate]:
-        """Return the expected errors (L,) under a contact, and the function from a gradient by them to (3, F, n)."""
+        """Return the expected errors (L,) under a contact, and the function from a gradient by them to (3, F, n).
+
+        The response of a fibre is its relative stretch in full scales, signal / (scale * length).
+        """
         (length, grad_length), weights = curves.lengths(), objective.kernel_weights(self.problem.pad.layout)
         per_signal, positions = 1 / (scale * length[:, None]), presses.positions
         if len(presses.far):
@@ -434,9 +446,9 @@ class GradientSearch:
 
         def differentiate(grad_errors: Array) -> Array:
             grad_responses = np.tensordot(grad_errors, error_gradients, axes=1)
-            grad_lengths = (
-                -(grad_responses * responses).sum(axis=1) / length
-            )  # responses are proportional to 1 / length
-            return differentiate_signals(grad_responses * per_signal) + grad_lengths[:, None] * grad_length
+            by_signals = differentiate_signals(grad_responses * per_signal)
+            # d response / d length = -response / length
+            by_lengths = -(grad_responses * responses).sum(axis=1) / length
+            return by_signals + by_lengths[:, None] * grad_length
 
         return errors, differentiate

@@ -164,8 +164,8 @@ def fabrication_sections(folder: Path, document: Mapping[str, Any]) -> list[Page
     """
     digests = {name: document["sha256"][name] for name in _PICTURES if name in document["sha256"]}
     unchanged = find_unchanged(folder, digests)
-    for name in digests.keys() - unchanged:
-        if (folder / name).exists():
+    for name in digests:
+        if name not in unchanged and (folder / name).exists():
             raise InputError(f"{folder / name}: is not the one fabrication.json was written with; fabricate again")
     return [_mould_section(folder, unchanged, document), _bench_section(folder, unchanged, document)]
 

@@ -223,34 +223,36 @@ class FaultMonitor:
         A faulty fibre disturbs the predictions for the others. So every suspect is tested again by the fibres that are
         not suspected; the faulty one still stands out.
         """
-        neg_log_p = self._neg_log_p(self._failed)
-        worst = neg_log_p.max(axis=1)
-        order = np.argsort(-worst, kind="stable")[: min(MAX_SUSPECTS, int((~self._failed).sum()))]
-        suspects = order[worst[order] > self.model.threshold / 2]
-        onset = self._onset
-        first = max(
-            int(onset[suspects, neg_log_p[suspects].argmax(axis=1)].min()), self.n_presses + 1 - len(self._recent)
-        )
-        is_alarm = worst > self.model.threshold
-        pairs = [pair for pair in combinations(sorted(order.tolist()), 2) if is_alarm[list(pair)].any()]
-        # A swapped pair or an inverted fibre is the fault if it makes the readings far more likely.
+        # 1. The fibres with the largest sums are suspects above half the threshold; replays begin at their first onset.
+        neg_log_p, onset = self._neg_log_p(self._failed), self._onset
+        largest, threshold = neg_log_p.max(axis=1), self.model.threshold
+        ranked = np.argsort(-largest, kind="stable")[: min(MAX_SUSPECTS, int((~self._failed).sum()))]
+        suspects = ranked[largest[ranked] > threshold / 2]
+        first_onset = int(onset[suspects, neg_log_p[suspects].argmax(axis=1)].min())
+        first = max(first_onset, self.n_presses + 1 - len(self._recent))
+        # 2. A swapped pair or an inverted fibre is the fault if it makes the readings far more likely.
+        pairs = [pair for pair in combinations(sorted(ranked.tolist()), 2) if (largest[list(pair)] > threshold).any()]
         wirings = [*self._swapped(pairs, first), *self._inverted(first)]
-        wiring = max(wirings, key=lambda each: each.llr, default=None)
-        if wiring and not wiring.llr > self.model.threshold:
-            wiring = None
-        scores = []
-        for fibre in suspects:
-            failed = self._failed.copy()
-            failed[suspects] = True
-            failed[fibre] = False
-            self._replay(first, failed)
-            scores.append(self._neg_log_p(failed)[fibre].max())
-        fibres = wiring.fibres if wiring else (int(suspects[np.argmax(scores)]),)
-        fibre = max(fibres, key=lambda c: worst[c])
+        wiring = max((each for each in wirings if each.llr > threshold), key=lambda each: each.llr, default=None)
+        # 3. Otherwise it is the suspect that stands out most when it is predicted without the other suspects.
+        if wiring:
+            fibres = wiring.fibres
+        else:
+            sums = []
+            for suspect in suspects:
+                failed = self._failed.copy()
+                failed[suspects] = True
+                failed[suspect] = False
+                self._replay(first, failed)
+                sums.append(self._neg_log_p(failed)[suspect].max())
+            fibres = (int(suspects[np.argmax(sums)]),)
+        # 4. Kind, onset and score are those of its hypothesis with the largest sum before the replays.
+        fibre = max(fibres, key=lambda each: largest[each])
         hypothesis = int(neg_log_p[fibre].argmax())
         since = int(onset[fibre, hypothesis])
         kind = wiring.kind if wiring else self._classify(fibre, hypothesis, since)
-        score = min(float(worst[fibre] / np.log(10)), MAX_SCORE)
+        score = min(float(largest[fibre] / np.log(10)), MAX_SCORE)
+        # 5. The faulty fibres are masked, and the sums of the others computed without them.
         self._failed[list(fibres)] = True
         self._replay(first, self._failed)
         return FibreFault(self.n_presses, since, tuple(self.model.living[list(fibres)].tolist()), kind, score)

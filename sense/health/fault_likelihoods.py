@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from padforge.sense.arrays import MIN_SCALE_V, Array
-from padforge.sense.health.trace_model import COMPONENTS, HELD, RELEASED, REST, T_DEGREES, TRACE
+from padforge.sense.health.trace_model import COMPONENTS, HELD, REST, T_DEGREES, TRACE
 
 OFFSETS = (2.0, -2.0, 4.0, -4.0, 12.0, -12.0)  # of the rest, in standard deviations of its residual
 GAINS = {"no_response": 0.0, "reduced_gain": 0.5, "inverted": -1.0}
@@ -30,9 +30,15 @@ STD_SCALES = np.geomspace(0.5, 2.0, 9)
 STD_FLOORS = np.array([0.0, 0.02, 0.05, 0.1, 0.2, 0.4, 0.8])
 MIN_INNOVATION = 1e-3  # least standard deviation of the innovation of a rest, since it is divided by
 MAX_HEIGHT = 1e5  # a height that no sum reaches
-MIN_PEAKS = 30  # minimum number of peaks that a tail is fitted to
-_CHUNK = 64  # presses that are compared with the library at once
+MIN_PEAKS = 30  # minimum number of highest peaks that a tail is fitted to
+MAX_PEAKS = 300  # the same at most; between both, the highest tenth of all peaks
 MEDIAN_T, FAR_T = 0.7267, 6.869  # median and 0.999 quantile of |Student's t| with `T_DEGREES` degrees of freedom
+MEDIAN_NORMAL = 0.6745  # median of |standard normal|
+QUIET = 10  # last readings of the hold and of the release that show the noise alone
+MIN_RELATIVE_NOISE = 1e-3  # noise of a fibre that reads without any, relative to its response
+MIN_LOG_NOISE_STD = 0.1  # minimum deviation of the logarithm of a fibre's noise
+LOG_STEP_DENSITY = -4.0  # logarithm of the density of a step of any size, up to some hundred deviations
+_CHUNK = 64  # presses that are compared with the library at once
 
 
 @dataclass(frozen=True)
@@ -42,7 +48,7 @@ class FaultLikelihoods:
     std_scale: Array  # a predicted deviation s is calibrated to hypot(std_scale s, std_floor); shape (C, T)
     std_floor: Array
     noise_floor: Array  # noise of the components of a response; shape (C, D)
-    library_mean: Array  # predictions for other presses; shape (L, C, D)
+    library_mean: Array  # predictions for other presses; shape (LIBRARY, C, D)
     library_std: Array
     noise_v: Array  # median noise; shape (C,), V
     log_noise_mean: Array  # median and deviation of the logarithm of the noise over its median; shape (C,)
@@ -59,9 +65,10 @@ class FaultLikelihoods:
         """Fit to healthy traces, targets, and predictions (Q, C, T) by members that were not trained on the press."""
         std_scale, std_floor = _calibrate_std(targets - mean, std)
         noise_v = np.median(estimate_noise(traces), axis=0)
-        noise_v = np.where(noise_v > MIN_SCALE_V, noise_v, 1e-3 * target_scale_v[:, 0])
+        noise_v = np.where(noise_v > MIN_SCALE_V, noise_v, MIN_RELATIVE_NOISE * target_scale_v[:, 0])
         log_noise = _log_noise(traces, noise_v)
         log_noise_mean = np.median(log_noise, axis=0)
+        log_noise_std = np.median(np.abs(log_noise - log_noise_mean), axis=0) / MEDIAN_NORMAL
         calibrated = np.hypot(std * std_scale, std_floor)
         offset_residual = ((targets - mean) / calibrated)[:, :, -1]
         autocorr = np.clip(
@@ -77,7 +84,7 @@ class FaultLikelihoods:
             library_std=calibrated[library, :, :COMPONENTS],
             noise_v=noise_v,
             log_noise_mean=log_noise_mean,
-            log_noise_std=np.maximum(np.median(np.abs(log_noise - log_noise_mean), axis=0) / 0.6745, 0.1),
+            log_noise_std=np.maximum(log_noise_std, MIN_LOG_NOISE_STD),
             constant_share=((np.ptp(traces, axis=-1) == 0).sum(axis=0) + 1) / (len(traces) + 2),
             step_filters=fit_step_filters(traces, noise_v),
             rest_autocorr=autocorr,
@@ -116,8 +123,7 @@ class FaultLikelihoods:
             sign, size = np.sign(offset), abs(offset) / self.innovation_std
             continuing.append(_shift_llr(sign * innovation, (1 - self.rest_autocorr) * size))
             jump = np.maximum(sign * step, 0.0).max(axis=0)
-            # A step may have any size up to some hundred deviations: the logarithm of its density is about -4.
-            step_llr = np.clip(-_log_t(jump, 0.0, 1.0) - 4.0, 0.0, MAX_STEP_LLR)
+            step_llr = np.clip(LOG_STEP_DENSITY - _log_t(jump, 0.0, 1.0), 0.0, MAX_STEP_LLR)
             onset.append(np.clip(_shift_llr(sign * innovation, size), -MAX_LLR, MAX_LLR) + step_llr)
         valid = np.isfinite(traces).all(axis=-1, keepdims=True)
         llrs = np.clip(np.stack(continuing, axis=-1), -MAX_LLR, MAX_LLR), np.stack(onset, axis=-1)
@@ -163,7 +169,7 @@ def _previous(values: Array) -> Array:
 
 def estimate_noise(traces: Array) -> Array:
     """Estimate the noise (...), V, of traces (..., TRACE): mean step in quiet parts, but for the largest quarter."""
-    quiet = (slice(0, REST), slice(REST + HELD - 10, REST + HELD), slice(TRACE - RELEASED + 10, TRACE))
+    quiet = (slice(0, REST), slice(REST + HELD - QUIET, REST + HELD), slice(TRACE - QUIET, TRACE))
     steps = np.sort(np.concatenate([np.abs(np.diff(traces[..., part], axis=-1)) for part in quiet], axis=-1), axis=-1)
     return steps[..., : steps.shape[-1] * 3 // 4].mean(axis=-1)
 
@@ -241,7 +247,7 @@ def _fit_tail(llr_continuing: Array, llr_onset: Array) -> tuple[Array, Array]:
         peaks = np.sort(np.concatenate([_peaks(series) for series in heights[:, :, hypothesis].T]))
         # Zeros, of sums that never left 0, complete a number of peaks that is too small for a tail.
         peaks = np.concatenate([np.zeros(max(MIN_PEAKS + 1 - len(peaks), 0)), peaks])
-        top = int(np.clip(len(peaks) // 10, MIN_PEAKS, 300))
+        top = int(np.clip(len(peaks) // 10, MIN_PEAKS, MAX_PEAKS))
         base = peaks[-top - 1]
         slope[hypothesis] = max((peaks[-top:] - base).mean(), 1.0)
         rates = np.log([top / len(heights), 1 / len(heights)])

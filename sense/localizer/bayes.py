@@ -28,7 +28,9 @@ GAUSS_NEWTON_STEPS = 2
 MAX_STEP = 0.2  # maximum Gauss-Newton step, in units of the scaled position
 MIN_STD = 1e-2  # minimum standard deviation of the grid posterior, a tenth of a cell
 N_SUMMARY = 9  # entries of a posterior summary, see `BayesianLocalizer.predict`
-MIN_EXPONENT = -60.0  # exponents are clipped to it: smaller ones are negligible, and ten times slower to exponentiate
+MIN_EXPONENT = -60.0
+"""Exponents are clipped to it: smaller ones are negligible, and ten times slower to exponentiate. The expected error of
+a design (`bayes_error`) has the same limit for the same reason, but importing it from there would take seconds."""
 PREFIX = "bayes."  # of the names of the arrays in files
 _CHUNK = 2**15
 
@@ -140,10 +142,11 @@ class BayesianLocalizer:
         return position @ self.rotation.T + self.shift, summary
 
     def _linearize(self, position: Any, xp: Any) -> tuple[Any, Any, Any]:
-        """Linearize the response of each fibre at (Q, 2) positions, with J its Jacobian and S its covariance.
+        """Linearize the response of each fibre at (Q, 2) positions.
 
         Returns:
-            Expected discriminants (Q, C, D), J' S^-1 (Q, C, 2, D), and J' S^-1 J in xx, yy and xy (Q, C, 3).
+            Expected discriminants (Q, C, D); their Jacobian, transposed, times the inverse of their covariance
+            (Q, C, 2, D); and that times the Jacobian, the Fisher information in xx, yy and xy (Q, C, 3).
         """
         fibres, _, size = self.projection.shape
         local = interpolate_grid(self.linearization, position, xp)
@@ -233,7 +236,7 @@ def fit_projection(table: Array, residual: Array, fibre_mask: Mask, earlier: Arr
 
 
 def _fit_lda(expected: Array, residual: Array, components: int) -> Array:
-    """Return whitened linear discriminants (F, D), from responses at positions (S, F) and residuals (Q, F)."""
+    """Return whitened linear discriminants (F, D), from responses at positions (P, F) and residuals (Q, F)."""
     size = residual.shape[1]
     scatter = residual.T @ residual / max(len(residual), 1) + MIN_VARIANCE * np.eye(size)
     whitening = np.linalg.inv(np.linalg.cholesky(scatter)).T
@@ -245,9 +248,9 @@ def _fit_lda(expected: Array, residual: Array, components: int) -> Array:
 
 
 def _solve_2x2(fisher: Any, prior_precision: Any, gradient: Any, xp: Any) -> tuple[Any, Any]:
-    """Solve (J + P) step = gradient for Q presses; return variances and steps, (Q, 2).
+    """Solve (fisher + prior_precision) step = gradient for Q presses; return variances and steps, (Q, 2).
 
-    J is the Fisher information (Q, 3) in xx, yy and xy, P the diagonal prior precision (Q, 2).
+    The Fisher information (Q, 3) is in xx, yy and xy, the prior precision (Q, 2) diagonal.
     """
     xx, yy, xy = fisher[:, 0] + prior_precision[:, 0], fisher[:, 1] + prior_precision[:, 1], fisher[:, 2]
     det = xp.clip(fisher[:, 0] * fisher[:, 1] - xy**2, 0.0, np.inf)  # may be negative by rounding

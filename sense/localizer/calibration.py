@@ -315,21 +315,21 @@ def calibrate_uncertainty(
         model = _calibrate_scales(model, moments, positions_mm, levels, on_progress, n_trained)
     uncalibrated = replace(model, interval_factors=np.ones_like(model.interval_factors))
     n_sets = MOMENT_SUBSETS if len(moments) > 1 else INTERVAL_SUBSETS
-    subsets = [failure_subsets(model.fibres, level, n_sets) for level in range(levels)]
-    predictions: list[list[list[Localization]]] = []
-    for presses in moments:
+    subsets = [failure_subsets(model.fibres, n_failed, n_sets) for n_failed in range(levels)]
+    predictions: list[list[list[Localization]]] = []  # by moment, then by number of failed fibres
+    for features in moments:
         on_progress(len(predictions), len(moments), "radii")
-        predictions.append([[uncalibrated.predict_features(presses, each) for each in sets] for sets in subsets])
+        predictions.append([[uncalibrated.predict_features(features, failed) for failed in sets] for sets in subsets])
     prior_ratios = None
     if n_trained:
-        shares = np.arange(levels) / model.fibres
+        failed_shares = np.arange(levels) / model.fibres
         experience = [Experience.at(n_complete) for n_complete in range(1, len(moments) + 1)]
-        expected = np.array([[each.ratio(n_trained, share) for share in shares] for each in experience])
+        expected = np.array([[each.ratio(n_trained, share) for share in failed_shares] for each in experience])
         prior_ratios = adapt_ratios(expected, predictions, positions_mm)
-    factors = [
+    factors: list[list[Array]] = [
         [
-            conformal(of_level, positions_mm, measures, None if prior_ratios is None else prior_ratios[moment, level])
-            for level, of_level in enumerate(of_moment)
+            conformal(of_set, positions_mm, measures, None if prior_ratios is None else prior_ratios[moment, n_failed])
+            for n_failed, of_set in enumerate(of_moment)
         ]
         for moment, of_moment in enumerate(predictions)
     ]
@@ -380,34 +380,39 @@ def _calibrate_scales(
     since training presses are augmented by the response that it predicts them with. After `n_trained` presses, the mean
     of the scales is known from other pads, and these presses determine the ratios between members alone.
     """
-    targets = (positions_mm - model.scaler.origin_mm) / model.scaler.scale_mm
-    subsets = [subset for level in range(levels) for subset in failure_subsets(model.fibres, level, SCALE_SUBSETS)]
+    positions = (positions_mm - model.scaler.origin_mm) / model.scaler.scale_mm
+    subsets = [
+        failed for n_failed in range(levels) for failed in failure_subsets(model.fibres, n_failed, SCALE_SUBSETS)
+    ]
 
-    # 1. Ratios of error to expected error of each member, with the expected ratio as the prior
-    member_ratios: dict[str, list[Array]] = {}
+    # 1. Mean ratio of error to expected error of each member, by moment and set of failed fibres, with the expected
+    # ratio as the prior; the members of the networks that answer at the moment follow each other
+    ratios_of: dict[str, list[Array]] = {}  # by network
+    n_presses = len(positions_mm)
     first = int(len(moments) > 1)
-    for n_complete, presses in enumerate(moments, first):
+    for n_complete, features in enumerate(moments, first):
         on_progress(n_complete - first, len(moments), "expected errors")
         growth = Experience.at(n_complete).growth(n_trained) if n_trained else 1.0
-        rows = np.flatnonzero(count_complete(presses.complete) == n_complete)  # the next press may cut off some
-        names = active_networks(model.networks, n_complete, presses.complete.shape[1], bool(model.bayes))
+        rows = np.flatnonzero(count_complete(features.complete) == n_complete)  # the next press may cut off some
+        names = active_networks(model.networks, n_complete, features.complete.shape[1], bool(model.bayes))
         for failed in subsets if len(rows) else ():
-            fibre_mask = presses.fibre_mask[rows] & ~np.isin(np.arange(model.fibres), failed)
-            inputs = presses.inputs[rows], fibre_mask, presses.complete[rows]
+            fibre_mask = features.fibre_mask[rows] & ~np.isin(np.arange(model.fibres), failed)
+            inputs = features.inputs[rows], fibre_mask, features.complete[rows]
             outputs = predict_members(model.networks, *inputs, *model.corrected)
             predicted, log_error = (half[:, :, :2] for half in np.split(outputs, 2, axis=2))
-            expected = np.exp(np.clip(log_error, MIN_LOG_ERROR, MAX_LOG_ERROR)).mean(axis=2)
-            ratio = (np.abs(predicted - targets[rows]).mean(axis=2) / expected).mean(axis=1)
+            error = np.abs(predicted - positions[rows]).mean(axis=2)
+            expected_error = np.exp(np.clip(log_error, MIN_LOG_ERROR, MAX_LOG_ERROR)).mean(axis=2)
+            ratios = (error / expected_error).mean(axis=1)
             if n_trained:
-                ratio *= growth / ratio.mean()
-            ratio = (PRIOR_COUNT * growth + len(positions_mm) * ratio) / (PRIOR_COUNT + len(positions_mm))
+                ratios *= growth / ratios.mean()
+            ratios = (PRIOR_COUNT * growth + n_presses * ratios) / (PRIOR_COUNT + n_presses)
             for name in names:
-                members = 1 if name == RESIDUAL else len(model.networks[name]["last.b"])
-                member_ratios.setdefault(name, []).append(ratio[:members])
-                ratio = ratio[members:]
+                n_members = 1 if name == RESIDUAL else len(model.networks[name]["last.b"])
+                ratios_of.setdefault(name, []).append(ratios[:n_members])
+                ratios = ratios[n_members:]
 
     # 2. Scale of each member
-    log_scales = {name: np.log(np.mean(ratios, axis=0)) for name, ratios in member_ratios.items()}
+    log_scales = {name: np.log(np.mean(ratios, axis=0)) for name, ratios in ratios_of.items()}
 
     def scaled(name: str, weights: Weights) -> Weights:
         if name not in log_scales:

@@ -323,18 +323,12 @@ def conformal(
     measures: Measures | None = None,
     prior_ratio: float | None = None,
 ) -> Array:
-    """Return factors with which standard deviations, radii and r90 of measures hold on these presses.
+    """Return factors with which standard deviations, radii and r90 of measures hold on presses, as in `error_row`.
 
     Radii are split conformal (Lei et al. 2018, Distribution-free predictive inference for regression): quantiles of
     distance over radius on presses that were not used before, one rank higher than the share, which is more cautious
-    after few presses.
-
-    Args:
-        predictions: as in `error_row`.
-        positions_mm: as there.
-        measures: as there.
-        prior_ratio: mean ratio of distance to radius on other pads. A gamma distribution about it counts as
-            PRIOR_PRESSES further presses, since quantiles of few presses vary much. None for no prior.
+    after few presses. With a `prior_ratio`, the mean ratio of distance to radius on other pads, a gamma distribution
+    about it counts as PRIOR_PRESSES further presses, since quantiles of few presses vary much.
 
     Returns:
         Factors (3 + T,) on the standard deviation, the radii of 50 and 90 %, and the r90 of T measures (1 if no true
@@ -433,14 +427,10 @@ def calibration_lines(document: Mapping[str, Any]) -> list[str]:
 
 def reserve_lines(document: Mapping[str, Any]) -> list[str]:
     """Say in lines with what reserve a calibration document is to be read: training, radii, and what is doubtful."""
-    doubts = [f"doubtful: {doubt}" for doubt in document.get("doubts", ())]
-    return [*untrained_lines(document), *sureness_lines(document), *doubts]
-
-
-def untrained_lines(document: Mapping[str, Any]) -> list[str]:
-    """Return a line if the training of the localizer of a calibration document was too short, else none."""
     share = document.get("trained_share", 1.0)
-    return [f"not trained out: {share:.0%} of the usual steps; errors fall with more time"] * (share < TRAINED_OUT)
+    untrained = [f"not trained out: {share:.0%} of the usual steps; errors fall with more time"]
+    doubts = [f"doubtful: {doubt}" for doubt in document.get("doubts", ())]
+    return [*(untrained if share < TRAINED_OUT else ()), *sureness_lines(document), *doubts]
 
 
 def sureness_lines(document: Mapping[str, Any]) -> list[str]:

@@ -1,7 +1,13 @@
-"""Features of presses: means of each fibre's readings over windows about a press, and its history before it.
+"""Features of presses: means of each fibre's readings over windows of the press, and its history before it.
 
-The windows are those of `moments`. Where a window would reach into a neighbouring press, the nearest reading of its own
-press is repeated. Each feature depends on one fibre alone, so that a failed fibre can be masked and affects no other.
+Both are relative to the baseline of the fibre, its mean at rest just before the press (`REST` of `moments`):
+
+- The windows are those of `moments`: they show the response to the press. Where a window would reach into a
+  neighbouring press, the nearest reading of its own press is repeated.
+- The history is the mean over each of `HISTORY_WINDOWS` and the median over each of `SLOW`, which end before the press,
+  whatever happened in them. It shows how far the fibre has crept after earlier presses, and so how it still creeps.
+
+Each feature depends on one fibre alone, so that a failed fibre can be masked and affects no other.
 Short gaps (NaN) are interpolated; a fibre with too few readings in a press is masked in it.
 """
 
@@ -42,8 +48,8 @@ MIN_PRESENT = 0.75  # minimum share of valid readings of a fibre in a press
 class PressFeatures:
     """Features of Q presses in volts."""
 
-    windows: Array  # (Q, C, F)
-    history: Array  # (Q, C, J), relative to the baseline
+    windows: Array  # (Q, C, F), relative to the baseline
+    history: Array  # (Q, C, J), relative to the baseline; J = 0 for features without moments
     fibre_mask: Mask  # (Q, C), whether the fibre has enough readings
     complete: Mask  # (Q, K), complete windows of the press and the release; K = 0 for features without moments
 
@@ -114,7 +120,7 @@ def interpolate_gaps(readings: Array) -> Array:
 
 
 def window_means(readings: Array, down_command: Indices, up_command: Indices, until: Indices) -> Array:
-    """Return (Q, C, F) means over the windows of press, release and latest readings, V, less the baseline."""
+    """Return (Q, C, F) means over the windows of press, release and latest readings, V, relative to the baseline."""
     previous_end, _ = _neighbours(down_command, up_command, len(readings))
     baseline = mean_at_rest(readings, down_command, previous_end)
     return windows_from_rest(readings, baseline, down_command, up_command, until)
@@ -140,21 +146,25 @@ def windows_from_rest(
 def compute_history(readings: Array, down_command: Indices) -> Array:
     """Return the history (Q, C, J) before the presses, V, relative to the baseline: windows, then slow medians.
 
-    It includes all readings, whether or not a press is known there.
+    It includes all readings, whether or not a press is known there. So the baseline is the mean of all readings in
+    `REST`, also of those before the end of the previous press, which `mean_at_rest` does not use.
     """
-    level = readings[0]  # subtracted so that long sums keep their digits
-    sums = np.vstack([np.zeros((1, readings.shape[1])), np.cumsum(readings - level, axis=0)])
+    offset = readings[0]  # subtracted so that long sums keep their digits
+    sums = np.vstack([np.zeros((1, readings.shape[1])), np.cumsum(readings - offset, axis=0)])
 
     def mean(window: Window) -> Array:
         first = np.maximum(down_command + window[0], 0)
         end = np.maximum(down_command + window[1], first + 1)
-        return (sums[end] - sums[first]) / (end - first)[:, None] + level
+        return (sums[end] - sums[first]) / (end - first)[:, None] + offset
 
-    slow = [_slow_median(readings, down_command, length) for length in SLOW]
-    return np.stack([*map(mean, HISTORY_WINDOWS), *slow], axis=2) - mean(REST)[:, :, None]
+    means = [mean(window) for window in HISTORY_WINDOWS]
+    medians = [_slow_median(readings, down_command, length) for length in SLOW]
+    baseline = mean(REST)
+    return np.stack([*means, *medians], axis=2) - baseline[:, :, None]
 
 
 def _slow_median(readings: Array, down_command: Indices, length: int) -> Array:
+    """Return the (Q, C) medians of `N_MEDIAN_SAMPLES` of the `length` readings before each press."""
     offsets = np.arange(-length, 0, length // N_MEDIAN_SAMPLES)
     out = np.empty((len(down_command), readings.shape[1]))
     for first in range(0, len(down_command), 1024):  # in chunks, since a press takes kilobytes

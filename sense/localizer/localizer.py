@@ -42,8 +42,9 @@ class Localizer:
     calibration_: Evaluation
 
     def __init__(self, max_failures: int = 3, random_state: int = 0, **options: Any) -> None:
-        for name in options.keys() - set(OPTIONS):
-            raise InputError(f"Localizer has no option {name}, expected one of {', '.join(OPTIONS)}")
+        for name in options:
+            if name not in OPTIONS:
+                raise InputError(f"Localizer has no option {name}, expected one of {', '.join(OPTIONS)}")
         self.max_failures, self.random_state = max_failures, random_state
         for name in OPTIONS:
             setattr(self, name, options.get(name, LocalizerSettings.model_fields[name].default))

@@ -290,21 +290,19 @@ class LocalizerModel(LocalizerDocument):
         rows = np.flatnonzero(unlike)
         if self.sliding is not None and len(rows):  # a sliding finger responds like several presses
             inputs = presses.inputs[rows], presses.fibre_mask[rows], presses.complete[rows]
-            unlike[rows] = (
-                self.sliding.follow(self.networks[SLIDE_NETWORK], *inputs).distance <= POSSIBLE_SLIDE_THRESHOLD
-            )
+            tracked = self.sliding.follow(self.networks[SLIDE_NETWORK], *inputs)
+            unlike[rows] = tracked.distance <= POSSIBLE_SLIDE_THRESHOLD
         std_mm, r50_mm, r90_mm = np.array(UNIFORM) * self.scaler.scale_mm
-        measures = {
-            target.name: replace(estimate, r90=np.where(unlike, target.scale, estimate.r90))
-            for target, estimate in zip(self.scaler.measures, localization.measures.values(), strict=True)
-        }
-        return Localization(
-            localization.positions_mm,
-            np.where(unlike[:, None], std_mm, localization.std_mm),
-            np.where(unlike, r50_mm, localization.r50_mm),
-            np.where(unlike, r90_mm, localization.r90_mm),
-            measures,
-            unlike,
+        return replace(
+            localization,
+            std_mm=np.where(unlike[:, None], std_mm, localization.std_mm),
+            r50_mm=np.where(unlike, r50_mm, localization.r50_mm),
+            r90_mm=np.where(unlike, r90_mm, localization.r90_mm),
+            measures={
+                target.name: replace(estimate, r90=np.where(unlike, target.scale, estimate.r90))
+                for target, estimate in zip(self.scaler.measures, localization.measures.values(), strict=True)
+            },
+            unlike=unlike,
         )
 
     def predict_features(self, presses: ScaledFeatures, failed: ArrayLike = ()) -> Localization:
@@ -323,13 +321,11 @@ class LocalizerModel(LocalizerDocument):
         fibre_mask: Mask = np.logical_and(presses.fibre_mask, self._working(failed))
         chunk = max(1, _CHUNK // self.fibres)
         parts = []
-        for first in range(0, len(presses), chunk):
+        for first in range(0, max(len(presses), 1), chunk):
             rows = slice(first, first + chunk)
             inputs = presses.inputs[rows], fibre_mask[rows], presses.complete[rows]
             parts.append(predict(self.networks, *inputs, *self.corrected, self.sliding))
-        empty = np.empty((0, 2 + len(self.scaler.measures)), np.float32)
-        empties = empty, empty, np.empty(0, bool)
-        targets, std, slid = (np.concatenate(part) for part in zip(empties, *parts, strict=True))
+        targets, std, slid = (np.concatenate(part) for part in zip(*parts, strict=True))
         n_complete, level = count_complete(presses.complete), np.minimum((~fibre_mask).sum(axis=1), self.max_failures)
         factors = self.interval_factors[np.where(slid, N_PRESS_WINDOWS - 1, n_complete), level]
         to_std, to_r50, to_r90 = factors[:, :3].T * self.scaler.scale_mm

@@ -10,9 +10,9 @@ release::
     RELEASE_WINDOWS                                          |0|1|2|3| 4 |  5  |    6    |     7     |
     LATEST_WINDOWS                                       |1|0|
 
-They are complete one after the other, so that the number of complete windows, K = 0 .. N_TIMED, says how far a press
-is. Each phase of a press has its own network (`PHASES`), since one network for all phases learns each of them less
-well::
+Windows of the press and the release are complete one after the other, so that their number, 0 to N_TIMED, says how far
+a press is. K is the number of those windows that a localizer uses: N_TIMED, N_PRESS_WINDOWS, or 0. Each phase of a
+press has its own network (`PHASES`), since one network for all phases learns each of them less well::
 
     complete     phase            network
     0            -                none: the press may be anywhere
@@ -43,7 +43,7 @@ LATEST_WINDOWS: tuple[Window, ...] = ((-1, 0), (-2, -1))
 """Windows before the latest reading, or before the release if that is earlier: they locate a finger that moves."""
 N_PRESS_WINDOWS = len(PRESS_WINDOWS)
 N_TIMED = len(PRESS_WINDOWS) + len(RELEASE_WINDOWS)
-"""Largest K: the windows of a press that are complete one after the other."""
+"""Windows of a press that are complete one after the other."""
 MODULATED = slice(2, 5), slice(5, 9), slice(12, 17)
 """Groups of windows; the sensitivity of a group is modulated as one (see `response_model`)."""
 
@@ -114,7 +114,7 @@ RESIDUAL_PHASE = Phase(N_PRESS_WINDOWS + 3, (0.15, 0.1, 0.15, 0.1, 0.05, 0.45))
 
 
 def complete_windows(down_command: Indices, up_command: Indices, until: Indices) -> Mask:
-    """Return (Q, K) which windows of `PRESS_WINDOWS` and `RELEASE_WINDOWS` are complete before readings `until` (Q,).
+    """Return (Q, K) which of `PRESS_WINDOWS` and `RELEASE_WINDOWS` are complete before readings `until` (Q,).
 
     After the release all `PRESS_WINDOWS` are complete, also those of a shorter press, whose last reading is repeated.
     """

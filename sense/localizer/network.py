@@ -30,9 +30,9 @@ from padforge.sense.localizer.moments import (
 )
 
 Weights = Mapping[str, Floats]
-"""`first.w` (E, D, H), `first.b` (E, 1, H), `hidden.w` (L, E, H, H), `hidden.b` (L, E, 1, H), `last.w` (E, H, 2 N) and
-`last.b` (E, 1, 2 N), for E members, D inputs, H hidden units, L residual layers and N targets; of the published
-network, E = 1, no `hidden`, and 2 in place of 2 N."""
+"""`first.w` (E, I, H), `first.b` (E, 1, H), `hidden.w` (layers, E, H, H), `hidden.b` (layers, E, 1, H), `last.w`
+(E, H, 2 N) and `last.b` (E, 1, 2 N), for E members, I inputs, H hidden units and N targets; of the published network,
+E = 1, no `hidden`, and 2 in place of 2 N."""
 
 N_OUTPUTS = 4
 """Outputs without measures: scaled x, y, and their log errors. With T measures, T values follow y, and T log errors
@@ -44,11 +44,11 @@ MAX_WEIGHT = 1e4  # far above the weights of any training; sums of smaller ones 
 
 
 def check_weights(weights: Weights, n_inputs: int, method: str, n_measures: int = 0) -> None:
-    """Raise InputError unless weights have the shapes and values of a network of D inputs and T measures."""
+    """Raise InputError unless weights have the shapes and values of a network of I inputs and T measures."""
     shapes = {name: weight.shape for name, weight in weights.items()}
     first, layers = shapes.get("first.w", ()), shapes.get("hidden.w", (0,))[:1]
     if len(first) != 3 or len(layers) != 1 or 0 in first:
-        raise InputError(f"weights have shapes {shapes}, expected first.w (E, D, H) and others")
+        raise InputError(f"weights have shapes {shapes}, expected first.w (E, I, H) and others")
     members, _, hidden = first
     outputs = N_OUTPUTS + 2 * n_measures if method == "ensemble" else 2
     expected = {
@@ -72,7 +72,7 @@ def network_inputs(features: Floats, fibre_mask: Mask, complete: Mask) -> Floats
 
 
 def forward(weights: Weights, x: Floats) -> Floats:
-    """Return (E, Q, 2 N) targets and log errors for (Q, D) inputs; log errors of the published network are 0."""
+    """Return (E, Q, 2 N) targets and log errors for (Q, I) inputs; log errors of the published network are 0."""
     h = x @ weights["first.w"] + weights["first.b"]
     if "hidden.w" not in weights:
         targets = np.tanh(h) @ weights["last.w"] + weights["last.b"]

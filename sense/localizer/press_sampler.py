@@ -47,12 +47,12 @@ class _Source(NamedTuple):
 
 
 class _Moments(NamedTuple):
-    """Moments at which the presses of a batch are read, of which the first S slide."""
+    """Moments at which the presses of a batch are read, of which the first ones slide."""
 
     counts: Indices  # complete windows; shape (B,)
     last: Indices  # latest reading of the press; shape (B,)
-    end: Array  # latest reading of a slide, which may be longer than `PRESS_WINDOWS`; shape (S,)
-    velocity: Array  # scaled distance per reading; shape (S, 2)
+    end: Array  # latest reading of a slide, which may be longer than `PRESS_WINDOWS`; shape (n,)
+    velocity: Array  # scaled distance per reading; shape (n, 2)
     correlation_length: float  # of residuals, scaled
 
 
@@ -87,8 +87,7 @@ class PressSampler:
         self._n_timed = presses.complete.shape[1]
         self._bayes = tuple(stage.map_arrays(torch.from_numpy) for stage in bayes)
         self.n_inputs = fibres * (n_features + 1) + self._n_timed + (N_SUMMARY if bayes else 0)
-        self._phase, self._cumulative_shares = phase, np.cumsum(phase.shares)
-        self._speed, self._per_mm = presses.speed, presses.per_mm
+        self._phase, self._speed, self._per_mm = phase, presses.speed, presses.per_mm
 
     def sample_rows(self, batch: int) -> Indices:
         """Sample the rows (B,) of a batch of presses."""
@@ -103,7 +102,7 @@ class PressSampler:
             noise: standard deviation of noise on the scaled features.
 
         Returns:
-            Inputs (B, D), and the positions (B, 2) by the Bayesian localizer, or 0 without one.
+            Inputs (B, I), and the positions (B, 2) by the Bayesian localizer, or 0 without one.
         """
         moments = self._sample_moments(len(rows))
         fibres, n_features = self._source.residual.shape[1:]
@@ -122,7 +121,7 @@ class PressSampler:
 
     def _sample_moments(self, batch: int) -> _Moments:
         """Sample moments of the phase; a single one with Bayesian localizers, since each serves one stage."""
-        n_moments, rng, shares = 1 if self._bayes else batch, self.rng, self._cumulative_shares
+        n_moments, rng, shares = 1 if self._bayes else batch, self.rng, np.cumsum(self._phase.shares)
         offsets = np.searchsorted(shares, rng.random(n_moments) * shares[-1], side="right")
         counts = np.full(batch, self._phase.first + offsets)
         begin, end = (_ENDS[np.minimum(counts + k, N_PRESS_WINDOWS + 1)] for k in (0, 1))
@@ -160,7 +159,7 @@ def _compute_inputs(
         moments: `_Moments` of the presses.
         noise: standard deviation of noise on the features.
         rng: random number generator.
-        x: 0; shape (B, D). Masked features, and windows that are not complete, stay 0.
+        x: 0; shape (B, I). Masked features, and windows that are not complete, stay 0.
     """
     side, (fibres, size), n_timed = len(source.table), source.residual.shape[1:], source.complete.shape[1]
     residual, features, latest = np.empty(size), np.empty(size), np.empty(N_LATEST)
@@ -228,10 +227,10 @@ def _trace_slide(
 ) -> tuple[Any, Any, Any, Any]:
     """Trace a finger from its target back to its touch, for `PRESS_WINDOWS` and then `LATEST_WINDOWS`.
 
-    With R_m(x) the response of window m to a press at x, L = `LAST_INSTANT_WINDOW`, x(t) the position of the finger and
+    With R_m(x) the response of window m to a press at x, i = `LAST_INSTANT_WINDOW`, x(t) the position of the finger and
     t_m the middle of window m, the response of window k at time t is the superposition of delayed increments
 
-        R_min(k, L)(x(t)) + sum over n = 1 .. k - L of [R_(L + n) - R_(L + n - 1)](x(t - (t_(L + n) - t_L))).
+        R_min(k, i)(x(t)) + sum over n = 1 .. k - i of [R_(i + n) - R_(i + n - 1)](x(t - (t_(i + n) - t_i))).
 
     Args:
         target: position of the finger at the end; shape (2,).
@@ -242,8 +241,8 @@ def _trace_slide(
         side: of the table.
 
     Returns:
-        Windows k (J,), the correlation (J,) of their residuals with that of the press at rest, and for each increment
-        n the cells (N, J, 2) of the table and the positions (N, J, 2) in them.
+        Windows k and the correlation of their residuals with that of the press at rest, for all windows; and for each
+        increment n, by window, the cells (i, j) of the table and the positions (u, v) in them.
     """
     n_windows, n_increments = N_PRESS_WINDOWS + len(latest_windows), N_PRESS_WINDOWS - LAST_INSTANT_WINDOW
     windows, correlation = np.empty(n_windows, np.int64), np.empty(n_windows)

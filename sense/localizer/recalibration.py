@@ -152,13 +152,12 @@ def recalibrate(
     # 2. Response
     new_fibres, twice_as_many_mm = [], None
     if model.method == "ensemble":
-        prior = None
+        plan = None
         if pad is not None:
-            prior = plan_prior(pad, stated_contact(recording), model.scaler.origin_mm, model.scaler.scale_mm)
-        refit = _Refit(prior, seed)
+            plan = plan_prior(pad, stated_contact(recording), model.scaler.origin_mm, model.scaler.scale_mm)
 
         def refit_last(old: LocalizerModel, *training: Any) -> LocalizerModel:
-            refitted = refit(old, *training, only_last=True)[0]
+            refitted = refit(old, *training, plan=plan, seed=seed, only_last=True)[0]
             step()
             return refitted
 
@@ -168,7 +167,7 @@ def recalibrate(
         if gain > MIN_REFIT_GAIN * standard_error:
             half = halves.predict(halves.change([model] * 2, refit_last))
             twice_as_many_mm = _extrapolate(validation.mean_error(predictions), halves.mean_error(half))
-            changed, is_new = refit(model, *presses)
+            changed, is_new = refit(model, *presses, plan=plan, seed=seed)
             after, change, new_fibres = predictions, "refitted", np.flatnonzero(is_new).tolist()
     on_progress(total, total, "")
 
@@ -207,72 +206,73 @@ def _extrapolate(error_mm: float, half_mm: float) -> float:
     return error_mm * (2 / (1 - 1 / FOLDS)) ** -exponent
 
 
-@dataclass(frozen=True)
-class _Refit:
-    """Fit of the response, the Bayesian localizers and the networks of a localizer to new presses.
+def refit(
+    old: LocalizerModel,
+    features: PressFeatures,
+    positions_mm: Array,
+    measures: Measures,
+    *,
+    plan: ResponsePrior | None,
+    seed: int,
+    only_last: bool = False,
+) -> tuple[LocalizerModel, Mask]:
+    """Refit response, Bayesian localizers and networks to new presses; return the localizer, and which fibres are new.
 
-    Attributes:
-        prior: from the plan of the pad; None without a plan.
+    Args:
+        old: the localizer as it is.
+        features: of the new presses, V.
+        positions_mm: of these; shape (Q, 2).
+        measures: depths and forces of these, NaN where unknown; shape (Q,) each.
+        plan: prior from the plan of the pad; None without a plan.
         seed: of the training.
+        only_last: whether to retrain only the networks that answer at the end of a press.
     """
+    from padforge.sense.localizer.training import retrain  # torch takes long to import
 
-    prior: ResponsePrior | None
-    seed: int
+    # 1. Response, with the present maps or the corrected ones as the prior, by evidence
+    starts = [old, fit_correction(old, features, positions_mm, measures)]
+    fits = [_fit_response(start, features, positions_mm, measures, plan) for start in starts]
+    number = int(np.argmax([fit.log_evidence for *_, fit in fits]))
+    start, (presses, table, response) = starts[number], fits[number]
+    presses, n_timed = leave_one_out_residuals(presses, table, response.leverage), features.complete.shape[1]
 
-    def __call__(
-        self,
-        old: LocalizerModel,
-        features: PressFeatures,
-        positions_mm: Array,
-        measures: Measures,
-        *,
-        only_last: bool = False,
-    ) -> tuple[LocalizerModel, Mask]:
-        """Return the refitted localizer, and which fibres (C,) are new.
+    # 2. Bayesian localizers, networks and tests
+    fitted = presses.inputs, presses.fibre_mask, presses.targets[:, :2]
+    bayes = fit_stages(table, *fitted, n_timed, earlier=start.bayes) if start.bayes else ()
+    last = active_networks(start.networks, n_timed, n_timed, bool(bayes))
+    networks = {name: weights for name, weights in start.networks.items() if not only_last or name in last}
+    rng = np.random.default_rng([seed, len(features)])
+    retrained = retrain(networks, start.residual_network, presses, table, start.max_failures, rng, bayes)
+    zero = start.scaler.mean_v / start.scaler.scale_v
+    tests = [
+        SinglePressTest.fit(table, presses, zero, n_complete, test).calibrated(presses)
+        for n_complete, test in zip(stages(n_timed), start.single_press, strict=True)
+    ]
+    changed = replace(
+        start,
+        networks={**start.networks, **retrained[0]},
+        residual_network=retrained[1],
+        bayes=bayes,
+        table=table,
+        single_press=tuple(tests),
+    )
+    return changed, response.is_new
 
-        With `only_last`, only the networks that answer at the end of a press are retrained.
-        """
-        from padforge.sense.localizer.training import retrain  # torch takes long to import
 
-        # 1. Response, with the present maps or the corrected ones as the prior, by evidence
-        starts = [old, fit_correction(old, features, positions_mm, measures)]
-        fits = [self._fit_response(start, features, positions_mm, measures) for start in starts]
-        number = int(np.argmax([fit.log_evidence for *_, fit in fits]))
-        start, (presses, table, response) = starts[number], fits[number]
-        presses, n_timed = leave_one_out_residuals(presses, table, response.leverage), features.complete.shape[1]
-
-        # 2. Bayesian localizers, networks and tests
-        fitted = presses.inputs, presses.fibre_mask, presses.targets[:, :2]
-        bayes = fit_stages(table, *fitted, n_timed, earlier=start.bayes) if start.bayes else ()
-        last = active_networks(start.networks, n_timed, n_timed, bool(bayes))
-        networks = {name: weights for name, weights in start.networks.items() if not only_last or name in last}
-        rng = np.random.default_rng([self.seed, len(features)])
-        retrained = retrain(networks, start.residual_network, presses, table, start.max_failures, rng, bayes)
-        networks, residual_network = {**start.networks, **retrained[0]}, retrained[1]
-        changed = replace(start, networks=networks, residual_network=residual_network, bayes=bayes, table=table)
-        zero = start.scaler.mean_v / start.scaler.scale_v
-        tests = [
-            SinglePressTest.fit(table, presses, zero, n_complete, test).calibrated(presses)
-            for n_complete, test in zip(stages(n_timed), start.single_press, strict=True)
-        ]
-        return replace(changed, single_press=tuple(tests)), response.is_new
-
-    def _fit_response(
-        self, old: LocalizerModel, features: PressFeatures, positions_mm: Array, measures: Measures
-    ) -> tuple[TrainingPresses, Floats, ResponseFit]:
-        """Scaled presses, the response table (S, S, C, F + G), and its fit, whose evidence is of windows in volts."""
-        scaler, n_windows = old.scaler, features.windows.shape[2]
-        predicted = old.predict_features(scaler.transform(features)).measures
-        # Unknown depths and forces are replaced by their predictions.
-        completed = {
-            name: np.where(np.isnan(values), predicted[name].values, values) for name, values in measures.items()
-        }
-        presses = scaler.training_presses(features, positions_mm, completed, frame_rate_hz(old.rate_hz))
-        maps = scaler.uncentre(old.table)[..., :n_windows]
-        prior = map_prior(maps) if self.prior is None else replace(self.prior, mean=maps)
-        table, response = refit_response(scaler, presses, old.table, n_windows, prior)
-        log_scale = float(presses.fibre_mask.sum(axis=0) @ np.log(scaler.scale_v[:, :n_windows]).sum(axis=1))
-        return presses, table, replace(response, log_evidence=response.log_evidence - log_scale)
+def _fit_response(
+    old: LocalizerModel, features: PressFeatures, positions_mm: Array, measures: Measures, plan: ResponsePrior | None
+) -> tuple[TrainingPresses, Floats, ResponseFit]:
+    """Scaled presses, the response table (S, S, C, F + G), and its fit, whose evidence is of windows in volts."""
+    scaler, n_windows = old.scaler, features.windows.shape[2]
+    predicted = old.predict_features(scaler.transform(features)).measures
+    # Unknown depths and forces are replaced by their predictions.
+    completed = {name: np.where(np.isnan(values), predicted[name].values, values) for name, values in measures.items()}
+    presses = scaler.training_presses(features, positions_mm, completed, frame_rate_hz(old.rate_hz))
+    maps = scaler.uncentre(old.table)[..., :n_windows]
+    prior = map_prior(maps) if plan is None else replace(plan, mean=maps)
+    table, response = refit_response(scaler, presses, old.table, n_windows, prior)
+    log_scale = float(presses.fibre_mask.sum(axis=0) @ np.log(scaler.scale_v[:, :n_windows]).sum(axis=1))
+    return presses, table, replace(response, log_evidence=response.log_evidence - log_scale)
 
 
 def fit_correction(
@@ -404,7 +404,7 @@ class CrossValidation:
         return [error_row(n_failed, level, *self.presses[1:]) for n_failed, level in enumerate(predictions)]
 
     def widening(self, predictions: Predictions) -> Array:
-        """Return (K, 3 + T) factors, 1 or more, with which intervals hold on these presses."""
+        """Return (L, 3 + T) factors, 1 or more, with which intervals hold on these presses."""
         return np.maximum([conformal(level, *self.presses[1:]) for level in predictions], 1.0)
 
 

@@ -109,7 +109,7 @@ def remove_history(windows: Array, history: Array, history_coef: Array, history_
 
 
 def interpolate_grid(table: Any, positions: Any, xp: Any = np) -> Any:
-    """Interpolate a (S, S, D) table over [-1, 1] bilinearly at (B, 2) positions, clipped to its edge; return (B, D).
+    """Interpolate a (S, S, n) table over [-1, 1] bilinearly at (Q, 2) positions, clipped to its edge; return (Q, n).
 
     `xp` is the module of the arrays, numpy or torch.
     """

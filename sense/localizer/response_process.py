@@ -37,7 +37,7 @@ class ResponsePrior:
 
     Attributes:
         deviations: maps on a grid over [-1, 1] in x and y; each window deviates from the mean by a sum of them with
-            independent standard normal weights, times an amplitude; shape (S, S, C, J).
+            independent standard normal weights, times an amplitude; shape (S, S, C, n).
         mean: responses of an earlier pad, V or scaled as the windows; shape (S, S, C, F); None if there was none.
     """
 
@@ -114,7 +114,7 @@ class _Process(NamedTuple):
     noise: Array  # (Q,), variance of each press
     positions: Array  # (Q, 2)
     depth: Array  # (Q,), relative
-    maps: Array  # (S, S, J)
+    maps: Array  # (S, S, n)
     mean: Array | None  # (S, S, F)
 
     def response_on_grid(self) -> Array:

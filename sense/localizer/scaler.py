@@ -136,7 +136,7 @@ class FeatureScaler:
         return scaler, scaler.scale(response.table)
 
     def n_inputs(self, method: str, n_timed: int) -> int:
-        """Return D, the inputs of a network: features and, for method "ensemble", masks of C fibres and K windows."""
+        """Return I, the inputs of a network: features and, for method "ensemble", masks of C fibres and K windows."""
         return self.mean_v.size + (len(self.mean_v) + n_timed if method == "ensemble" else 0)
 
     def transform(self, features: PressFeatures) -> ScaledFeatures:

@@ -73,7 +73,7 @@ class EnsembleMlp(nn.Module):
         return self.first.w.shape[0]
 
     def forward(self, x: Tensor) -> Tensor:
-        """Return (E, B, 2 N) outputs for (E, B, D) inputs, as `network.forward`."""
+        """Return (E, B, 2 N) outputs for (E, B, I) inputs, as `network.forward`."""
         h = torch.baddbmm(self.first.b, x, self.first.w)
         for layer in self.hidden:
             h = h + torch.baddbmm(layer.b, _activate(h), layer.w)
@@ -92,7 +92,7 @@ def _activate(h: Tensor) -> Tensor:
 
 
 def network_inputs(features: Tensor, fibre_mask: Tensor, complete: Tensor) -> Tensor:
-    """Return the (B, D) inputs of a network from features (B, C, F) and masks (B, C) and (B, K)."""
+    """Return the (B, I) inputs of a network from features (B, C, F) and masks (B, C) and (B, K)."""
     timed = functional.pad(complete, (0, features.shape[2] - complete.shape[1]), value=True)
     masked = torch.where(fibre_mask[..., None] & timed[:, None], features, 0.0)
     return torch.cat([masked.flatten(1), fibre_mask.to(features.dtype), complete.to(features.dtype)], dim=1)

@@ -12,6 +12,7 @@ import os
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import CancelledError
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
@@ -56,16 +57,6 @@ def one_cycle(share: float) -> float:
     return min(share / WARM_UP, (1 - share) / (1 - WARM_UP))
 
 
-@contextmanager
-def flushed_denormals() -> Iterator[None]:
-    """Flush denormal numbers to 0 in this thread; they are slow, and moments of vanishing gradients decay to them."""
-    torch.set_flush_denormal(True)
-    try:
-        yield
-    finally:
-        torch.set_flush_denormal(False)
-
-
 def fit_network(
     parameters: Mapping[str, Tensor],
     loss_of_batch: Callable[[], Tensor],
@@ -105,7 +96,8 @@ def fit_network(
     for weight, shape, values, slopes in zip(weights, shapes, flat.split(sizes), gradient.split(sizes), strict=True):
         weight.data, weight.grad = values.view(shape), slopes.view(shape)  # one step for all
     share, step, reports = 0.0, 0, 0
-    with flushed_denormals():
+    torch.set_flush_denormal(True)  # denormal numbers, to which moments of vanishing gradients decay, are slow
+    try:
         while share < 1:
             step += 1
             share = step / steps if seconds is None else min((time.monotonic() - begin) / max(seconds, 1e-9), 1.0)
@@ -123,45 +115,33 @@ def fit_network(
             if share * REPORTS >= reports + 1:
                 reports = int(share * REPORTS)
                 on_progress(reports, REPORTS, "")
+    finally:
+        torch.set_flush_denormal(False)
     fitted = zip(parameters, shapes, average.split(sizes), strict=True)
     return {name: values.view(shape).numpy().copy() for name, shape, values in fitted}
 
 
-class StoppedError(Exception):
-    """Another training failed, or the user interrupted."""
+@contextmanager
+def joint_progress(totals: Sequence[int], on_progress: OnProgress) -> Iterator[Callable[[int, int, int, str], None]]:
+    """Join the progress of trainings in threads, of so many steps each.
 
-
-class JointProgress:
-    """Joint progress of trainings in threads, of `totals` steps.
-
-    Trainings that still run when the `with` block ends stop at their next report.
+    Yields a function of the number of a training, its steps so far, its steps in all, and its work before or after the
+    steps. It raises CancelledError in trainings that still run when the block ends, as on an error or Ctrl-C.
     """
+    steps, lock, has_ended = [0] * len(totals), Lock(), Event()
 
-    def __init__(self, totals: Sequence[int], on_progress: OnProgress) -> None:
-        self._done, self._totals, self._on_progress = [0] * len(totals), totals, on_progress
-        self._lock, self._stopped = Lock(), Event()
-
-    def update(self, number: int, done: int, total: int, what: str) -> None:
-        """Report the progress of one training; raise StoppedError if the `with` block has ended.
-
-        Args:
-            number: of the training.
-            done: steps of this training so far, unless `what` is stated.
-            total: steps of this training.
-            what: work before or after the steps.
-        """
-        if self._stopped.is_set():
-            raise StoppedError
-        with self._lock:
+    def update(number: int, done: int, total: int, what: str) -> None:
+        if has_ended.is_set():
+            raise CancelledError
+        with lock:
             if not what:
-                self._done[number] = round(done / total * self._totals[number])
-            self._on_progress(sum(self._done), sum(self._totals), what)
+                steps[number] = round(done / total * totals[number])
+            on_progress(sum(steps), sum(totals), what)
 
-    def __enter__(self) -> None:
-        pass
-
-    def __exit__(self, *error: object) -> None:
-        self._stopped.set()
+    try:
+        yield update
+    finally:
+        has_ended.set()
 
 
 MEASURE_WEIGHT = 0.5  # weight of the error of a scaled depth or force, relative to that of the distance
@@ -205,13 +185,50 @@ class TrainedNetworks(NamedTuple):
 
 @dataclass
 class TrainingTask:
-    """Training of one network."""
+    """Training of one member of a network."""
 
-    name: str  # of its phase, or `RESIDUAL`
+    name: str  # of the network: that of its phase, or `RESIDUAL`
     phase: Phase
+    options: LocalizerSettings
     steps: int  # usual number
-    seed: int
+    bayes: Sequence[BayesianLocalizer] = ()  # that it corrects
+    start: Weights | None = None  # to continue from
+    spread: float = 1.0  # factor on `AUGMENTATION`
     seconds: float | None = None  # limit in place of `steps`
+
+
+def run_trainings(
+    tasks: Sequence[TrainingTask],
+    presses: TrainingPresses,
+    table: Floats,
+    rng: np.random.Generator,
+    on_progress: OnProgress = ignore_progress,
+) -> tuple[dict[str, Weights], list[int]]:
+    """Run trainings in threads; return the networks by name, and the steps that each training has taken."""
+    totals = [task.steps if task.seconds is None else max(1, round(task.seconds)) for task in tasks]
+    seeds = rng.integers(2**63, size=len(tasks)).tolist()
+    on_progress(0, sum(totals), "")
+
+    def train(number: int) -> tuple[Weights, int]:
+        task, seed = tasks[number], seeds[number]
+        training = Training(presses, table, task.options, seed, task.phase, task.bayes, task.start, task.spread)
+        fitted = fit_network(
+            dict(training.network.named_parameters()),
+            training.loss,
+            task.steps,
+            task.options.learning_rate,
+            seconds=task.seconds,
+            on_progress=partial(update, number),
+        )
+        return training.weights(fitted), training.n_steps
+
+    with one_thread(), joint_progress(totals, on_progress) as update:
+        trained = dict(run_tasks((number, partial(train, number)) for number in range(len(tasks))))
+    members: dict[str, list[Weights]] = {}
+    for number, task in enumerate(tasks):
+        members.setdefault(task.name, []).append(trained[number][0])
+    networks = {name: stack_members(weights) for name, weights in members.items()}
+    return networks, [trained[number][1] for number in range(len(tasks))]
 
 
 def train_members(
@@ -260,44 +277,24 @@ def train_members(
 
     # 2. One task a network; long ones begin first, so that no core is idle at the end
     by_length = sorted(phases.items(), key=lambda item: -item[1].length)
-    named_phases = [item for item in by_length for _ in range(members)]
-    if has_bayes:
-        named_phases.append((RESIDUAL, RESIDUAL_PHASE if n_timed else phases["press"]))
-    seeds = rng.integers(2**63, size=len(named_phases)).tolist()
     tasks = [
-        TrainingTask(name, phase, round(steps * phase.length), seed)
-        for (name, phase), seed in zip(named_phases, seeds, strict=True)
+        TrainingTask(name, phase, options, round(steps * phase.length))
+        for name, phase in by_length
+        for _ in range(members)
     ]
+    if has_bayes:
+        smaller = {name: min(size, getattr(options, name)) for name, size in MAX_RESIDUAL_SIZE.items()}
+        phase = RESIDUAL_PHASE if n_timed else phases["press"]
+        n_steps = round(steps * phase.length)
+        tasks.append(TrainingTask(RESIDUAL, phase, options.model_copy(update=smaller), n_steps, bayes))
     if time_budget is not None:
         remaining_s = max(0.0, time_budget - (time.monotonic() - begin))
         longest = makespan([task.steps for task in tasks], cores)
         for task in tasks:
             task.seconds = remaining_s * task.steps / longest
-    totals = [task.steps if task.seconds is None else max(1, round(task.seconds)) for task in tasks]
-    on_progress(0, sum(totals), "")
-    joint = JointProgress(totals, on_progress)
-    residual_size = {name: min(size, getattr(options, name)) for name, size in MAX_RESIDUAL_SIZE.items()}
-    residual_options = options.model_copy(update=residual_size)
 
     # 3. Training
-    def train(number: int) -> tuple[Weights, int]:
-        """Return the weights of a network and the steps it has taken."""
-        task = tasks[number]
-        chosen = (residual_options, bayes) if task.name == RESIDUAL else (options, ())
-        training = Training(presses, table, chosen[0], task.seed, task.phase, chosen[1])
-        fitted = fit_network(
-            dict(training.network.named_parameters()),
-            training.loss,
-            task.steps,
-            options.learning_rate,
-            seconds=task.seconds,
-            on_progress=partial(joint.update, number),
-        )
-        return training.weights(fitted), training.n_steps
-
-    with one_thread(), joint:
-        trained = dict(run_tasks((number, partial(train, number)) for number in range(len(tasks))))
-    weights, n_steps = zip(*(trained[number] for number in range(len(tasks))), strict=True)
+    trained, n_steps = run_trainings(tasks, presses, table, rng, on_progress)
     missing = [max(0, min(MIN_STEPS, task.steps) - done) for task, done in zip(tasks, n_steps, strict=True)]
     if time_budget is not None and any(missing):
         needed_s = time.monotonic() - begin + pace_s * makespan(missing, cores)
@@ -305,12 +302,9 @@ def train_members(
             f"time budget: got {time_budget:.3g} s for the training, in which a network took {min(n_steps)} steps; "
             f"expected at least {MIN_STEPS}, about {math.ceil(needed_s)} s"
         )
-    networks = {
-        name: stack_members([weights[number] for number, task in enumerate(tasks) if task.name == name])
-        for name in phases
-    }
     trained_share = min(min(done / task.steps, 1.0) for task, done in zip(tasks, n_steps, strict=True))
-    return TrainedNetworks(networks, bayes, weights[-1] if has_bayes else {}, trained_share)
+    networks = {name: trained[name] for name in phases}
+    return TrainedNetworks(networks, bayes, trained.get(RESIDUAL, {}), trained_share)
 
 
 def training_steps(presses: int, options: LocalizerSettings) -> int:
@@ -338,18 +332,6 @@ def train_published(train: TrainingPresses, early_stop: TrainingPresses, rng: np
     return {name: np.ascontiguousarray(weight[None], dtype=np.float32) for name, weight in weights.items()}
 
 
-def _loss(error: Tensor, expected: Tensor) -> Tensor:
-    """Return the (...) loss of (..., 2 + T) errors: the distance, plus weighted errors of the measures.
-
-    Args:
-        error: of positions and measures.
-        expected: errors (..., 2 + T), by which the distance is rounded.
-    """
-    rounding = (ROUNDING * expected[..., :2]).square()
-    distance = (error[..., :2].square() + rounding).sum(dim=-1).add(1e-8).sqrt()
-    return distance if error.shape[-1] == 2 else distance + MEASURE_WEIGHT * error[..., 2:].abs().sum(dim=-1)
-
-
 class Training:
     """A network and its loss, on the CPU: a GPU is no faster, since it waits for batches and kernel launches."""
 
@@ -367,7 +349,7 @@ class Training:
         rng = np.random.default_rng(seed)
         self.n_steps = 0  # batches so far
         self._recent, self._reuses = deque[tuple[Floats, Floats]](maxlen=RECENT_BATCHES), bool(bayes)
-        self._presses = sampler = PressSampler(presses, table, options.max_failures, rng, phase, bayes)
+        self._sampler = sampler = PressSampler(presses, table, options.max_failures, rng, phase, bayes)
         self._batch, targets = min(options.batch, len(presses.inputs)), sampler.targets
         self._bounds = low, high = targets[:, :3].min(axis=0), targets[:, :3].max(axis=0)
         spacing = math.sqrt((high - low)[:2].prod() / len(np.unique(targets[:, :2], axis=0)))
@@ -400,13 +382,22 @@ class Training:
         return float(np.median(durations))
 
     def loss(self) -> Tensor:
-        """Return the loss of the next batch."""
+        """Return the loss of the next batch.
+
+        With the errors e of x and y, m of the measures, and the expected errors s (which only the last term trains):
+
+            sqrt(|e|^2 + |ROUNDING s|^2) + MEASURE_WEIGHT sum |m| + LOG_ERROR_WEIGHT sum (|error| / s + log s).
+        """
         self.n_steps += 1
         inputs, targets = map(torch.from_numpy, self._next_batch())
         predicted, log_error = self.network.forward_bfloat16(self.scale_down(inputs))[0].chunk(2, dim=1)
         error, log_error = predicted - targets, log_error.clamp(MIN_LOG_ERROR, MAX_LOG_ERROR)
-        likelihood = (error.detach().abs() * (-log_error).exp() + log_error).sum(dim=1)  # of a Laplace distribution
-        return (_loss(error, log_error.detach().exp()) + LOG_ERROR_WEIGHT * likelihood).mean()
+        rounding = (ROUNDING * log_error.detach().exp()[:, :2]).square()
+        loss = (error[:, :2].square() + rounding).sum(dim=1).add(1e-8).sqrt()
+        if error.shape[1] > 2:
+            loss = loss + MEASURE_WEIGHT * error[:, 2:].abs().sum(dim=1)
+        likelihood = (error.detach().abs() * (-log_error).exp() + log_error).sum(dim=1)
+        return (loss + LOG_ERROR_WEIGHT * likelihood).mean()
 
     def _next_batch(self) -> tuple[Floats, Floats]:
         """Return a new batch; every second time a recent one where Bayesian positions take most of the time."""
@@ -415,17 +406,17 @@ class Training:
         if self.n_steps % 2:
             self._recent.append(self.sample_batch())
             return self._recent[-1]
-        return self._recent[self._presses.rng.integers(len(self._recent))]
+        return self._recent[self._sampler.rng.integers(len(self._recent))]
 
     def sample_batch(self) -> tuple[Floats, Floats]:
-        """Sample inputs (1, B, D) and the targets of the network (B, 2 + T)."""
-        rows = self._presses.sample_rows(self._batch)
-        targets = self._augment_position(self._presses.targets[rows])
-        x, position = self._presses.inputs(rows, targets, INPUT_NOISE)
+        """Sample inputs (1, B, I) and the targets of the network (B, 2 + T)."""
+        rows = self._sampler.sample_rows(self._batch)
+        targets = self._augment_position(self._sampler.targets[rows])
+        x, position = self._sampler.inputs(rows, targets, INPUT_NOISE)
         return x[None], targets - position
 
     def _fit_directions(self) -> tuple[Tensor, Tensor]:
-        """Return the directions (D, n) in which inputs vary most, and the shares (n,) by which these are shrunk."""
+        """Return the directions (I, n) in which inputs vary most, and the shares (n,) by which these are shrunk."""
         x = np.concatenate([self.sample_batch()[0][0] for _ in range(COMMON_BATCHES)]).astype(np.float64)
         n_inputs = x.shape[1]
         largest = max(n_inputs - COMMON_DIRECTIONS, 0), n_inputs - 1
@@ -434,7 +425,7 @@ class Training:
         return torch.from_numpy(directions.astype(np.float32)), torch.from_numpy(shrinkage.astype(np.float32))
 
     def scale_down(self, x: Tensor) -> Tensor:
-        """Scale (..., D) inputs down, most strongly in the directions in which they vary most."""
+        """Scale (..., I) inputs down, most strongly in the directions in which they vary most."""
         return (x - x @ self._directions * self._shrinkage @ self._directions.T) / COMMON_SQUARE**0.5
 
     def scale_up(self, x: Tensor) -> Tensor:
@@ -445,9 +436,9 @@ class Training:
     def _augment_position(self, targets: Floats) -> Floats:
         """Augment (B, 2 + T) targets by normal noise, reflected at the bounds; force follows depth."""
         low, high = self._bounds
-        gain = self._presses.depth_gain
+        gain = self._sampler.depth_gain
         std = self._std / (1 + gain * targets[:, 2:3]) if gain else self._std
-        augmented = targets[:, :3] + std * self._presses.rng.standard_normal((len(targets), len(self._std)))
+        augmented = targets[:, :3] + std * self._sampler.rng.standard_normal((len(targets), len(self._std)))
         augmented = np.where(augmented < low, 2 * low - augmented, augmented)
         augmented = np.clip(np.where(augmented > high, 2 * high - augmented, augmented), -1, 1)
         forces = targets[:, 3:] + self._force_per_depth * (augmented - targets[:, :3])[:, 2:]
@@ -456,9 +447,8 @@ class Training:
 
 RETRAINING_STEPS = 150  # from a similar response; with 400, networks err no less and are overconfident
 RETRAINING_RATE = 1e-3
-RETRAINING_SPREAD = (
-    1.4  # factor on `AUGMENTATION`, since presses are few; without it an unchanged pad errs a tenth more
-)
+RETRAINING_SPREAD = 1.4
+"""Factor on `AUGMENTATION`, since presses are few; without it an unchanged pad errs a tenth more."""
 
 
 def retrain(
@@ -484,26 +474,15 @@ def retrain(
     Returns:
         The retrained networks and residual network.
     """
-    phases = PHASES[presses.complete.shape[1]]
-    options = LocalizerSettings(max_failures=max_failures)
-    tasks = [(name, weights, phases[name], ()) for name, weights in networks.items()]
+    n_timed = presses.complete.shape[1]
+    options = LocalizerSettings(max_failures=max_failures, learning_rate=RETRAINING_RATE)
+    starts = [(name, weights, PHASES[n_timed][name], ()) for name, weights in networks.items()]
     if residual_network:
-        phase = RESIDUAL_PHASE if presses.complete.shape[1] else phases["press"]
-        tasks.append((RESIDUAL, residual_network, phase, bayes))
-    members_of = [unstack_members(weights) for _, weights, *_ in tasks]
-    seeds = [rng.integers(2**63, size=len(members)).tolist() for members in members_of]
-
-    def train(number: int) -> Weights:
-        _, _, phase, corrected_bayes = tasks[number]
-        members, steps = [], round(RETRAINING_STEPS * phase.length)
-        for member, seed in zip(members_of[number], seeds[number], strict=True):
-            training = Training(presses, table, options, seed, phase, corrected_bayes, member, RETRAINING_SPREAD)
-            parameters = dict(training.network.named_parameters())
-            members.append(training.weights(fit_network(parameters, training.loss, steps, RETRAINING_RATE)))
-        return stack_members(members)
-
-    with one_thread():
-        trained = dict(run_tasks((number, partial(train, number)) for number in range(len(tasks))))
-    by_name = {name: trained[number] for number, (name, *_) in enumerate(tasks)}
-    residual_network = by_name.pop(RESIDUAL, residual_network)
-    return by_name, residual_network
+        starts += [(RESIDUAL, residual_network, RESIDUAL_PHASE if n_timed else PHASES[0]["press"], bayes)]
+    tasks = [
+        TrainingTask(name, phase, options, round(RETRAINING_STEPS * phase.length), corrected, member, RETRAINING_SPREAD)
+        for name, weights, phase, corrected in starts
+        for member in unstack_members(weights)
+    ]
+    trained, _ = run_trainings(tasks, presses, table, rng)
+    return {name: trained[name] for name in networks}, trained.get(RESIDUAL, residual_network)

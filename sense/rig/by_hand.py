@@ -296,7 +296,7 @@ class HandSession:
     def __init__(self, recorder: Recorder, n_fibres: int, targets_mm: Array, hold_s: float, n_done: int = 0) -> None:
         self._recorder, self._n_fibres, self._n_done = recorder, n_fibres, n_done
         # Times begin at 0, or 1 s after the last reading of a resumed recording.
-        self._start_s = recorder.last_s + 1 if np.isfinite(recorder.last_s) else 0.0
+        self._start_s = max(recorder.last_s + 1, 0.0)
         self._zero_s: float | None = None
         self._first = recorder.n_readings  # index in the recording of the session's first reading, which has index 0
         self._number = max(recorder.done, default=-1) + 1

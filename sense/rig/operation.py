@@ -5,7 +5,7 @@ An adaptive plan moves its next presses to where the errors of a localizer are l
 
 import logging
 import tempfile
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, closing, contextmanager, nullcontext
 from pathlib import Path
 from typing import Any
@@ -237,9 +237,9 @@ def record(
             return None if dry else Recording.open(out)
 
 
-def _make_planner(config: RigConfig, rig: RigSettings, model: Path | None) -> Callable[[PressPlan, int], PressPlan]:
+def _make_planner(config: RigConfig, rig: RigSettings, model: Path | None) -> AdaptivePlanner | None:
     if rig.plan != "adaptive":
-        return lambda plan, press: plan
+        return None
     if model is None:
         raise InputError("[rig] plan is adaptive, which needs --model, a folder that calibrate wrote")
     free = pressable_test(config.pad, fit_pad_settings(config.pad, config.pad_settings))
@@ -273,16 +273,13 @@ def diagnose(kind: str, config: RigConfig, inputs: Sequence[int]) -> list[Diagno
 def _diagnose_arm(kind: str, config: RigConfig, inputs: Sequence[int]) -> list[Diagnosis]:
     """Diagnose an arm, and whether the pose of the pad on a printer's bed is known."""
     rig, location = config.rig.model_copy(update={"channels": tuple(inputs)}), []
-    if kind == "printer":
-        try:
-            _check_ports(rig)
-        except RigFault as fault:
-            return [Diagnosis("arm", "fail", str(fault))]
-        try:
-            rig = locate_on_bed(rig, config.folder)
-        except RigFault as fault:
-            location = [Diagnosis("place", "fail", str(fault))]
     try:
+        if kind == "printer":
+            _check_ports(rig)
+            try:
+                rig = locate_on_bed(rig, config.folder)
+            except RigFault as fault:
+                location = [Diagnosis("place", "fail", str(fault))]
         arm = load_device("padforge.arms", kind)(rig)
     except RigFault as fault:
         return [Diagnosis("arm", "fail", str(fault)), *location]

@@ -136,7 +136,7 @@ class PressLoop:
         self,
         plan: PressPlan,
         on_progress: OnProgress = ignore_progress,
-        planner: Callable[[PressPlan, int], PressPlan] = lambda plan, press: plan,
+        planner: Callable[[PressPlan, int], PressPlan] | None = None,
     ) -> None:
         """Make every press of the plan that the recorder does not have.
 
@@ -144,7 +144,7 @@ class PressLoop:
             plan: positions and depths.
             on_progress: called after every press, once it is on the disk.
             planner: called before every press with the plan and its number; returns the plan, or one with the presses
-                from that number on moved.
+                from that number on moved. None to keep the plan.
 
         Raises:
             RigFault: the plan is not safe, or a device failed; the arm stands still, completed presses are on the disk.
@@ -156,7 +156,7 @@ class PressLoop:
             self._lift()  # the tool may stand anywhere in the box, even on the pad
             for press in range(len(plan)):
                 if press not in self._recorder.done:
-                    if (changed := planner(plan, press)) is not plan:
+                    if planner is not None and (changed := planner(plan, press)) is not plan:
                         check_plan(changed, self._rig)
                         plan = changed
                     self._await_disk(self._press(press, plan.positions_mm[press], float(plan.depths_mm[press])))
@@ -168,8 +168,7 @@ class PressLoop:
         """Start times at 0, or 1 s after the last reading of a resumed recording; discard buffered samples."""
         self._board.read()
         self._arm.drain()
-        last_s = self._recorder.last_s
-        self._zero_s = clock.now() - (last_s + 1 if np.isfinite(last_s) else 0.0)
+        self._zero_s = clock.now() - max(self._recorder.last_s + 1, 0.0)
 
     def _press(self, press: int, position_mm: Array, depth_mm: float) -> Future[Any]:
         """Make a press; return the queued call that writes it to the disk."""

@@ -81,6 +81,7 @@ class SimulatedBoard:
 
     def _touch(self, time_s: float) -> tuple[Array, float]:
         """Return the finger's position and depth, mm; it presses in the second half of every cycle."""
+        # Not twice `half_cycle_s`, which is of a real board: a reading is the average of a whole number of its samples.
         cycle_s = self._rig.readings_per_press / self._rig.rate_hz
         press, elapsed_s = divmod(time_s, cycle_s)
         if press > self._press:

@@ -76,7 +76,7 @@ def learning_curve(
     Raises:
         InputError: too few presses for a curve.
     """
-    from padforge.sense.localizer.training import JointProgress, training_steps
+    from padforge.sense.localizer.training import joint_progress, training_steps
 
     options = or_default("options", options, settings.LocalizerSettings)
     rng = np.random.default_rng(options.seed)
@@ -92,16 +92,16 @@ def learning_curve(
     options = options.model_copy(update={"members": 1, "method": "ensemble"})
     # as many steps as in a calibration on that many presses: with one short training for all, more presses would hardly
     # lower the error
-    joint = JointProgress([training_steps(size, options) for size in sizes], on_progress)
+    steps = [training_steps(size, options) for size in sizes]
 
     def test_errors(number: int) -> Array:
         rows, rng = np.sort(order[: sizes[number]]), np.random.default_rng([options.seed, sizes[number]])
-        localizer = fit_recording(recording, rows, options, rng, partial(joint.update, number))
+        localizer = fit_recording(recording, rows, options, rng, partial(update, number))
         prediction = localizer.predict_features(localizer.scaled_features(recording)[test])
         return distances(prediction.positions_mm, recording.presses_mm[test])
 
     longest_first = reversed(range(len(sizes)))
-    with one_thread(), joint:
+    with one_thread(), joint_progress(steps, on_progress) as update:
         by_number = dict(run_tasks((number, partial(test_errors, number)) for number in longest_first))
     errors = np.array([by_number[number] for number in range(len(sizes))])
     counts = np.array(sizes, dtype=float)

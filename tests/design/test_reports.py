@@ -14,7 +14,7 @@ from padforge.design.settings import Contact, PadSettings, RulesSettings, Search
 from tests.helpers.golden import Golden, page_text
 from tests.helpers.less import blank_pictures
 
-TERMS = {"expected_error_mm_1": 2.346, "expected_error_mm_0": 1.0, "sharpness": 0.25, "penalty_border_mm": 0.125}
+TERMS = {"expected_error_mm_1": 2.346, "expected_error_mm_0": 1.0, "sharpness": 0.25, "penalty_end_slopes": 0.125}
 STRAIGHT = {"expected_error_mm_1": 4.0, "expected_error_mm_0": 12.34}
 VIOLATIONS = [
     {"rule": "min_gap_mm", "fibres": [1, 3], "place_mm": [1.04, -2.0], "measured": 0.5, "limit": 2.0},

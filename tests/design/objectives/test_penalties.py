@@ -100,7 +100,7 @@ class Slopes(torch.autograd.Function):
         return tuple(torch.from_numpy(ctx.curves.by_knots(gradient)))
 
 
-def turns_and_border_slopes(along, across, rules, bent_radius_mm, unit_mm, all_bends, margin):
+def turns_and_end_slopes(along, across, rules, bent_radius_mm, unit_mm, all_bends, margin):
     """Both integrals with what they integrate over held, as torch differentiates them; (F, n) knots of PCHIP curves."""
     shares = (1 - torch.cos(torch.arange(12, dtype=torch.float64) * np.pi / 12)) / 2
     slope = Slopes.apply(along, across)
@@ -133,21 +133,22 @@ def turns_and_border_slopes(along, across, rules, bent_radius_mm, unit_mm, all_b
         around = pad(torch.full_like(arc, beside), (2, 2)) if towards > 0 else beside * begins_on_pad
         excess.append(torch.relu(torch.sqrt(angle**2 + around**2 + 1e-30) * margin * radius / window - 1))
     in_zone = (t < rules.border_mm / unit_mm) | (t > t[:, -1:] - rules.border_mm / unit_mm)
-    border = torch.relu(rate.abs() - 1) * in_zone * halves(arc)
-    return (torch.stack(excess).mean(dim=0) * halves(beyond)).sum(dim=1).mean() / run, border.sum(dim=1).mean() / run
+    end_slopes = torch.relu(rate.abs() - 1) * in_zone * halves(arc)
+    turns = torch.stack(excess).mean(dim=0) * halves(beyond)
+    return turns.sum(dim=1).mean() / run, end_slopes.sum(dim=1).mean() / run
 
 
 @pytest.mark.parametrize(("bent_radius_mm", "all_bends", "margin"), [(1e6, True, 1.0), (30.0, False, 1.3)])
-def test_turns_and_border_slopes_and_their_gradients_are_those_of_torch(bent_radius_mm, all_bends, margin):
+def test_turns_and_end_slopes_and_their_gradients_are_those_of_torch(bent_radius_mm, all_bends, margin):
     """With the arc lengths that samples stand for held: their changes are left out of the gradient."""
     pad, rules = Morphology.random(2, 4, seed=5), only(min_mean_bend_radius_mm=9.0, border_mm=12.0)
     along, across = (torch.tensor(axis, requires_grad=True) for axis in axes(pad))
-    expected = turns_and_border_slopes(along, across, rules, bent_radius_mm, pad.unit_mm, all_bends, margin)
+    expected = turns_and_end_slopes(along, across, rules, bent_radius_mm, pad.unit_mm, all_bends, margin)
     torch.stack(expected).sum().backward()
     size = PadSettings(grid=2, bent_radius_mm=bent_radius_mm)
     values, *gradient = penalties(*axes(pad), size, rules, margin, all_bends=all_bends)
     assert values["min_mean_bend_radius_mm"] == pytest.approx(expected[0].item(), rel=1e-9)
-    assert values["border_mm"] == pytest.approx(expected[1].item(), rel=1e-9)
+    assert values["end_slopes"] == pytest.approx(expected[1].item(), rel=1e-9)
     assert along.grad is not None
     assert across.grad is not None
     np.testing.assert_allclose(gradient, torch.stack([along.grad, across.grad]).numpy(), atol=1e-9)

@@ -94,8 +94,8 @@ def test_estimators_have_settings_as_params_print_what_differs_and_are_cloned() 
     localizer = Localizer.from_settings(settings)
     assert localizer.get_params() == {**settings.model_dump(exclude={"seed"}), "random_state": 7}
     assert localizer.set_params(hidden=9).get_params()["hidden"] == 9
-    with pytest.raises(InputError, match="no option depth"):
-        Localizer(depth=3)
+    with pytest.raises(InputError, match="no option depth"):  # the first unknown one, whatever the hashes of names
+        Localizer(depth=3, **dict.fromkeys("hgfedcba", 0))
     assert repr(Localizer()) == "Localizer()"
     assert repr(clone(Localizer(hidden=16, max_failures=1))) == "Localizer(max_failures=1, hidden=16)"
     assert repr(clone(PressWindows())) == "PressWindows()"
