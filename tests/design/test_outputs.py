@@ -57,7 +57,7 @@ enforce = false
 """
 VERSIONS = r'(?<=": ")\d+(\.\w+)+(?=")'
 SECONDS = r"(?<=fibres in )[\d.]+(?= s)", r'(?<="seconds": )[\d.]+'
-ROUNDING = r"\d\.\d+e-1\d"
+ROUNDING = r"-?\d\.\d+e-1\d"
 PORT = r"(?<=127\.0\.0\.1:)\d+"
 
 
