@@ -55,7 +55,7 @@ LEAD = MEDIAN_OFFSET + MEDIAN_WIDTH // 2  # readings before `down_command` that 
 OPENING = PRESS_WINDOWS[-1][1]  # readings after `down_command` that features use
 LATEST = 20  # readings before the present, or the release, that features of a long press use
 MIN_COMPLETE = 3  # complete windows of a change from which on it may be taken for a second finger
-MIN_EXPLAINED = 0.7  # minimum share of such a change that a press at its position explains
+MIN_EXPLAINED = 0.8  # minimum share of such a change that a press at its position explains
 MAX_DEEPENING = 0.6  # maximum share that the first finger, pressing deeper or less deep, explains
 LIFT_WINDOWS = 2, 3  # `RELEASE_WINDOWS` that show which of two fingers has been lifted
 MAX_ERROR_RATIO = 0.5  # maximum squared error of that, relative to the second-best explanation
@@ -241,7 +241,8 @@ class Live:
         self._frames, self._last_s = FrameStream(rate_hz, fibres), -np.inf  # time of the last reading
         self._buffer = RingBuffer(1 + fibres)  # times and voltages of frames
         self._presses: list[BufferedPress] = []  # current ones, in the order of their touches
-        self._candidate: BufferedPress | None = None  # a change that may be a second finger
+        # A change that may be a second finger, and the estimate of the first one before it.
+        self._candidate: tuple[BufferedPress, Estimate] | None = None
         self._lift: int | None = None  # `up_command` of one of two fingers, or of both
         self._n_presses = self._previous_end = 0
         self.presses: deque[Estimate] = deque(maxlen=12)  # latest presses in the view
@@ -385,6 +386,7 @@ class Live:
         resting = self._resting
         if len(resting) != 1 or self._localizer.features != "windows":
             return
+        touched = max(touched, self._buffer.end - SLACK)
         first, down_command = resting[0], self._buffer.command_index(touched, TOUCH_DELAY_S)
         settled = first.down_command + EARLY_WINDOWS  # earlier readings belong to the touch of the first finger
         if down_command <= settled:
@@ -402,7 +404,7 @@ class Live:
         rows = np.arange(max(settled, down_command + REST[0]), down_command)
         readings = interpolate_gaps(self._buffer.rows(int(rows[0]), down_command)[:, 1:])
         press.baseline = (readings - press.relaxation(rows)).mean(axis=0)[None]
-        self._candidate, self._before = press, before
+        self._candidate = press, before
 
     def _course(self, press: BufferedPress, until: int, estimate: Estimate) -> PressCourse:
         """Return the expected course of a press, in proportion to its readings, at an estimated position."""
@@ -416,14 +418,14 @@ class Live:
             events += self._tell_lifted(self._lift)
             self._lift = None
         elif self._candidate is not None:
-            events += self._judge(self._candidate)
+            events += self._judge(*self._candidate)
         for press in list(self._presses):
             events += self._follow(press)
         return events
 
-    def _judge(self, press: BufferedPress) -> list[Event]:
+    def _judge(self, press: BufferedPress, before: Estimate) -> list[Event]:
         """Follow a candidate as a second finger if that explains it; forget it if it does not once it is complete."""
-        first, before, until = self._resting[0], self._before, self._buffer.end
+        first, until = self._resting[0], self._buffer.end
         press.store_opening(self._buffer)
         n_complete = int(complete_windows(*(np.array([index]) for index in (press.down_command, until, until))).sum())
         if n_complete < MIN_COMPLETE or first.course is None:
