@@ -175,7 +175,7 @@ class EventPrinter:
 
     def __init__(self, as_json: bool) -> None:
         self._as_json = as_json
-        self._latest: Estimate | None = None
+        self._latest: dict[int, Estimate] = {}  # of the presses that are not over
 
     def print(self, events: "Iterable[Event]") -> None:
         """Print events, one a line."""
@@ -192,24 +192,21 @@ class EventPrinter:
 
     def _is_news(self, estimate: "Estimate") -> bool:
         """Return whether to print an estimate, and remember it if so."""
-        latest = self._latest
-        if (
-            latest is None
-            or latest.press != estimate.press
-            or estimate.final
-            or estimate.is_sharper_than(latest)
-            or estimate.has_moved_from(latest)
-        ):
-            self._latest = estimate
-        return self._latest is estimate
+        latest = self._latest.get(estimate.press)
+        if estimate.final:
+            self._latest.pop(estimate.press, None)
+            return True
+        if latest is None or estimate.is_sharper_than(latest) or estimate.has_moved_from(latest):
+            self._latest[estimate.press] = estimate
+        return self._latest[estimate.press] is estimate
 
 
 def view_lines(view: dict[str, Any]) -> list[str]:
     """Return the view of a pad (`Live.view`) as text."""
-    latest = view["presses"][-1] if view["presses"] else None
+    presses = [press for press in view["presses"] if not press["final"]] or view["presses"][-1:]
     return [
         "pressed" if view["pressed"] else "waiting for a press",
-        latest["text"] if latest else "no press yet",
+        *([press["text"] for press in presses] or ["no press yet"]),
         *(f"fibre {c:<3} {_bar(fibre['swing'] or 0.0)} {fibre['state']}" for c, fibre in enumerate(view["fibres"], 1)),
         *view["faults"],
     ]

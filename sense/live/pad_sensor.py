@@ -73,8 +73,9 @@ class PadSensor:
         """Return the latest state by name: readings in V, NaN where missing, and the touch.
 
         `pressed` is 1 while the pad is pressed. While `valid` is 1, position, radius, depth and force are those of the
-        current press, otherwise of the last one; they are 0 before the first estimate. `unlike` is 1 if no single press
-        explains the responses, for example with two fingers. Raises RigFault if the board failed.
+        current press, of two fingers the one that landed last, otherwise of the last press; they are 0 before the first
+        estimate. `unlike` is 1 if no single press explains the responses, for example with two fingers. Raises RigFault
+        if the board failed.
         """
         if self._thread is None:
             raise InputError("the pad is not connected")
@@ -109,7 +110,7 @@ class PadSensor:
             self._started.set()
 
     def _summarize(self, pipeline: Live, volts: Array) -> Mapping[str, float]:
-        latest = pipeline.presses[-1] if pipeline.presses else None
+        latest = pipeline.shown_presses[-1] if pipeline.presses else None
         # A model of method `published` does not estimate the current press: its latest estimate is of the one before.
         is_valid = latest is not None and not (pipeline.pressed and latest.final)
         touch = [float(getattr(latest, name)) if is_valid else 0.0 for name in self._touch_names]

@@ -2,11 +2,12 @@
 
 It returns events: the position of a press at every reading from its touch to the end of its release, with radii that
 are valid at that moment; faulty fibres, which are masked from the next press on; and a notice if the latest presses are
-those of another pad, for which no fibre is masked.
+those of another pad, for which no fibre is masked. A second finger that lands while the first one rests is a press of
+its own, localized from the change since then; the position of the first one is no longer updated.
 """
 
 from collections import deque
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from math import hypot
 from typing import Any, Literal
 
@@ -14,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from padforge.common.validation import InputError
-from padforge.sense.arrays import Array, Mask, check_stream
+from padforge.sense.arrays import Array, Indices, Mask, check_stream
 from padforge.sense.health.fault_detector import FaultMonitor, FibreFault
 from padforge.sense.health.health_model import HealthModel
 from padforge.sense.health.trace_model import RELEASED
@@ -31,10 +32,18 @@ from padforge.sense.localizer.features import (
     windows_from_rest,
 )
 from padforge.sense.localizer.localizer import Localizer
-from padforge.sense.localizer.model import MEASURE_COLUMNS, LocalizerModel
+from padforge.sense.localizer.model import MEASURE_COLUMNS, UNIFORM, LocalizerModel
 from padforge.sense.localizer.model_files import check_same_pad
-from padforge.sense.localizer.moments import MODULATED, PRESS_WINDOWS, RELEASE_WINDOWS, REST, complete_windows
-from padforge.sense.localizer.scaler import ScaledFeatures
+from padforge.sense.localizer.moments import (
+    EARLY_WINDOWS,
+    MODULATED,
+    N_PRESS_WINDOWS,
+    PRESS_WINDOWS,
+    RELEASE_WINDOWS,
+    REST,
+    complete_windows,
+)
+from padforge.sense.localizer.press_course import PressCourse
 from padforge.sense.localizer.single_press import MIN_PRESSES, find_misfits, is_other_pad
 from padforge.sense.recording.frames import FrameStream
 from padforge.sense.rig.streams import HISTORY, SLACK, RingBuffer
@@ -45,6 +54,11 @@ SHARPER = 0.75  # ratio of radii below which a new estimate at the same position
 LEAD = MEDIAN_OFFSET + MEDIAN_WIDTH // 2  # readings before `down_command` that features use, without their history
 OPENING = PRESS_WINDOWS[-1][1]  # readings after `down_command` that features use
 LATEST = 20  # readings before the present, or the release, that features of a long press use
+MIN_COMPLETE = 3  # complete windows of a change from which on it may be taken for a second finger
+MIN_EXPLAINED = 0.8  # minimum share of such a change that a press at its position explains
+MAX_DEEPENING = 0.6  # maximum share that the first finger, pressing deeper or less deep, explains
+LIFT_WINDOWS = 2, 3  # `RELEASE_WINDOWS` that show which of two fingers has been lifted
+MAX_ERROR_RATIO = 0.5  # maximum squared error of that, relative to the second-best explanation
 RELEASE = max(RELEASE_WINDOWS[-1][1], RELEASED)  # readings after `up_command` that complete a press
 
 
@@ -67,6 +81,7 @@ class Estimate:
     r90_mm: float
     failed: tuple[int, ...]  # indices of the masked fibres
     unlike: bool = False  # whether no single press explains the responses, for example with two fingers
+    finger: int = 1  # 2 if it landed while finger 1 rested
     depth_mm: float | None = None  # None, like the next three, if the localizer does not predict it
     depth_r90_mm: float | None = None  # half width of the 90 % interval
     force_n: float | None = None
@@ -84,10 +99,11 @@ class Estimate:
 
     @property
     def text(self) -> str:
+        press = f"press {self.press}" + ", second finger" * (self.finger - 1)
         if self.unlike:
-            return f"press {self.press}: no single press, but several fingers? ({self.moment_text})"
+            return f"{press}: no single press, but several fingers? ({self.moment_text})"
         return (
-            f"press {self.press}: {self.x_mm:.1f}, {self.y_mm:.1f} mm, within {self.r50_mm:.1f} mm at 50 %, "
+            f"{press}: {self.x_mm:.1f}, {self.y_mm:.1f} mm, within {self.r50_mm:.1f} mm at 50 %, "
             f"{self.r90_mm:.1f} mm at 90 %{self.measures_text} ({self.moment_text})"
         )
 
@@ -126,7 +142,7 @@ Event = Estimate | FibreFault | OtherPad
 
 @dataclass
 class BufferedPress:
-    """The current press; indices are those of readings in the stream."""
+    """A current press; indices are those of readings in the stream."""
 
     number: int  # index of the press, from 0
     time_s: float  # time of the touch
@@ -137,7 +153,18 @@ class BufferedPress:
     history: Array  # history features (1, C, J), V, see `PressFeatures`
     up_command: int | None = None  # first reading after the command up; None while the press is held
     up_s: float = 0.0  # time of `up_command`
+    finger: int = 1  # see `Estimate`
+    other: "BufferedPress | None" = None  # of the finger that rested before, whose relaxation is no part of this press
+    fixed: Estimate | None = None  # the last one, if another finger has changed the readings since
+    course: PressCourse | None = None  # expected one, at that position
     _opening: Array | None = None
+
+    def relaxation(self, rows: Indices) -> Array:
+        """Return how the response to the other finger changes from `down_command` to readings (n,); (n, C), V."""
+        if self.other is None or self.other.course is None:
+            return np.zeros((len(rows), 1))
+        response = self.other.course.response(np.append(rows, self.down_command) - self.other.down_command)
+        return response[:-1] - response[-1]
 
     def release(self, up_command: int, buffer: RingBuffer) -> None:
         """End the press, at least one reading after `down_command`."""
@@ -165,6 +192,7 @@ class BufferedPress:
             opening = self._opening[: len(self._opening) + opened - (self.down_command + OPENING)]
         first = opened - len(opening)
         readings = np.concatenate([opening, buffer.rows(latest, until)[:, 1:]])
+        readings = readings - self.relaxation(np.append(np.arange(first, opened), np.arange(latest, until)))
         up = up_command - first - (latest - opened)
         return readings, self.down_command - first, up, max(self.previous_end - first, 0)
 
@@ -212,7 +240,10 @@ class Live:
         self._detector = PressDetector(fibres)
         self._frames, self._last_s = FrameStream(rate_hz, fibres), -np.inf  # time of the last reading
         self._buffer = RingBuffer(1 + fibres)  # times and voltages of frames
-        self._press: BufferedPress | None = None
+        self._presses: list[BufferedPress] = []  # current ones, in the order of their touches
+        # A change that may be a second finger, and the estimate of the first one before it.
+        self._candidate: tuple[BufferedPress, Estimate] | None = None
+        self._lift: int | None = None  # `up_command` of one of two fingers, or of both
         self._n_presses = self._previous_end = 0
         self.presses: deque[Estimate] = deque(maxlen=12)  # latest presses in the view
         self.track: deque[Estimate] = deque(maxlen=MAX_TRACK)
@@ -224,7 +255,16 @@ class Live:
     @property
     def pressed(self) -> bool:
         """Whether the pad is pressed now."""
-        return self._press is not None and self._press.up_command is None
+        return bool(self._resting)
+
+    @property
+    def _resting(self) -> list[BufferedPress]:
+        return [press for press in self._presses if press.up_command is None]
+
+    @property
+    def shown_presses(self) -> list[Estimate]:
+        """Latest estimates of the presses that are not over, oldest first; without any, that of the last press."""
+        return [press for press in self.presses if not press.final] or list(self.presses)[-1:]
 
     @property
     def failed(self) -> tuple[int, ...]:
@@ -256,9 +296,10 @@ class Live:
             for event in self._detector.update(row[:1], row[None, 1:]):
                 if event.down:
                     events += self._begin(event.reading)
-                elif self._press is not None:
-                    command = self._buffer.command_index(event.reading, RELEASE_DELAY_S)
-                    self._press.release(max(command, self._press.touched), self._buffer)
+                else:
+                    events += self._end(event.reading)
+            for reading in self._detector.further:
+                self._suspect(reading)
             events += self._advance()
         return events
 
@@ -274,7 +315,7 @@ class Live:
         """
         swings, end = np.full(len(self._response_v), np.nan), self._buffer.end
         if end:
-            baseline = self._buffer.baseline(end) if self._press is None else self._press.baseline[0]
+            baseline = self._presses[0].baseline[0] if self._presses else self._buffer.baseline(end)
             swings = (self._buffer.rows(end - 1, end)[0, 1:] - baseline) / self._response_v
         return {
             "pressed": self.pressed,
@@ -302,27 +343,143 @@ class Live:
         """Start a press, and return the remaining events of the previous one."""
         touched = max(touched, self._buffer.end - SLACK)  # a slow change may be recognised as a touch hours later
         down_command = self._buffer.command_index(touched, TOUCH_DELAY_S)
-        if self._press is not None and self._press.up_command is not None:
-            down_command = max(down_command, self._press.up_command + 1)
-        events = self._advance(down_command)
+        ends = [press.up_command + 1 for press in self._presses if press.up_command is not None]
+        down_command = max([down_command, *ends])
+        events = self._cut(self._presses, down_command)
+        self._candidate = self._lift = None
         down_command = max(down_command, self._previous_end + 1)
         time_s = float(self._buffer.rows(touched, touched + 1)[0, 0])
         readings = interpolate_gaps(self._buffer.rows(down_command - HISTORY, self._buffer.end)[:, 1:])
         first = self._buffer.end - len(readings)
         down, previous_end = (np.array([max(index - first, 0)]) for index in (down_command, self._previous_end))
         baseline, history = mean_at_rest(readings, down, previous_end), compute_history(readings, down)
-        self._press = BufferedPress(
+        press = BufferedPress(
             self._n_presses, time_s, touched, down_command, self._previous_end, baseline=baseline, history=history
         )
-        self.track.clear()
-        self._n_presses += 1
+        self._add(press)
         return events
 
-    def _advance(self, cut: int | None = None) -> list[Event]:
-        """Return the events at the latest reading; with `cut`, the last ones of a press that ends there."""
-        press, until = self._press, self._buffer.end
-        if press is None:
+    def _add(self, press: BufferedPress) -> None:
+        self._presses.append(press)
+        self.track.clear()
+        self._n_presses += 1
+
+    def _cut(self, presses: list[BufferedPress], end: int) -> list[Event]:
+        """Return the last events of presses that end at a reading."""
+        return [event for press in list(presses) for event in self._follow(press, end)]
+
+    def _end(self, released: int) -> list[Event]:
+        """End the press whose release shows at a reading; which one of two that is, `_tell_lifted` finds out later."""
+        self._candidate, resting = None, self._resting
+        if not resting or self._lift is not None:
             return []
+        command = max(self._buffer.command_index(released, RELEASE_DELAY_S), resting[-1].touched)
+        if len(resting) > 1:
+            self._lift = command
+            return []
+        events = self._cut([press for press in self._presses if press is not resting[0]], command)
+        resting[0].release(command, self._buffer)
+        return events
+
+    def _suspect(self, touched: int) -> None:
+        """Consider a change under a press, from a reading on, for the touch of a second finger."""
+        resting = self._resting
+        if len(resting) != 1 or self._localizer.features != "windows":
+            return
+        touched = max(touched, self._buffer.end - SLACK)
+        first, down_command = resting[0], self._buffer.command_index(touched, TOUCH_DELAY_S)
+        settled = first.down_command + EARLY_WINDOWS  # earlier readings belong to the touch of the first finger
+        if down_command <= settled:
+            return
+        time_s = float(self._buffer.rows(touched, touched + 1)[0, 0])
+        before = first.fixed or self._estimate(first, down_command, False)
+        if before.unlike:
+            return
+        press = BufferedPress(
+            self._n_presses, time_s, touched, down_command, settled, baseline=first.baseline, history=first.history
+        )
+        press.finger, press.other = 3 - first.finger, first
+        if first.fixed is None:
+            first.course = self._course(first, down_command, before)
+        rows = np.arange(max(settled, down_command + REST[0]), down_command)
+        readings = interpolate_gaps(self._buffer.rows(int(rows[0]), down_command)[:, 1:])
+        press.baseline = (readings - press.relaxation(rows)).mean(axis=0)[None]
+        self._candidate = press, before
+
+    def _course(self, press: BufferedPress, until: int, estimate: Estimate) -> PressCourse:
+        """Return the expected course of a press, in proportion to its readings, at an estimated position."""
+        features = self._features_of_working_fibres(press, until)
+        return PressCourse.fit(self._localizer, features, np.array([estimate.x_mm, estimate.y_mm]))
+
+    def _advance(self) -> list[Event]:
+        """Return the events at the latest reading."""
+        events: list[Event] = []
+        if self._lift is not None and self._buffer.end >= self._lift + RELEASE_WINDOWS[LIFT_WINDOWS[-1]][1]:
+            events += self._tell_lifted(self._lift)
+            self._lift = None
+        elif self._candidate is not None:
+            events += self._judge(*self._candidate)
+        for press in list(self._presses):
+            events += self._follow(press)
+        return events
+
+    def _judge(self, press: BufferedPress, before: Estimate) -> list[Event]:
+        """Follow a candidate as a second finger if that explains it; forget it if it does not once it is complete."""
+        first, until = self._resting[0], self._buffer.end
+        press.store_opening(self._buffer)
+        n_complete = int(complete_windows(*(np.array([index]) for index in (press.down_command, until, until))).sum())
+        if n_complete < MIN_COMPLETE or first.course is None:
+            return []
+        estimate = self._estimate(press, until, False)
+        distance = hypot(estimate.x_mm - before.x_mm, estimate.y_mm - before.y_mm)
+        elsewhere, deepening = (self._course(press, until, each) for each in (estimate, before))
+        is_elsewhere = distance > before.r90_mm + estimate.r90_mm and elsewhere.explained_share > MIN_EXPLAINED
+        if is_elsewhere and max(deepening.explained_share, elsewhere.share_explained_by(first.course)) < MAX_DEEPENING:
+            events = self._cut([press for press in self._presses if press is not first], press.down_command)
+            self._candidate, first.fixed = None, before
+            self._add(press)
+            return [*events, self._show(before)]
+        if n_complete >= N_PRESS_WINDOWS:
+            self._candidate = None
+        return []
+
+    def _tell_lifted(self, lift: int) -> list[Event]:
+        """Release those of two fingers whose release explains the change since a reading, if that can be told."""
+        resting, events = self._resting, list[Event]()
+        for press in resting:
+            if press.fixed is None:
+                press.fixed = self._estimate(press, lift, False)
+                press.course = self._course(press, lift, press.fixed)
+        courses = [press.course for press in resting if press.course is not None]
+        window = RELEASE_WINDOWS[LIFT_WINDOWS[0]][0], RELEASE_WINDOWS[LIFT_WINDOWS[-1]][1]
+        after, before = (self._mean(lift + first, lift + end) for first, end in (window, (-3, 0)))
+        steps = np.array([course.changes_by_release[list(LIFT_WINDOWS)].mean(axis=0) for course in courses])
+        sets, mask = ([0], [1], [0, 1]), courses[0].fibre_mask & courses[1].fibre_mask
+        errors = [float((((after - before) - steps[lifted].sum(axis=0))[mask] ** 2).sum()) for lifted in sets]
+        best, second_best = np.argsort(errors)[:2]
+        lifted = sets[best]
+        if errors[best] > MAX_ERROR_RATIO * errors[second_best]:
+            lifted = [1]  # one is taken to rest on, but either may be the one, so that neither is located any more
+            names, anywhere_mm = ("std_x_mm", "std_y_mm", "r50_mm", "r90_mm"), np.array(UNIFORM)[[0, 0, 1, 2]]
+            radii_mm = dict(zip(names, (self._localizer.scaler.scale_mm * anywhere_mm).tolist(), strict=True))
+            for press in resting:
+                if press.fixed is not None:
+                    press.fixed = replace(press.fixed, unlike=True, **radii_mm)
+                    events.append(self._show(press.fixed))
+        elif lifted == [1]:
+            resting[1].fixed = None  # its release shows undisturbed, and locates it better
+        for number in lifted:
+            resting[number].release(lift, self._buffer)
+        if len(lifted) == 1:
+            self._detector.hold(courses[1 - lifted[0]].pressed[-1])
+        return events
+
+    def _mean(self, first: int, end: int) -> Array:
+        return interpolate_gaps(self._buffer.rows(first, end)[:, 1:]).mean(axis=0)
+
+    def _follow(self, press: BufferedPress, cut: int | None = None) -> list[Event]:
+        """Return the events of a press at the latest reading; with `cut`, the last ones of a press that ends there."""
+        until = self._buffer.end
         if cut is not None:
             until = max(cut, press.down_command + 1)
             if press.up_command is None:
@@ -330,22 +487,27 @@ class Live:
         press.store_opening(self._buffer)
         is_complete = False
         if press.up_command is not None:
-            end = press.up_command + RELEASE
+            end = press.up_command + (0 if press.fixed else RELEASE)
             is_complete = until >= end or cut is not None
             until = min(until, end)
         events: list[Event] = []
-        if is_complete or self._localizer.features == "windows":  # published features need a complete press
-            events.append(self._estimate(press, until, is_complete))
+        if press.fixed is not None:
+            events += [self._show(replace(press.fixed, final=True))] * is_complete
+        elif is_complete or (self._localizer.features == "windows" and self._lift is None):
+            # published features need a complete press, and after a lift it is not yet known which finger rests
+            events.append(self._show(self._estimate(press, until, is_complete)))
         if press.up_command is not None and is_complete:
-            events += [*self._check_pad(press, until), *self._check_fibres(press, until)]
-            self._previous_end, self._press = press.up_command, None
+            if press.fixed is None and press.other is None:
+                events += [*self._check_pad(press, until), *self._check_fibres(press, until)]
+            elif self._monitor is not None:
+                self._monitor.n_presses += 1
+            self._previous_end = max(self._previous_end, press.up_command)
+            self._presses.remove(press)
         return events
 
     def _estimate(self, press: BufferedPress, until: int, final: bool) -> Estimate:
-        scaled = self._localizer.scaler.transform(self._features(press, until))
-        fibre_mask = scaled.fibre_mask.copy()
-        fibre_mask[:, list(self.failed)] = False
-        result = self._localizer.localize(ScaledFeatures(scaled.inputs, fibre_mask, scaled.complete))
+        scaled = self._localizer.scaler.transform(self._features_of_working_fibres(press, until))
+        result = self._localizer.localize(scaled)
         numbers = np.concatenate([result.positions_mm[0], result.std_mm[0], result.r50_mm, result.r90_mm]).tolist()
         measures = {
             column: float(values[0])
@@ -357,11 +519,15 @@ class Live:
             moment = "touch", until - press.touched, now_s - press.time_s
         else:
             moment = "lift", until - press.up_command, now_s - press.up_s
-        failed = tuple(np.flatnonzero(~fibre_mask[0]).tolist())
+        failed = tuple(np.flatnonzero(~scaled.fibre_mask[0]).tolist())
         judged = {"failed": failed, "unlike": bool(result.unlike is not None and result.unlike[0])}
-        estimate = Estimate(press.number, press.time_s, now_s, *moment, final, *numbers, **judged, **measures)
-        self._show(estimate)
-        return estimate
+        judged |= {"finger": press.finger}
+        return Estimate(press.number, press.time_s, now_s, *moment, final, *numbers, **judged, **measures)
+
+    def _features_of_working_fibres(self, press: BufferedPress, until: int) -> PressFeatures:
+        features = self._features(press, until)
+        working = ~np.isin(np.arange(features.fibre_mask.shape[1]), self.failed)
+        return replace(features, fibre_mask=features.fibre_mask & working)
 
     def _features(self, press: BufferedPress, until: int) -> PressFeatures:
         """Return the features of the press, as `compute_features` of all readings before `until` would."""
@@ -375,16 +541,21 @@ class Live:
         windows = windows_from_rest(interpolate_gaps(readings), press.baseline, *moment)
         return PressFeatures(windows, press.history, valid_fibres(readings, *moment), complete_windows(*moment))
 
-    def _show(self, estimate: Estimate) -> None:
+    def _show(self, estimate: Estimate) -> Estimate:
         """Replace the previous estimate of the press in `presses`, and add to `track` if the finger has moved."""
-        if self.presses and self.presses[-1].press == estimate.press:
-            self.presses.pop()
-        self.presses.append(estimate)
+        numbers = [earlier.press for earlier in self.presses]
+        if estimate.press in numbers:
+            self.presses[numbers.index(estimate.press)] = estimate
+        else:
+            self.presses.append(estimate)
+        if estimate.press != self.presses[-1].press:
+            return estimate
         if self.track and not estimate.has_moved_from(self.track[-1]):
             if not estimate.is_sharper_than(self.track[-1]):
-                return
+                return estimate
             self.track.pop()  # the same position with a smaller radius
         self.track.append(estimate)
+        return estimate
 
     def _check_pad(self, press: BufferedPress, end: int) -> list[OtherPad]:
         """Update `is_other_pad` from a complete press; return an event if it becomes true."""

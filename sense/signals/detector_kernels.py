@@ -81,6 +81,8 @@ MAX_STEP = 20.0  # limit of a whitened step, so that a broken fibre does not out
 CLEAR_STEP = 5.0  # whitened step above which a fibre adds to the typical press in V
 MIN_PRESSES, MIN_AGREEMENT = 3, 0.5  # minimum touches, and their minimum agreement, for a use of their direction
 TOUCH_RATE, LEVEL_RATE = 0.05, 0.15  # weights of the newest touch and level in their running means
+MIN_FURTHER = -0.1  # minimum projection on the step of a press of what is not a part of its release
+FURTHER = 2  # event: a pad that is pressed is pressed further
 INVERTED, MIN_INVERTED = 1.2, 0.4
 """Rests are presses if rest levels scatter more than these shares of levels under presses, and of a typical press."""
 
@@ -94,7 +96,8 @@ class State(IntEnum):
     REST       takes back a step, soon after a release          -                 REST
     REST       against the direction of touches                 -                 UNCLEAR
     PRESSED    takes back the step of the touch                 release           REST
-    PRESSED    any other (pressed deeper or elsewhere)          -                 PRESSED
+    PRESSED    further in the direction of touches              further           PRESSED
+    PRESSED    any other                                        -                 PRESSED
     UNCLEAR    takes back the unclear step: that was a touch    touch, release    REST
     UNCLEAR    any other: that was a missed press's release     touch             PRESSED
     PRESSED    rest levels scatter as only presses do           release           REST
@@ -106,12 +109,18 @@ class State(IntEnum):
 
 
 class Change(IntEnum):
-    """Classes of a change; SETTLING is a later part of a release."""
+    """Classes of a change.
+
+    SETTLING is a later part of a release, FURTHER a press that deepens, moves or is joined by a second one, and may yet
+    turn into a release; PARTIAL is the release of one of two presses.
+    """
 
     UNKNOWN = 0
     TOUCH = 1
     RELEASE = 2
     SETTLING = 3
+    FURTHER = 4
+    PARTIAL = 5
 
 
 def initial_state(n_fibres: int) -> tuple[Any, Any]:
@@ -398,9 +407,9 @@ def _replace_levels(fibres: Any, levels: Any) -> float:
 
 
 @kernel(inline="always")
-def emit(events: Any, count: Any, down: bool, reading: int) -> int:
+def emit(events: Any, count: Any, kind: int, reading: int) -> int:
     """Append an event; return their number."""
-    events[count, 0], events[count, 1] = down, reading
+    events[count, 0], events[count, 1] = kind, reading
     return count + 1
 
 
@@ -419,6 +428,9 @@ def classify_change(fibres: Any, pad: Any, time_s: float, settled: bool, events:
     elif pad.state == State.PRESSED and (projection < -0.5 or (agreement < 0 and ratio > 0.25)):
         pad.change = Change.RELEASE
         count = emit(events, count, False, pad.run_first)
+    elif pad.state == State.PRESSED and pad.change == Change.UNKNOWN and agreement > 0 and projection > MIN_FURTHER:
+        pad.change = Change.FURTHER
+        count = emit(events, count, FURTHER, pad.run_first)
     elif pad.state == State.UNCLEAR and settled:
         was_touch = agreement < 0 or (-2 < projection < -0.5 and ratio < 4)
         count = emit(events, count, True, pad.unclear_first if was_touch else pad.run_first)
@@ -456,7 +468,7 @@ def commit_change(fibres: Any, pad: Any, time_s: float, events: Any, count: Any)
     elif pad.change == Change.UNKNOWN and pad.state == State.REST:
         pad.state, pad.unclear_first = State.UNCLEAR, pad.run_first
         _set_press_step(fibres, 0.0)
-    elif pad.change == Change.UNKNOWN:  # pressed deeper or elsewhere
+    elif pad.change == Change.UNKNOWN or pad.change == Change.FURTHER:
         larger = _size(fibres, fibres.residual, np.inf) > _size(fibres, fibres.press_step, np.inf)
         _set_press_step(fibres, 0.0 if larger else 1.0)
     return count
@@ -483,7 +495,7 @@ def _process_block(
             fibre.residual = fibre.mean - fibre.start_level
         track_peak(fibres, pad, time_s)
         settled = _has_settled(fibres, pad, time_s, reject_limit)
-        if pad.change == Change.UNKNOWN:
+        if pad.change == Change.UNKNOWN or pad.change == Change.FURTHER:
             count = classify_change(fibres, pad, time_s, settled, events, count)
         if settled:
             count = commit_change(fibres, pad, time_s, events, count)
@@ -503,7 +515,8 @@ def detect(
     """Detect presses in further readings (n, C), V, from the `initial_state`, which is overwritten.
 
     By the number of fibres present, `reject_limit` (C + 1,) is the chi-square that noise exceeds rarely, `accept_limit`
-    hardly ever. Returns the number of `events` (2 n, 2): 1 (touch) or 0, and the first reading that shows it.
+    hardly ever. Returns the number of `events` (2 n, 2): 1 (touch), 0 (release) or `FURTHER`, and the first reading
+    that shows it.
     """
     count = np.int64(0)
     for r in range(len(times_s)):

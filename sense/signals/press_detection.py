@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from padforge.common.validation import InputError, check_int
 from padforge.sense.arrays import MAX_FIBRES, Array, Indices, check_stream
-from padforge.sense.signals.detector_kernels import detect, initial_state
+from padforge.sense.signals.detector_kernels import FURTHER, Change, State, detect, initial_state
 
 P_REJECT, P_ACCEPT = 1e-3, 1e-9  # probabilities that white noise makes a block leave the levels, and makes a change
 TOUCH_DELAY_S, RELEASE_DELAY_S = 0.16, 0.08  # from a command to its first effect: means of the published recording
@@ -42,6 +42,10 @@ class PressDetector:
     Args:
         fibres: number of fibres, C.
 
+    Attributes:
+        further: readings, found by the last update, from which on a pad that was pressed is pressed further: deeper,
+            elsewhere or by a second finger.
+
     Raises:
         InputError: fewer than one fibre, or too many.
     """
@@ -52,6 +56,7 @@ class PressDetector:
         fibres = check_int("fibres", fibres, 1, MAX_FIBRES)
         self._fibres, self._pad = initial_state(fibres)
         self._last_s = -np.inf
+        self.further: list[int] = []
         degrees = np.arange(1, fibres + 1)
         self._reject_limit = np.concatenate([[0.0], chdtri(degrees, P_REJECT)])
         self._accept_limit = np.concatenate([[0.0], chdtri(degrees, P_ACCEPT)])
@@ -70,7 +75,20 @@ class PressDetector:
         events = np.empty((2 * len(times), 2), np.int64)
         times, rows = np.array(times), np.array(rows, order="C")  # `detect` would compile again for read-only arrays
         count = detect(self._fibres, self._pad, times, rows, self._reject_limit, self._accept_limit, events)
-        return [PressEvent(bool(down), reading) for down, reading in events[:count].tolist()]
+        found = events[:count].tolist()
+        self.further = [reading for kind, reading in found if kind == FURTHER]
+        return [PressEvent(bool(kind), reading) for kind, reading in found if kind != FURTHER]
+
+    def hold(self, step_v: Array) -> None:
+        """Take the latest release for that of one of two presses; the pad is still pressed.
+
+        Args:
+            step_v: response to the other press; shape (C,), V.
+        """
+        self._fibres["press_step"] = step_v
+        self._pad["state"] = State.PRESSED
+        if self._pad["in_change"]:
+            self._pad["change"] = Change.PARTIAL
 
 
 def detect_presses(readings: ArrayLike, times_s: ArrayLike) -> Presses:

@@ -20,7 +20,7 @@ DEEP = {"depth_mm": 2.51, "depth_r90_mm": 0.26, "force_n": 1.24, "force_r90_n": 
 EVENTS: tuple[Event, ...] = (
     PLAIN,
     replace(PLAIN, now_s=0.5, readings=3, since_s=0.25, x_mm=3.5, r50_mm=1.5, r90_mm=3.0, **DEEP),
-    replace(PLAIN, now_s=0.75, since="lift", readings=1, since_s=0.0, final=True, unlike=True),
+    replace(PLAIN, now_s=0.75, since="lift", readings=1, since_s=0.0, final=True, unlike=True, finger=2),
     FibreFault(press=3, since=1, fibres=(1,), kind="stuck", score=8.0),
     OtherPad(4),
 )
@@ -83,7 +83,7 @@ def test_lines_on_a_terminal(golden: Golden, capsys: pytest.CaptureFixture[str])
     fibres = [
         {"swing": swing, "state": state} for swing, state in ((0.5, "sound"), (-0.26, "stuck"), (None, "missing"))
     ]
-    presses = [{"text": f"press {number}: here"} for number in (3, 4)]
+    presses = [{"text": f"press {number}: here", "final": number == 3} for number in (3, 4, 5)]
     view = {"pressed": True, "presses": presses, "fibres": fibres, "faults": ["fibre 2 was dead", "fibre 3 is open"]}
     for shown in (view, view | {"pressed": False, "presses": [], "faults": []}):
         print("\n".join(["--", *view_lines(shown)]))

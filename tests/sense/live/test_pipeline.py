@@ -35,6 +35,8 @@ def no_delays() -> Iterator[None]:
 class ScriptedDetector:
     """A press detector that gives the presses of a recording, some readings after they begin and end."""
 
+    further: tuple[int, ...] = ()
+
     def __init__(self, recording: Recording, delays: tuple[int, int] = (2, 1)) -> None:
         events = (True, delays[0], recording.down_command), (False, delays[1], recording.up_command)
         self._events = sorted((index + late, index, down) for down, late, at in events for index in at.tolist())

@@ -1,0 +1,81 @@
+"""Expected course of a press: what a finger that rests or lifts does to readings in which another one is localized."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from padforge.sense.arrays import Array, Mask
+from padforge.sense.localizer.features import PressFeatures
+from padforge.sense.localizer.model import LocalizerModel
+from padforge.sense.localizer.moments import N_PRESS_WINDOWS, PRESS_WINDOWS
+from padforge.sense.localizer.response_model import interpolate_grid
+
+MAX_RATIO = 0.9  # of successive changes of a response that relaxes
+MIN_V2 = 1e-15  # lower limit of sums of squares, V^2
+_MIDDLES = np.array([(first + end - 1) / 2 for first, end in PRESS_WINDOWS])
+
+
+@dataclass(frozen=True)
+class PressCourse:
+    """Responses that the calibration expects of a press at a position, in proportion to the measured response.
+
+    Responses are without the effect of earlier presses.
+    """
+
+    measured: Array  # (C,), V, in the latest complete window
+    expected: Array  # (C,), V, in the same
+    fibre_mask: Mask  # (C,), valid fibres
+    pressed: Array  # (len(PRESS_WINDOWS), C), V, expected
+    released: Array  # (len(RELEASE_WINDOWS), C), V, expected
+
+    @classmethod
+    def fit(cls, model: LocalizerModel, features: PressFeatures, position_mm: Array) -> "PressCourse":
+        """Fit the proportion.
+
+        Args:
+            model: localizer that was fitted to windows.
+            features: of one press.
+            position_mm: its position; shape (2,).
+        """
+        scaler, side = model.scaler, len(model.table)
+        position = (position_mm - scaler.origin_mm)[None] / scaler.scale_mm
+        table = interpolate_grid(model.table.reshape(side, side, -1), position).reshape(scaler.mean_v.shape)
+        scaled = np.stack([table, scaler.transform(features).inputs[0]])
+        expected, measured = (scaler.uncentre(scaled) * scaler.scale_v).swapaxes(1, 2)
+        latest, mask = max(int(features.complete[0, :N_PRESS_WINDOWS].sum()) - 1, 0), features.fibre_mask[0]
+        expected *= _proportion(measured[latest], expected[latest], mask)
+        pressed, released = np.split(expected[: features.complete.shape[1]], [N_PRESS_WINDOWS])
+        return cls(measured[latest], expected[latest], mask, pressed, released)
+
+    @property
+    def explained_share(self) -> float:
+        """Share of the squares of the measured response that is explained."""
+        return self._share(self.expected)
+
+    @property
+    def changes_by_release(self) -> Array:
+        """Changes (len(RELEASE_WINDOWS), C), V, from the held press to the windows after its release."""
+        return self.released - self.pressed[-1]
+
+    def share_explained_by(self, other: "PressCourse") -> float:
+        """Return the share of the squares of the measured response that is in proportion to that of another press."""
+        mask = self.fibre_mask & other.fibre_mask
+        return self._share(_proportion(self.measured, other.measured, mask) * other.measured)
+
+    def response(self, frames: Array) -> Array:
+        """Return the response (n, C), V, at frames (n,) after the command down; it relaxes on after the windows."""
+        weights = np.stack([np.interp(frames, _MIDDLES, row) for row in np.eye(len(_MIDDLES))], axis=1)
+        earlier, later = np.diff(self.pressed[-3:], axis=0)
+        ratio = float(np.clip((earlier * later).sum() / max((earlier**2).sum(), MIN_V2), 0.0, MAX_RATIO))
+        steps = np.maximum(frames - _MIDDLES[-1], 0.0) / (_MIDDLES[-1] - _MIDDLES[-2])
+        return weights @ self.pressed + (ratio * (1 - ratio**steps) / (1 - ratio))[:, None] * later
+
+    def _share(self, expected: Array) -> float:
+        residual = (self.measured - expected)[self.fibre_mask]
+        return 1 - float((residual**2).sum()) / max(float((self.measured[self.fibre_mask] ** 2).sum()), MIN_V2)
+
+
+def _proportion(measured: Array, expected: Array, fibre_mask: Mask) -> float:
+    """Return the least-squares factor, at least 0, of an expected response (C,) to a measured one."""
+    energy = max(float((expected[fibre_mask] ** 2).sum()), MIN_V2)
+    return max(float((measured * expected)[fibre_mask].sum()) / energy, 0.0)
