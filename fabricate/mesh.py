@@ -1,6 +1,7 @@
 """Triangle meshes of bodies by manifold3d, and their files: STL and 3MF, the same bytes for the same mesh."""
 
 import logging
+import re
 import zipfile
 from collections.abc import Iterable
 from importlib.metadata import version
@@ -24,6 +25,7 @@ _log = logging.getLogger(__name__)
 
 _STL_RECORD = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
 
+_STL_TITLE_BYTES = 1000  # of an STL that is text, in which its first facet begins
 _STL_HEAD_BYTES = 84  # header of a binary STL, and its number of triangles
 SEPARATION_MM = 1e-4
 """Distance by which coincident vertices are separated: far below what prints, far above the resolution of a float."""
@@ -153,14 +155,24 @@ def read_mesh(path: Path) -> tuple[Array, Numbers]:
     return vertices, triangles
 
 
-def _without_tail(path: Path) -> bytes:
-    """Return a file without stray bytes at the end of a binary STL, which would make trimesh read it as text."""
+def _mended_stl(path: Path) -> bytes:
+    """Return an STL without the small defects that slicers pass over and trimesh does not; a warning names each."""
     content = path.read_bytes()
-    n_bytes = _STL_HEAD_BYTES + _STL_RECORD.itemsize * int.from_bytes(content[80:_STL_HEAD_BYTES], "little")
-    stray = len(content) - n_bytes
-    if n_bytes > _STL_HEAD_BYTES and 0 < stray < _STL_RECORD.itemsize:
-        _log.warning("%s: %d stray bytes at its end are left out", path, stray)
-        content = content[:n_bytes]
+    text = content.lower()
+    if text.startswith(b"solid") and b"facet" in text[:_STL_TITLE_BYTES]:
+        end = text.rfind(b"endfacet") + len(b"endfacet")
+        if b"endsolid" not in text[end:]:
+            _log.warning("%s: its end is missing, all facets before it are read", path)
+            content = content[:end] + b"\nendsolid\n"
+        with_points, n_commas = re.subn(rb"(?<=\d),(?=\d)", b".", content)
+        if n_commas:
+            _log.warning("%s: commas in %d numbers are read as decimal points", path, n_commas)
+        return with_points
+    n_stated = int.from_bytes(content[80:_STL_HEAD_BYTES], "little")
+    n_whole, n_stray = divmod(len(content) - _STL_HEAD_BYTES, _STL_RECORD.itemsize)
+    if n_whole > 0 and (n_whole, n_stray) != (n_stated, 0):
+        _log.warning("%s: states %d triangles, holds %d and %d stray bytes", path, n_stated, n_whole, n_stray)
+        content = content[:80] + n_whole.to_bytes(4, "little") + content[_STL_HEAD_BYTES : len(content) - n_stray]
     return content
 
 
@@ -198,7 +210,7 @@ def _read_by_trimesh(path: Path) -> tuple[Array, Numbers]:
     try:
         with np.errstate(all="ignore"):
             kind = path.suffix[1:].lower()
-            content = {"stl": _without_tail, "3mf": _without_unprinted}.get(kind, Path.read_bytes)(path)
+            content = {"stl": _mended_stl, "3mf": _without_unprinted}.get(kind, Path.read_bytes)(path)
             scene = trimesh.load_scene(BytesIO(content), file_type=kind, process=False)  # keeps triangles with NaN
             if scene.units:
                 scene = scene.convert_units("millimeters")

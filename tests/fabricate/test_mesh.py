@@ -40,12 +40,25 @@ def require_line(error: BaseException, name: str = "") -> None:
     assert len(str(error).splitlines()) == 1
 
 
-def test_read_mesh_leaves_stray_bytes_of_an_stl_out_with_a_warning(tmp_path, caplog):
-    vertices, triangles = np.eye(4)[:, :3], np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]])
-    write_stl(path := tmp_path / "tail.stl", vertices, triangles)
-    path.write_bytes(path.read_bytes() + b"\r\n")
-    assert len(read_mesh(path)[1]) == 4
-    assert caplog.messages == [f"{path}: 2 stray bytes at its end are left out"]
+TEXT = trimesh.exchange.stl.export_stl_ascii(trimesh.Trimesh(VERTICES + 0.5, TRIANGLES, process=False)).encode()
+BINARY = trimesh.exchange.stl.export_stl(trimesh.Trimesh(VERTICES + 0.5, TRIANGLES, process=False))
+
+
+@pytest.mark.parametrize(
+    ("content", "warning"),
+    [
+        (BINARY + b"\r\n", "states 12 triangles, holds 12 and 2 stray bytes"),
+        (BINARY[:80] + b"\x0e\0\0\0" + BINARY[84:], "states 14 triangles, holds 12 and 0 stray bytes"),
+        (TEXT.replace(b"endsolid", b""), "its end is missing, all facets before it are read"),
+        (TEXT.replace(b".", b","), f"commas in {TEXT.count(b'.')} numbers are read as decimal points"),
+    ],
+    ids=["tail", "count", "end", "commas"],
+)
+def test_read_mesh_reads_what_is_whole_of_an_stl_with_a_warning(tmp_path, caplog, content, warning):
+    (path := tmp_path / "defect.stl").write_bytes(content)
+    vertices, triangles = read_mesh(path)
+    assert vertices[triangles] == pytest.approx(VERTICES[TRIANGLES] + 0.5, abs=1e-6)
+    assert caplog.messages == [f"{path}: {warning}"]
 
 
 @pytest.mark.parametrize("suffix", [".stl", ".3mf"])
