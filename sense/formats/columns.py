@@ -81,7 +81,11 @@ def parse_columns(text: str, quantities: Sequence[str] = DATASETS) -> list[Colum
     required = [quantity for quantity in ("time", "fibres") if quantity in quantities]
     for quantity in required:
         if quantity not in named and not (quantity == "time" and "rate" in named):
-            expected = f"expected {' and '.join(required)} in each"
+            expected = f"expected {' and '.join(required)}"
+            if quantity == "time":  # other tables hold a line per press
+                expected += (
+                    ", or rate=HZ of regular readings; features of whole presses are for Localizer.fit in Python"
+                )
             raise InputError(f"columns {short_repr(text)} do not name {quantity}, {expected}")
     for one, other in (("x", "y"), ("down_command", "up_command")):
         if (one in named) != (other in named):
