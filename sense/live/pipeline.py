@@ -57,7 +57,7 @@ LATEST = 20  # readings before the present, or the release, that features of a l
 MIN_COMPLETE = 3  # complete windows of a change from which on it may be taken for a second finger
 MIN_EXPLAINED = 0.8  # minimum share of such a change that a press at its position explains
 MAX_DEEPENING = 0.6  # maximum share that the first finger, pressing deeper or less deep, explains
-LIFT_WINDOWS = 2, 3  # `RELEASE_WINDOWS` that show which of two fingers has been lifted
+LIFT_WINDOWS = 2, 3  # `RELEASE_WINDOWS` that show which of two fingers lifts off
 MAX_ERROR_RATIO = 0.5  # maximum squared error of that, relative to the second-best explanation
 RELEASE = max(RELEASE_WINDOWS[-1][1], RELEASED)  # readings after `up_command` that complete a press
 
@@ -369,7 +369,7 @@ class Live:
         return [event for press in list(presses) for event in self._follow(press, end)]
 
     def _end(self, released: int) -> list[Event]:
-        """End the press whose release shows at a reading; which one of two that is, `_tell_lifted` finds out later."""
+        """End the press whose release shows at a reading; which one of two that is, `_tell_released` finds out."""
         self._candidate, resting = None, self._resting
         if not resting or self._lift is not None:
             return []
@@ -415,7 +415,7 @@ class Live:
         """Return the events at the latest reading."""
         events: list[Event] = []
         if self._lift is not None and self._buffer.end >= self._lift + RELEASE_WINDOWS[LIFT_WINDOWS[-1]][1]:
-            events += self._tell_lifted(self._lift)
+            events += self._tell_released(self._lift)
             self._lift = None
         elif self._candidate is not None:
             events += self._judge(*self._candidate)
@@ -443,7 +443,7 @@ class Live:
             self._candidate = None
         return []
 
-    def _tell_lifted(self, lift: int) -> list[Event]:
+    def _tell_released(self, lift: int) -> list[Event]:
         """Release those of two fingers whose release explains the change since a reading, if that can be told."""
         resting, events = self._resting, list[Event]()
         for press in resting:
@@ -455,23 +455,23 @@ class Live:
         after, before = (self._mean(lift + first, lift + end) for first, end in (window, (-3, 0)))
         steps = np.array([course.changes_by_release[list(LIFT_WINDOWS)].mean(axis=0) for course in courses])
         sets, mask = ([0], [1], [0, 1]), courses[0].fibre_mask & courses[1].fibre_mask
-        errors = [float((((after - before) - steps[lifted].sum(axis=0))[mask] ** 2).sum()) for lifted in sets]
+        errors = [float((((after - before) - steps[ends].sum(axis=0))[mask] ** 2).sum()) for ends in sets]
         best, second_best = np.argsort(errors)[:2]
-        lifted = sets[best]
+        ends = sets[best]
         if errors[best] > MAX_ERROR_RATIO * errors[second_best]:
-            lifted = [1]  # one is taken to rest on, but either may be the one, so that neither is located any more
+            ends = [1]  # one is taken to rest on, but either may be the one, so that neither is located any more
             names, anywhere_mm = ("std_x_mm", "std_y_mm", "r50_mm", "r90_mm"), np.array(UNIFORM)[[0, 0, 1, 2]]
             radii_mm = dict(zip(names, (self._localizer.scaler.scale_mm * anywhere_mm).tolist(), strict=True))
             for press in resting:
                 if press.fixed is not None:
                     press.fixed = replace(press.fixed, unlike=True, **radii_mm)
                     events.append(self._show(press.fixed))
-        elif lifted == [1]:
+        elif ends == [1]:
             resting[1].fixed = None  # its release shows undisturbed, and locates it better
-        for number in lifted:
+        for number in ends:
             resting[number].release(lift, self._buffer)
-        if len(lifted) == 1:
-            self._detector.hold(courses[1 - lifted[0]].pressed[-1])
+        if len(ends) == 1:
+            self._detector.hold(courses[1 - ends[0]].pressed[-1])
         return events
 
     def _mean(self, first: int, end: int) -> Array:

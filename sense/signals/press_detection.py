@@ -75,9 +75,9 @@ class PressDetector:
         events = np.empty((2 * len(times), 2), np.int64)
         times, rows = np.array(times), np.array(rows, order="C")  # `detect` would compile again for read-only arrays
         count = detect(self._fibres, self._pad, times, rows, self._reject_limit, self._accept_limit, events)
-        found = events[:count].tolist()
-        self.further = [reading for kind, reading in found if kind == FURTHER]
-        return [PressEvent(bool(kind), reading) for kind, reading in found if kind != FURTHER]
+        changes = events[:count].tolist()
+        self.further = [reading for kind, reading in changes if kind == FURTHER]
+        return [PressEvent(bool(kind), reading) for kind, reading in changes if kind != FURTHER]
 
     def hold(self, step_v: Array) -> None:
         """Take the latest release for that of one of two presses; the pad is still pressed.
