@@ -133,13 +133,14 @@ def kind(line: str) -> str:
     return re.sub(r"#(?:(?:,| /) #)*", "#", masked(line))
 
 
-DETECTED = re.compile(r"(?<=detected at press )\d+")
-"""The press at which a fault is known, which is the first or the second one by the pad that a search finds."""
+OF_THE_PAD = re.compile(r"(?<=detected at press )\d+|\d+(?= crossings)|(?<=of the old model: fibres )\d+(, \d+)*")
+"""Whole numbers that depend on the pad that a search finds: the press at which a fault is known, crossings, fibres that
+are learnt again."""
 
 
 def alike(page: str, line: str, share: float) -> bool:
     """Whether two lines differ by their decimals alone, and these by no more than a share of them."""
-    page, line = (DETECTED.sub("N", each) for each in (page, line))
+    page, line = (OF_THE_PAD.sub("N", each) for each in (page, line))
     if masked(page) != masked(line):
         return False
     for one, other in zip(NUMBER.findall(page), NUMBER.findall(line), strict=True):
