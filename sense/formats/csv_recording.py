@@ -161,7 +161,15 @@ def _exported_entries(table: Table) -> list[ColumnEntry]:
 
 
 def export_csv(recording: Recording, path: str | Path) -> None:
-    """Write a recording as CSV, atomically; importing it gives the same numbers. A file at the path is replaced."""
+    """Write a recording as CSV, atomically; importing it gives the same numbers.
+
+    Args:
+        recording: recording to write.
+        path: path of the file, which is replaced.
+
+    Raises:
+        InputError: the file cannot be written.
+    """
     path = check_export(recording, path)
     measures = {name: getattr(recording, MEASURES[quantity]) for name, quantity in _MEASURED.items()}
     measures = {name: values for name, values in measures.items() if not np.isnan(values).all()}

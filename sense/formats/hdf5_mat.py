@@ -37,7 +37,15 @@ CYCLE, DOWN_AT = 40, 20  # readings of a published press, and the one at which t
 
 
 def export_hdf5(recording: Recording, path: str | Path) -> None:
-    """Write a recording as HDF5, atomically; importing it gives the same numbers. A file at the path is replaced."""
+    """Write a recording as HDF5, atomically; importing it gives the same numbers.
+
+    Args:
+        recording: recording to write.
+        path: path of the file, which is replaced.
+
+    Raises:
+        InputError: the file cannot be written.
+    """
     import h5py
 
     path = check_export(recording, path)
