@@ -170,7 +170,8 @@ def _mended_stl(path: Path) -> bytes:
         return with_points
     n_stated = int.from_bytes(content[80:_STL_HEAD_BYTES], "little")
     n_whole, n_stray = divmod(len(content) - _STL_HEAD_BYTES, _STL_RECORD.itemsize)
-    if n_whole > 0 and (n_whole, n_stray) != (n_stated, 0):
+    # What states twice as many as it holds is torn, or no STL: other text states half a billion.
+    if n_stated < 2 * n_whole and (n_whole, n_stray) != (n_stated, 0):
         _log.warning("%s: states %d triangles, holds %d and %d stray bytes", path, n_stated, n_whole, n_stray)
         content = content[:80] + n_whole.to_bytes(4, "little") + content[_STL_HEAD_BYTES : len(content) - n_stray]
     return content

@@ -61,6 +61,14 @@ def test_read_mesh_reads_what_is_whole_of_an_stl_with_a_warning(tmp_path, caplog
     assert caplog.messages == [f"{path}: {warning}"]
 
 
+@pytest.mark.parametrize("content", [BINARY[: 84 + 50 * 5], b"v 1.0 2.0 3.0\n" * 40], ids=["torn", "text"])
+def test_read_mesh_refuses_what_is_torn_or_no_stl(tmp_path, content):
+    (path := tmp_path / "other.stl").write_bytes(content)
+    with pytest.raises(InputError, match=r"other\.stl: ") as refusal:
+        read_mesh(path)
+    require_line(refusal.value)
+
+
 @pytest.mark.parametrize("suffix", [".stl", ".3mf"])
 def test_read_mesh_returns_what_was_written(tmp_path, suffix):
     moved = VERTICES + np.array([0.1, -123.456, 7])
