@@ -255,16 +255,17 @@ def _order_lines(document: Document) -> Iterator[str]:
     n_fibres, resin = len(document["fibres"]), document["settings"]["printer"]["resin"]
     dividers = Counter(entry["divider_ohm"] for entry in document["fibres"] if entry["divider_ohm"] is not None)
     values = ", ".join(f"{count} of {_ohms(ohm)}" for ohm, count in sorted(dividers.items()))
-    thick = f", {fibre['diameter_mm']:g} mm" if f"{fibre['diameter_mm']:g} mm" not in fibre["name"] else ""
+    resistances = [entry["resistance_ohm"] or 0.0 for entry in document["fibres"]]
+    diameter = f"{fibre['diameter_mm']:g} mm"
     amounts = {
-        "fibre": f"{order['fibre_m']:.2f} m of {fibre['name']}{thick}",
+        "fibre": f"{order['fibre_m']:.2f} m of {fibre['name']}" + f", {diameter}" * (diameter not in fibre["name"]),
         "silicone": f"{silicone['mass_g']:.0f} g of {silicone['name']}",
         "adhesive": f"up to {sum(document['adhesive']['steps_ml']):.2f} ml in the tracks",
         "resin" if resin else "filament": f"{order['plastic_g']:.0f} g of {PLASTICS[resin][0]}",
         "connectors": f"{2 * n_fibres}",
         "wire": f"{2 * n_fibres} pieces, from the pad to the board",
         "resistors": values or f"{n_fibres}, of values by the resistance of the fibre",
-        "capacitors": f"{n_fibres}" if any(ohm > MAX_SOURCE_OHM for ohm in dividers) else "",
+        "capacitors": f"{n_fibres}" if max(resistances) > MAX_SOURCE_OHM else "",
         "board": f"for {n_fibres} fibres",
     }
     rows = [(kind, amount, *PRODUCTS[kind]) for kind, amount in amounts.items() if amount]
