@@ -503,6 +503,7 @@ class Live:
                 self._monitor.n_presses += 1
             self._previous_end = max(self._previous_end, press.up_command)
             self._presses.remove(press)
+            press.other = None  # fingers that take turns without a rest would be remembered for ever
         return events
 
     def _estimate(self, press: BufferedPress, until: int, final: bool) -> Estimate:

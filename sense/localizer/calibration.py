@@ -69,8 +69,8 @@ MOMENT_SUBSETS = 4  # the same where there are several moments
 class Experience:
     """Errors of 26 other localizers at a moment of a press, as a prior for the radii.
 
-    They were of 10 pads, simulated and published, with the defaults of `SIZE_KEYS`, trained out, and 235 to 3500
-    training presses. The mean ratio of distance to expected radius differed by `PAD_SPREAD` between them.
+    They were of nine pads, simulated ones and the published one, with the defaults of `SIZE_KEYS`, trained out, and 235
+    to 3500 training presses. The mean ratio of distance to expected radius differed by `PAD_SPREAD` between them.
     """
 
     growth_presses: float  # with n training presses, new presses err 1 + this / n times as much as expected
