@@ -1,6 +1,5 @@
 """The arm behind the real ur-rtde: what it does, and that it rests after a fault."""
 
-import os
 import signal
 import socket
 import subprocess
@@ -211,8 +210,8 @@ def unlock_and_play(robot: EmulatedUR5) -> None:
 
 def signal_worker(name: str) -> Callable[[EmulatedUR5, UR5], None]:
     def send(robot: EmulatedUR5, arm: UR5) -> None:
-        assert arm.worker_pid is not None
-        os.kill(arm.worker_pid, signal.Signals[name])
+        assert arm._worker is not None  # noqa: SLF001
+        arm._worker.process.send_signal(signal.Signals[name])  # noqa: SLF001
 
     return send
 

@@ -1,6 +1,5 @@
 """The sample clock against simulated truth: jitter, stalls, a board that is off by up to 200 ppm and drifts."""
 
-import pickle
 from dataclasses import dataclass
 
 import numpy as np
@@ -76,13 +75,6 @@ def test_times_are_accurate_from_first_block(rate: tuple[float, int], skew: floa
     errors, _ = run(Link(*rate, 30.0, skew, seed, jitter_s))
     assert np.abs(errors).max() < 5e-3
     assert np.abs(errors[len(errors) // 2 :]).max() < 5e-4
-
-
-def test_times_stay_accurate_in_bounded_memory() -> None:
-    errors, clock = run(Link(40.0, 8, 600.0, 200e-6, seed=1))
-    assert np.abs(errors).max() < 2e-3
-    assert np.abs(errors[250:]).max() < 1e-3
-    assert len(pickle.dumps(clock)) < 3000  # a minute of arrivals
 
 
 def test_times_keep_gaps_and_ascend_through_delay_step() -> None:
