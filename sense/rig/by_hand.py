@@ -420,8 +420,8 @@ class HandSession:
     def view(self) -> dict[str, Any]:
         """Return the present view as JSON; positions are [x, y], mm, or None.
 
-        "progress" is the elapsed fraction of the phase, 0 to 1; "rejected" the target of the last press if that was
-        rejected; "swing" the deviation of a fibre from its baseline over the maximum response so far, None if missing.
+        "rejected" is the target of the last press if that was rejected; "swing" the deviation of a fibre from its
+        baseline over the maximum response so far, None if missing.
         """
         sequence, end = self._sequence, self._ring.end
         baseline = self._baseline if sequence.is_pressed else self._ring.baseline(end)
@@ -464,18 +464,10 @@ class HandSession:
 def record_by_hand(
     config: RigConfig, board: Board, on_view: OnView, poll_commands: PollCommands, resume: bool = False
 ) -> Recording:
-    """Record presses by hand; completed presses are on the disk even if the session fails.
+    """Record presses by hand, with a board that is not yet connected.
 
-    Args:
-        config: pad, settings and run directory.
-        board: board, not yet connected.
-        on_view: receives every `HandSession.view`.
-        poll_commands: returns the commands, of `COMMANDS`, since its last call.
-        resume: whether to continue a recording in the run directory.
-
-    Raises:
-        InputError: settings, targets or the run directory are invalid, or no press was made.
-        RigFault: the board or the disk failed.
+    Completed presses are on the disk even if the session fails. `on_view` receives every `HandSession.view`;
+    `poll_commands` returns the commands, of `COMMANDS`, since its last call.
     """
     if not resume:
         check_new_recording(config.out)

@@ -17,10 +17,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from padforge.design.settings import PUBLISHED_CONTACT
-from padforge.sense.recording.block_file import read_blocks
 from padforge.sense.recording.press_plan import PressPlan
 from padforge.sense.recording.recording import Recording
-from padforge.sense.recording.run_directory import STATE_COLUMNS, Recorder, read_journal
+from padforge.sense.recording.run_directory import Recorder, read_journal
 from padforge.sense.rig import operation
 from padforge.sense.rig.arms.ur5 import UR5
 from padforge.sense.rig.config import RigConfig
@@ -76,14 +75,6 @@ def test_run_records_every_press(tmp_path):
     journal = [json.loads(line) for line in (tmp_path / "run" / "journal.ndjson").read_text().splitlines()]
     reached = np.array([event["at_mm"] for event in journal if event["event"] == "done"])
     assert reached == pytest.approx(np.column_stack([PLAN.positions_mm, PLAN.depths_mm]), abs=0.1)
-
-
-def test_run_leaves_a_gap_for_lost_samples(tmp_path):
-    arm, board, options = rig()
-    arm.hook = lambda arm: setattr(board, "lose", 35 if 101.0 < arm.time() < 101.05 else 0)
-    run(tmp_path / "run", arm, board, options)
-    assert 0.02 < np.diff(Recording.open(tmp_path / "run").times_s).max() < 0.06
-    assert "lost" in (tmp_path / "run" / "journal.ndjson").read_text()
 
 
 def test_press_begins_with_the_first_reading_after_the_command(tmp_path):
@@ -299,39 +290,6 @@ def test_run_raises_a_disk_that_hangs(tmp_path):
     assert len(arm.moves) == 3
 
 
-def test_run_waits_for_a_press_alone_on_a_disk_that_never_rests(tmp_path):
-    """What is recorded while a press is awaited takes the disk until there is more of it."""
-    arm, board, options = rig()
-    drain, more, over = arm.drain, threading.Semaphore(0), threading.Event()
-
-    def counted_drain():
-        if len(arm.moves) == 3 and arm.pose[2] > 50:
-            if over.is_set():
-                more.release()
-            over.set()  # the only press is
-            arm.time.sleep(0.1)
-        return drain()
-
-    with open_run(tmp_path / "run") as recorder:
-        append_states = recorder.append_states
-
-        def slow(rows):
-            if over.is_set():
-                more.acquire(timeout=0.5)
-            append_states(rows)
-
-        arm.drain, recorder.append_states = counted_drain, slow
-        press(
-            arm,
-            board,
-            recorder,
-            options,
-            PressPlan(PLAN.positions_mm[:1], PLAN.depths_mm[:1]),
-            on_progress=lambda *progress: more.release(1000),
-        )
-    assert n_done(tmp_path / "run") == 1
-
-
 def test_resumed_run_drops_what_came_while_it_connected(tmp_path):
     """To connect an arm may take longer than the second between the last reading and the next."""
     for presses in (1, 2):
@@ -341,37 +299,6 @@ def test_resumed_run_drops_what_came_while_it_connected(tmp_path):
     recording = Recording.open(tmp_path / "run")
     assert recording.times_s[0] < 0.05
     assert np.sort(np.diff(recording.times_s))[-2:] == pytest.approx([0.01, 1.01], abs=0.02)
-
-
-def test_run_keeps_what_each_press_reached(tmp_path):
-    """As the states on the disk have it: where the tip stood at the end, and the median of the force at rest.
-
-    The arm stands beside where it was sent, and the force has spikes, so that its mean is above its median.
-    """
-    arm, board, options = rig(pad_angle_deg=30.0, press_mm_s=400.0)
-    move = arm.move
-
-    def beside(pose, speed_mm_s, acceleration_mm_s2):
-        move((pose[0] + 0.01234, pose[1], pose[2] + 0.03456, *pose[3:]), speed_mm_s, acceleration_mm_s2)
-
-    arm.move = beside
-    arm.hook = lambda arm: setattr(arm, "force_n", -min(50 - arm.pose[2], 4.5) * (1 + (7 * arm.time() % 1) ** 6))
-    run(tmp_path / "run", arm, board, options, PressPlan(PLAN.positions_mm[:2], np.array([4.0, 5.0])))
-    recording = Recording.open(tmp_path / "run")
-    _, states = read_blocks(tmp_path / "run" / "states.bin", len(STATE_COLUMNS) - 1)
-    journal = [json.loads(line) for line in (tmp_path / "run" / "journal.ndjson").read_text().splitlines()]
-    for press, done in enumerate(event for event in journal if event["event"] == "done"):
-        x, y, z, *_, force_n, _ = states[np.abs(states[:, 2] - 50.03456 + recording.depths_mm[press]) < 1e-6].T
-        turned = ((x[-1] + 1j * (y[-1] + 400)) * np.exp(-1j * np.pi / 6)).round(4)
-        assert done["at_mm"] == [turned.real, turned.imag, round(50 - z[-1], 4)]
-        n = len(force_n)  # but for those until the arm is known to rest, and one as it is sent up
-        assert done["force_n"] in [np.median(np.abs(force_n[a:b])) for a in (0, 1, 2) for b in (n - 1, n)]
-        assert abs(np.abs(force_n).mean() - done["force_n"]) > 0.05
-    assert recording.depths_mm.tolist() == [4.0, 5.0]
-    arm, board, options = rig(max_force_n=None)
-    arm.force_n = None  # no sensor
-    run(tmp_path / "without", arm, board, options, PressPlan(PLAN.positions_mm[:1], np.array([4.0])))
-    assert np.isnan(Recording.open(tmp_path / "without").forces_n).all()
 
 
 @settings(max_examples=20)
@@ -472,9 +399,11 @@ def test_record_handles_a_second_ctrl_c_after_the_loop(tmp_path: Path, monkeypat
 
     arm = FakeArm(Time())
     monkeypatch.setattr(operation, "PressLoop", InterruptedLoop)
+    monkeypatch.setattr(operation, "load_device", lambda group, name: lambda rig: arm)
+    monkeypatch.setattr(operation, "make_board", lambda rig, inputs: FakeBoard(arm))
     config = RigConfig(PAD, PUBLISHED_CONTACT, RIG, tmp_path / "run", "test")
     with pytest.raises(KeyboardInterrupt):
-        operation.record(config, contextlib.nullcontext((arm, FakeBoard(arm), RIG)))
+        operation.record("ur5", config)
     assert received == [signal.SIGINT] * 2
 
 
