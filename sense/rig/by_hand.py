@@ -6,8 +6,7 @@ session is JSON, for the page (`live/pages/hand.html`), and a few lines of text 
 
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from enum import StrEnum
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -102,21 +101,15 @@ def open_recorder_by_hand(config: RigConfig, board: Mapping[str, Any], resume: b
     return recorder, targets_mm, np.array(remaining).reshape(-1, 2)
 
 
-class HandPhase(StrEnum):
-    """State of a session: what the person is asked to do.
+HandPhase = Literal["settle", "wait", "press", "hold", "lift", "done"]
+"""State of a session: what the person is asked to do.
 
-    SETTLE --ready--> PRESS --touch--> HOLD --held for hold_s--> LIFT --release--> WAIT --ready--> PRESS ... DONE
+settle --ready--> press --touch--> hold --held for hold_s--> lift --release--> wait --ready--> press ... done
 
-    A touch in SETTLE, WAIT or DONE leads to LIFT and is rejected. Rejected are also presses that were held for too
-    short or too long, were too weak, or moved.
-    """
-
-    SETTLE = "settle"  # hands off before the first press
-    WAIT = "wait"  # for the pad to recover
-    PRESS = "press"
-    HOLD = "hold"
-    LIFT = "lift"
-    DONE = "done"  # all presses are made
+The hands are off the pad in "settle", before the first press, and in "wait", while the pad recovers. A touch in these,
+or in "done", leads to "lift" and is rejected. Rejected are also presses that were held for too short or too long, were
+too weak, or moved.
+"""
 
 
 def press_responses(readings: Array, down_command: int, up_command: int) -> Array:
@@ -229,10 +222,10 @@ class PressSequence:
         """Return the state at a time."""
         if self.is_pressed:
             is_over = self._rejection or self.held_s(now_s) >= self.hold_s
-            return HandPhase.LIFT if is_over else HandPhase.HOLD
+            return "lift" if is_over else "hold"
         if now_s < self._ready_s:
-            return HandPhase.SETTLE if self._is_settling else HandPhase.WAIT
-        return HandPhase.PRESS if self.remaining else HandPhase.DONE
+            return "settle" if self._is_settling else "wait"
+        return "press" if self.remaining else "done"
 
     def progress(self, now_s: float) -> float:
         """Return the elapsed fraction of the wait or the hold, 0 to 1."""
@@ -322,7 +315,7 @@ class HandSession:
                 if len(times_s):
                     self.feed(times_s, readings)
                     on_view(self.view())
-                if self._phase() is HandPhase.DONE:
+                if self._phase() == "done":
                     return
         except OSError as error:
             raise RigFault("disk", f"the recording cannot be written ({error.strerror or error})") from error
@@ -444,7 +437,7 @@ class HandSession:
         }
 
     def _phase(self) -> HandPhase:
-        return HandPhase.LIFT if self._detector is None else self._sequence.phase(self._now_s)
+        return "lift" if self._detector is None else self._sequence.phase(self._now_s)
 
     def _prompt(self) -> str:
         sequence = self._sequence
@@ -452,12 +445,12 @@ class HandSession:
             return "lift; if nothing touches the pad, say so (f)"
         target = _position_text(sequence.target)
         return {
-            HandPhase.SETTLE: "hands off the pad",
-            HandPhase.WAIT: f"next {target}: wait" if target else "hands off the pad",
-            HandPhase.PRESS: f"press {target}",
-            HandPhase.HOLD: "hold",
-            HandPhase.LIFT: "lift",
-            HandPhase.DONE: "all presses are made",
+            "settle": "hands off the pad",
+            "wait": f"next {target}: wait" if target else "hands off the pad",
+            "press": f"press {target}",
+            "hold": "hold",
+            "lift": "lift",
+            "done": "all presses are made",
         }[self._phase()]
 
 

@@ -120,7 +120,6 @@ class EmulatedLineBoard(SerialDevice):
         """Open the pseudo-terminal; a period is longer than the header says by `skew_ppm`."""
         super().__init__("board", seed)
         self._source, self._header, self._skew_ppm, self._silent = source, header, skew_ppm, silent
-        self._columns = header.channels
         self._start_s: float | None = None
         self._first = 0  # index of the next sample
         self._stalled = self._resetting = False
@@ -138,10 +137,6 @@ class EmulatedLineBoard(SerialDevice):
     def reset(self) -> None:
         """Start anew, as by its button."""
         self._resetting = True  # done by the board's own thread, for which the start must not vanish within a step
-
-    def send_columns(self, columns: int) -> None:
-        """Send this number of counts a line from now on."""
-        self._columns = columns
 
     def _step(self, data: bytes) -> None:
         if self._stalled:
@@ -174,7 +169,7 @@ class EmulatedLineBoard(SerialDevice):
             return
         self._first = end
         scale = self._header.full_scale
-        volts = self._source(self.true_times(index))[:, : self._columns]
+        volts = self._source(self.true_times(index))[:, : self._header.channels]
         counts = np.clip(np.rint(volts / self._header.reference_v * scale), 0, scale).astype(np.int64)
         for k, row in zip(index.tolist(), counts.tolist(), strict=True):
             if len(self._out) > MAX_OUT_BYTES:

@@ -16,7 +16,6 @@ from numpy.typing import ArrayLike
 from padforge.design import Contact, Morphology
 from padforge.design.settings import PadSettings
 from padforge.sense import Recording
-from padforge.sense.localizer.calibration import calibrate
 from padforge.sense.recording.run_directory import read_journal
 from padforge.sense.rig import by_hand
 from padforge.sense.rig.by_hand import (
@@ -38,7 +37,6 @@ from padforge.sense.settings import RigSettings
 from padforge.sense.signals.press_detection import PressDetector, PressEvent
 from tests.emulators.finger import SCATTER_MM, Finger
 from tests.helpers.page_names import names_in_view
-from tests.sense.conftest import QUICK, few_moments
 from tests.sense.rig.fakes import FingerBoard, Time
 
 
@@ -56,10 +54,7 @@ def test_plan_targets_orders_uniform_ones_in_short_rounds() -> None:
         assert (np.ptp(positions[first : first + ROUND], axis=0) > 0.6 * 45).all()
 
 
-def test_plan_targets_keeps_the_order_of_a_grid_or_file(tmp_path: Path) -> None:
-    grid = plan_targets(config_of(presses=9, plan="serpentine"))
-    assert (np.diff(grid[:3, 0]) > 0).all()
-    assert (np.diff(grid[3:6, 0]) < 0).all()
+def test_plan_targets_keeps_the_order_of_a_file(tmp_path: Path) -> None:
     (tmp_path / "places.csv").write_text("x_mm,y_mm\n3.25,-1\n0,2\n3.25,-1\n")
     assert plan_targets(config_of(plan=str(tmp_path / "places.csv"))).tolist() == [[3.25, -1], [0, 2], [3.25, -1]]
 
@@ -268,24 +263,6 @@ def test_session_raises_a_full_disk(hands, monkeypatch: pytest.MonkeyPatch) -> N
     assert fault.value.cause == "disk"
 
 
-class Resting(Finger):
-    """Leaves the hand on the pad at its third press, for long."""
-
-    def _touch(self, time_s: float) -> tuple[np.ndarray, float]:
-        place, depth = super()._touch(time_s)
-        if len(self.strokes) == 3 and self.strokes[2].up_s < np.inf:
-            self.strokes[2].up_s = self.strokes[2].down_s + 10.0
-        return place, depth
-
-
-def test_session_asks_a_resting_hand_to_lift(hands) -> None:
-    hand = hands(finger=Resting, presses=4)
-    recording = hand.record()
-    np.testing.assert_array_equal(accepted_mm(recording), hand.targets)
-    assert [why for why in hand.messages if "held for" in why and "lift after 0.6 s" in why]
-    assert any(view["prompt"].startswith("lift; if nothing") for view in hand.views)
-
-
 BASELINE = np.array([2.0, 1.8, 1.9])
 PRESS = np.array([0.1, -0.2, 0.2])
 
@@ -384,14 +361,6 @@ def test_validator_follows_the_drift_of_the_baseline(validator: PressValidator) 
     assert validator.is_touched(BASELINE) is True
     validator.reset_baseline()
     assert validator.is_touched(BASELINE) is None
-
-
-def test_calibrate_learns_from_a_recording_by_hand(clumsy: tuple[Hands, Recording]) -> None:
-    hand, recording = clumsy
-    with few_moments():
-        _, evaluation = calibrate(recording, QUICK.model_copy(update={"members": 1, "epochs": 6}))
-    scale_mm = np.linalg.norm(hand.targets - hand.targets.mean(axis=0), axis=1).mean()
-    assert evaluation.errors[0]["mean_mm"] < 0.4 * scale_mm
 
 
 def test_presses_are_held_for_half_a_cycle_at_the_rate_of_the_board(monkeypatch: pytest.MonkeyPatch, tmp_path) -> None:

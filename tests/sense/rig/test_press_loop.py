@@ -225,67 +225,60 @@ def test_run_stops_and_retreats_and_says_whether_the_tool_stays_on_the_pad(tmp_p
     golden("rig/faults.txt", "\n".join(reports))
 
 
-def test_run_loses_nothing_on_a_full_disk(tmp_path):
-    arm, board, options = rig()
-    with open_run(tmp_path / "run") as recorder:
+def run_on_disk(path, arm, board, disturb, **more):
+    """Record on a disk that is disturbed each time before it synchronises."""
+    with open_run(path) as recorder:
         sync = recorder.sync
 
-        def full():
-            if len(recorder.done) >= 3:
-                raise OSError(28, "No space left on device")
+        def disturbed():
+            disturb(recorder)
             sync()
 
-        recorder.sync = full
-        with pytest.raises(RigFault, match="No space left") as fault:
-            press(arm, board, recorder, options)
-        recorder.sync = sync
+        recorder.sync = disturbed
+        try:
+            press(arm, board, recorder, RIG, FOUR, **more)
+        finally:
+            recorder.sync = sync
+
+
+def test_run_loses_nothing_on_a_full_disk(tmp_path):
+    def fill(recorder):
+        if len(recorder.done) >= 3:
+            raise OSError(28, "No space left on device")
+
+    arm, board, _ = rig()
+    with pytest.raises(RigFault, match="No space left") as fault:
+        run_on_disk(tmp_path / "run", arm, board, fill)
     assert fault.value.cause == "disk"
     assert arm.stops >= 1
     assert n_done(tmp_path / "run") >= 2
 
 
 def test_run_begins_no_press_before_the_last_one_is_on_the_disk(tmp_path):
-    arm, board, options = rig()
+    arm, board, _ = rig()
     progress = []
-    with open_run(tmp_path / "run") as recorder:
-        sync = recorder.sync
 
-        def slow():
-            time.sleep(0.02)
-            sync()
+    def note(done, total, what):
+        progress.append((done, n_done(tmp_path / "run"), len(arm.moves)))
 
-        recorder.sync = slow
-        press(
-            arm,
-            board,
-            recorder,
-            options,
-            FOUR,
-            on_progress=lambda done, total, what: progress.append((done, n_done(tmp_path / "run"), len(arm.moves))),
-        )
+    run_on_disk(tmp_path / "run", arm, board, lambda recorder: time.sleep(0.02), on_progress=note)
     assert progress == [(done, done, 3 * done) for done in range(1, 5)]
 
 
 def test_run_raises_a_disk_that_hangs(tmp_path):
-    arm, board, options = rig()
+    arm, board, _ = rig()
     resume = threading.Event()
-    with open_run(tmp_path / "run") as recorder:
-        sync = recorder.sync
 
-        def hangs():
-            resume.wait(20)
-            sync()
+    def hook(arm):
+        if len(arm.moves) >= 3 and arm.pose[2] == 60:
+            arm.time.sleep(1.0)
+            board.read()
+        if arm.stops:
+            resume.set()
 
-        def hook(arm):
-            if len(arm.moves) >= 3 and arm.pose[2] == 60:
-                arm.time.sleep(1.0)
-                board.read()
-            if arm.stops:
-                resume.set()
-
-        recorder.sync, arm.hook = hangs, hook
-        with pytest.raises(RigFault, match="the disk took more than 30 s") as fault:
-            press(arm, board, recorder, options)
+    arm.hook = hook
+    with pytest.raises(RigFault, match="the disk took more than 30 s") as fault:
+        run_on_disk(tmp_path / "run", arm, board, lambda recorder: resume.wait(20))
     assert fault.value.cause == "disk"
     assert len(arm.moves) == 3
 

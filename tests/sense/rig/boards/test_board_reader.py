@@ -95,19 +95,6 @@ def test_times_keep_gaps_and_ascend_through_delay_step() -> None:
     assert before == pytest.approx(3.199, abs=1e-3)
 
 
-def test_times_of_microsecond_clock() -> None:
-    """A board that counts microseconds, with a resonator that is off by 3 in a thousand."""
-    rng = np.random.default_rng(2)
-    clock, measured_us = SampleClock(1e-6, 5e-3), np.cumsum(rng.integers(900, 1100, 90_000))
-    measured_s = 50 + measured_us * 1e-6 * 1.003
-    times = np.empty(0)
-    for block in np.split(np.arange(len(measured_us)), 9000):
-        clock.observe(int(measured_us[block[-1]]), float(measured_s[block[-1]]) + rng.uniform(0, 5e-3))
-        times = clock.times(measured_us[block])
-    assert times == pytest.approx(measured_s[-10:], abs=1e-3)
-    assert np.diff(times) == pytest.approx(np.diff(measured_s[-10:]), rel=1e-2)
-
-
 @settings(max_examples=15)
 @given(st.integers(0, 2**32 - 1), st.integers(2, 12), st.sampled_from([1e-4, 1e-3, 1e-1]))
 def test_times_follow_highest_line_below_arrivals(seed: int, count: int, size: float) -> None:
