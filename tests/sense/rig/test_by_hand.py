@@ -83,10 +83,10 @@ IDENTITY = {"name": "virtual", "channels": 2 * HAND_PAD.grid, "rate_hz": HAND_RI
 class Hands:
     """Records by hand, again and again, with one finger on one pad; keeps the views, and the outcomes in order."""
 
-    def __init__(self, folder: Path, finger: type[Finger] = Finger, mishaps: float = 0.0, **settings: Any) -> None:
+    def __init__(self, folder: Path, mishaps: float = 0.0, **settings: Any) -> None:
         rig = HAND_RIG.model_copy(update=settings)
         self.out, self.clock = folder / "hand", Time(least_s=0.025)
-        self.finger = finger(HAND_PAD, Contact(), rig, rig.board_rate_hz, mishaps=mishaps)
+        self.finger = Finger(HAND_PAD, Contact(), rig, rig.board_rate_hz, mishaps=mishaps)
         self.config = RigConfig(HAND_PAD, Contact(), rig, self.out, "test")
         self.targets = plan_targets(self.config)
         self.messages: list[str] = []
@@ -117,18 +117,6 @@ class Hands:
         times_s = recording.times_s[recording.down_command]
         return [self.finger.strokes[int(np.argmin(np.abs(downs - time_s)))] for time_s in times_s]
 
-    def interrupt(self, done: int, phase: str) -> None:
-        """Record until Ctrl-C after so many presses in that phase; half a minute later nothing touches the pad."""
-
-        def watch(view: dict) -> None:
-            if (view["done"], view["phase"]) == (done, phase):
-                raise KeyboardInterrupt
-
-        with pytest.raises(KeyboardInterrupt):
-            self.record(watch=watch)
-        self.finger.look({"phase": "settle"})
-        self.clock.sleep(30)
-
 
 @pytest.fixture
 def hands(tmp_path: Path) -> Callable[..., Hands]:
@@ -145,15 +133,10 @@ def distances_mm(recording: Recording, strokes: np.ndarray) -> list[float]:
     return [float(np.linalg.norm(stroke.position_mm - place)) for stroke, place in made]
 
 
-@pytest.fixture(scope="module")
-def clumsy(tmp_path_factory: pytest.TempPathFactory) -> tuple[Hands, Recording]:
-    """A recording in which three presses of ten go wrong."""
-    hand = Hands(tmp_path_factory.mktemp("hand"), mishaps=0.3, presses=40)
-    return hand, hand.record()
-
-
-def test_session_accepts_every_target_once_and_rejects_mishaps(clumsy: tuple[Hands, Recording]) -> None:
-    hand, recording = clumsy
+def test_session_accepts_every_target_once_and_rejects_mishaps(hands) -> None:
+    """Three presses of ten go wrong."""
+    hand = hands(mishaps=0.3, presses=40)
+    recording = hand.record()
     np.testing.assert_array_equal(accepted_mm(recording), hand.targets)
     strokes = np.array(hand.strokes_of(recording))
     rejected, accepted = (
@@ -237,10 +220,18 @@ def test_session_quits(hands) -> None:
 def test_session_resumes(hands, monkeypatch, phase: str, killed: bool) -> None:
     """A press that was under way is none; after a kill nothing tells the journal of it."""
     hand = hands(presses=5)
+
+    def watch(view: dict) -> None:
+        if (view["done"], view["phase"]) == (3, phase):
+            raise KeyboardInterrupt
+
     with monkeypatch.context() as patched:
         if killed:
             patched.setattr(by_hand.Recorder, "abort", lambda self, reason: None)
-        hand.interrupt(3, phase)
+        with pytest.raises(KeyboardInterrupt):
+            hand.record(watch=watch)
+    hand.finger.look({"phase": "settle"})
+    hand.clock.sleep(30)  # nothing touches the pad any more
     assert len(read_journal(hand.out / "journal.ndjson")) == 3
     before = Recording.open(hand.out)
     np.testing.assert_array_equal(before.presses_mm, hand.targets[:3])
