@@ -166,6 +166,7 @@ def _record_with(rig: str, config: "RigConfig", model: Path | None, dry_run: boo
 
     if resume and not (config.out / START).exists():
         _warn(f"{config.out}: nothing to resume, a new recording begins")
+        resume = False
     if rig == "hand":
         if dry_run or model:
             raise InputError("--dry-run and --model need an arm, allowed with --rig hand are --plan and --resume")

@@ -17,7 +17,7 @@ from padforge.sense.arrays import Array
 from padforge.sense.localizer.features import REST, interpolate_gaps
 from padforge.sense.recording.press_plan import fit_pad_settings, make_plan, pressable_test
 from padforge.sense.recording.recording import Recording
-from padforge.sense.recording.run_directory import JOURNAL, START, Recorder, check_new_recording, read_journal
+from padforge.sense.recording.run_directory import JOURNAL, Recorder, check_new_recording, read_journal
 from padforge.sense.rig.config import RigConfig, open_recorder, read_source
 from padforge.sense.rig.devices import Board, RigFault
 from padforge.sense.rig.streams import HISTORY, SLACK, RingBuffer, stream_board
@@ -88,14 +88,13 @@ def _order_in_rounds(positions_mm: Array) -> Array:
 
 def open_recorder_by_hand(config: RigConfig, board: Mapping[str, Any], resume: bool) -> tuple[Recorder, Array, Array]:
     """Return the recorder, new or resumed, the targets (Q, 2) of its plan, and the remaining targets (P, 2), mm."""
-    is_resumed = resume and (config.out / START).exists()
-    if is_resumed:
+    if resume:
         targets_mm = np.array(read_source(config, config.rig, KIND)["plan"]["presses"], np.float64)
     else:
         targets_mm = plan_targets(config)
     recorder = open_recorder(config, config.rig, targets_mm.tolist(), config.out, resume, {"board": board}, KIND)
     remaining = targets_mm.tolist()
-    for press in read_journal(config.out / JOURNAL).values() if is_resumed else ():
+    for press in read_journal(config.out / JOURNAL).values() if resume else ():
         if list(press[:2]) in remaining:
             remaining.remove(list(press[:2]))
     return recorder, targets_mm, np.array(remaining).reshape(-1, 2)

@@ -164,7 +164,7 @@ class RigConfig:
 
 def load_or_make_plan(config: RigConfig, rig: RigSettings, resume: bool) -> PressPlan:
     """Return the stored plan of a resumed recording, otherwise a new one by `rig`."""
-    if resume and (config.out / START).exists():
+    if resume:
         plan = PressPlan.from_rows(read_source(config, rig, KIND)["plan"]["presses"])
         free = pressable_test(config.pad, fit_pad_settings(config.pad, config.pad_settings))
         return check_pressable(plan, config.out, free)
@@ -189,8 +189,6 @@ def read_source(config: RigConfig, rig: RigSettings, kind: str) -> dict[str, Any
 
 def plan_notice(config: RigConfig) -> str:
     """Return a notice that a resumed recording keeps its plan although `[rig]` sets another; "" if it does not."""
-    if not (config.out / START).exists():
-        return ""
     stored, current = read_json(config.out / START, FORMAT)["source"]["rig"], config.rig.model_dump(mode="json")
     changed = [f"{key} = {stored.get(key)}" for key in _PLAN_KEYS if stored.get(key) != current[key]]
     return f"{config.out}: goes on by the plan it was begun with, [rig] {', '.join(changed)}" if changed else ""
@@ -205,14 +203,14 @@ def open_recorder(
     identities: Mapping[str, Mapping[str, Any]],
     kind: str = KIND,
 ) -> Recorder:
-    """Return the recorder of a new recording in `folder`, or of the one there if `resume` and there is one.
+    """Return the recorder of a new recording in `folder`, or of the one there if `resume`.
 
     `rig` are the settings completed for the devices, `presses` x and y, or x, y and depth, of each press of the plan,
     mm, and `identities` the results of `connect`, by "arm" and "board". Raises InputError for a recording that was
     begun with another arm, tool or board.
     """
     devices = json.loads(json.dumps({name: dict(identity) for name, identity in identities.items()}))
-    if resume and (folder / START).exists():
+    if resume:
         stored = read_json(folder / START, FORMAT)["source"]["devices"]
         for device, identity in devices.items():
             for key in _IDENTITY_KEYS[device]:

@@ -67,27 +67,21 @@ class Arm(Protocol):
         `serial` and, where the controller keeps the tool, `tcp` (the tip from the flange, mm and rad) are compared when
         a recording is resumed. Raises RigFault("refused") if another program controls the arm.
         """
-        ...
 
     def state(self) -> ArmState:
         """Return the latest state; raises RigFault("stale") if it is older than 0.5 s, "lost" if the link is down."""
-        ...
 
     def drain(self) -> Array:
         """Return the states since the last call, each exactly once; shape (n, 10), by `STATE_COLUMNS`."""
-        ...
 
     def move(self, pose: Pose, speed_mm_s: float, acceleration_mm_s2: float) -> None:
         """Start a straight move and return; the caller has checked it against the limits."""
-        ...
 
     def stop(self) -> None:
         """Stop the arm where it is, within 0.5 s; safe to call at any time and more than once."""
-        ...
 
     def close(self) -> None:
         """Stop the arm and close the link; never raises."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -108,15 +102,12 @@ class Board(Protocol):
         These keys are used: `rate_hz`, samples a second; `channels`, the number C; `inputs`, their numbers on the
         board; optionally `supply_v`, the reading at full scale; and `warning`, which `doctor` shows.
         """
-        ...
 
     def read(self) -> BoardSamples:
         """Return all samples since the last call, without waiting; raises RigFault("stale") after 1 s without any."""
-        ...
 
     def close(self) -> None:
         """Stop sampling and close the link; never raises."""
-        ...
 
 
 def load_device(group: Group, name: str) -> Callable[..., Any]:

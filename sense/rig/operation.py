@@ -185,7 +185,7 @@ def record(
             _log.warning('[rig] max_force_n is "unwatched": no force stops the arm')
         folder = temporary_folder(Path(tempfile.gettempdir()), "padforge-dry-") if dry else nullcontext(config.out)
         with folder as out:
-            with open_recorder(config, rig, plan.to_rows(), out, resume, identities) as recorder:
+            with open_recorder(config, rig, plan.to_rows(), out, resume and not dry, identities) as recorder:
                 on_progress(len(recorder.done), len(plan), "")
                 PressLoop(arm, board, recorder, rig, dry=dry).run(plan, on_progress, planner)
             return None if dry else Recording.open(out)
