@@ -50,18 +50,9 @@ BAR = 12  # maximum length of a fibre's bar on a terminal, to either side, chara
 @click.option("--token", default="", envvar="PADFORGE_TOKEN", help="Secret that clients have to send.")
 @spec_option
 @json_option
-@click.pass_context
 def live(
-    context: click.Context,
-    rig: str,
-    replay: Path | None,
-    speed: float,
-    model: Path,
-    port: int,
-    spec: Path | None,
-    as_json: bool,
-    **output: Any,
-) -> None:
+    rig: str, replay: Path | None, speed: float, model: Path, port: int, spec: Path | None, as_json: bool, **output: Any
+) -> int:
     """Show touches as they happen, in the terminal and a page. The page is for the browsers of this machine.
 
     \b
@@ -138,7 +129,7 @@ def live(
                     draw(view_lines(view))
                 if outputs:
                     broadcast(outputs, builder.build(times_s, readings, events))
-    context.exit(int(pipeline.is_other_pad))
+    return int(pipeline.is_other_pad)
 
 
 def _open_outputs(

@@ -55,16 +55,9 @@ from padforge.sense.cli.options import (
 @common.force_option
 @common.json_option
 @common.profile_option
-@click.pass_context
 def calibrate(
-    context: click.Context,
-    recording: Path,
-    morphology: Path | None,
-    spec: Path | None,
-    out: Path | None,
-    as_json: bool,
-    **options: Any,
-) -> None:
+    recording: Path, morphology: Path | None, spec: Path | None, out: Path | None, as_json: bool, **options: Any
+) -> int:
     """Train a localizer on RECORDING. It is tested on held-out presses.
 
     \b
@@ -98,7 +91,7 @@ def calibrate(
             document = calibrate_into(presses, folder, settings, pad=pad, on_progress=show, **run)
     lines = [pressed_line(presses), *calibration_lines(document), *moment_lines(document["by_moment"])]
     common.show_result(document, lines, as_json)
-    context.exit(int(bool(document["doubts"])))
+    return int(bool(document["doubts"]))
 
 
 @click.command()
@@ -107,8 +100,7 @@ def calibrate(
 @max_failures_option
 @common.json_option
 @common.profile_option
-@click.pass_context
-def evaluate(context: click.Context, model: Path, recording: Path, max_failures: int, as_json: bool) -> None:
+def evaluate(model: Path, recording: Path, max_failures: int, as_json: bool) -> int:
     """Evaluate a model on RECORDING, by set of failed fibres.
 
     \b
@@ -126,7 +118,7 @@ def evaluate(context: click.Context, model: Path, recording: Path, max_failures:
         document = evaluation.evaluate(localizer, opened, levels, on_progress=show).to_dict()
     lines = [*evaluation.calibration_lines(document), *evaluation.moment_lines(document["by_moment"])]
     common.show_result(document, lines, as_json)
-    context.exit(int(bool(document["doubts"])))
+    return int(bool(document["doubts"]))
 
 
 def _parse_moment(context: click.Context, param: click.Parameter, value: str | None) -> tuple[str, float] | None:
@@ -151,15 +143,9 @@ def _parse_moment(context: click.Context, param: click.Parameter, value: str | N
 )
 @common.out_option(what="CSV file of positions, places.csv", file=True)
 @common.profile_option
-@click.pass_context
 def locate(
-    context: click.Context,
-    model: Path,
-    recording: Path,
-    exclude_fibres: tuple[int, ...],
-    moment: "tuple[str, float] | None",
-    out: Path | None,
-) -> None:
+    model: Path, recording: Path, exclude_fibres: tuple[int, ...], moment: tuple[str, float] | None, out: Path | None
+) -> int:
     """Predict where RECORDING was pressed, with uncertainties. True positions are not needed.
 
     \b
@@ -190,15 +176,14 @@ def locate(
         common.echo(shift.text, err=True)
     write_localization(localization, file)
     common.echo(f"{len(localization.r50_mm)} positions -> {file}")
-    context.exit(int(is_other_pad))
+    return int(is_other_pad)
 
 
 @click.command()
 @model_option
 @recording_argument
 @common.json_option
-@click.pass_context
-def health(context: click.Context, model: Path, recording: Path, as_json: bool) -> None:
+def health(model: Path, recording: Path, as_json: bool) -> int:
     """Detect failed, damaged and drifting fibres of RECORDING. The readings alone are needed.
 
     \b
@@ -225,7 +210,7 @@ def health(context: click.Context, model: Path, recording: Path, as_json: bool) 
     }
     lines = [*fault_lines(findings, opened.fibres, dead), *(shift.text for shift in shifts)]
     common.show_result(document, [OTHER_PAD] if is_other_pad else lines, as_json)
-    context.exit(int(bool(findings) or is_other_pad))
+    return int(bool(findings) or is_other_pad)
 
 
 @click.command()
@@ -403,17 +388,9 @@ def learning_curve(recording: Path, seed: int | None, spec: Path | None, out: Pa
 @common.force_option
 @common.json_option
 @common.profile_option
-@click.pass_context
 def identify(
-    ctx: click.Context,
-    recording: Path,
-    morphology: Path,
-    seed: int | None,
-    spec: Path | None,
-    out: Path | None,
-    force: bool,
-    as_json: bool,
-) -> None:
+    recording: Path, morphology: Path, seed: int | None, spec: Path | None, out: Path | None, force: bool, as_json: bool
+) -> int:
     """Identify the twin of a printed pad from RECORDING. The twin has its fibres as built, wiring, pose and
     sensitivity profile.
 
@@ -440,4 +417,4 @@ def identify(
         options = {"contact": contact, "inputs": inputs, "on_progress": show, "force": force}
         document = identify_into(opened, pad, folder, seed or 0, **options)
     common.show_result(document, identification_lines(document, folder), as_json)
-    ctx.exit(1 if document["doubts"] else 0)
+    return int(bool(document["doubts"]))

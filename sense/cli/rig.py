@@ -1,6 +1,5 @@
 """The commands `padforge sense record` and `doctor`."""
 
-from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, closing
 from functools import partial
 from pathlib import Path
@@ -15,7 +14,6 @@ from padforge.sense.cli.options import FILE, FOLDER, recording_line, redrawn_lin
 if TYPE_CHECKING:
     from padforge.design.morphology import Morphology
     from padforge.design.settings import PadSettings
-    from padforge.sense.live.outputs import LivePage
     from padforge.sense.recording.recording import Recording
     from padforge.sense.rig.config import RigConfig
 
@@ -168,60 +166,50 @@ def _record_with(rig: str, config: "RigConfig", model: Path | None, dry_run: boo
 
     if resume and not (config.out / START).exists():
         _warn(f"{config.out}: nothing to resume, a new recording begins")
+        resume = False
     if rig == "hand":
         if dry_run or model:
             raise InputError("--dry-run and --model need an arm, allowed with --rig hand are --plan and --resume")
         return _record_by_hand(config, resume)
-    opened = operation.opened_rig(rig, config, config.rig.inputs(len(config.pad.knots)))
     with common.progress_bar("presses") as show:
-        return operation.record(config, opened, model=model, dry=dry_run, resume=resume, on_progress=show)
+        return operation.record(rig, config, model=model, dry=dry_run, resume=resume, on_progress=show)
 
 
 def _record_by_hand(config: "RigConfig", resume: bool) -> "Recording":
-    """Record by hand, with the view and the commands on a page and in the terminal."""
+    """Record by hand, with the view and the commands on a page, and in a terminal if there is one."""
     from padforge.sense.live.outputs import LivePage
-    from padforge.sense.rig.by_hand import COMMANDS, pad_view, record_by_hand
+    from padforge.sense.rig.by_hand import COMMANDS, pad_view, record_by_hand, view_lines
     from padforge.sense.rig.operation import make_board
 
     commands = {row["key"]: row["command"] for row in COMMANDS}
+    pad = pad_view(config.pad, str(config.out), bool(config.rig.mirrored))
+    latest: dict[str, Any] = {}
     with ExitStack() as stack:
         board = stack.enter_context(closing(make_board(config.rig, config.rig.inputs(len(config.pad.knots)))))
         page = stack.enter_context(LivePage(0, "hand.html", commands.values()))
         _warn(f"page: {page.url} (q ends)")
         draw, typed = stack.enter_context(redrawn_lines()), stack.enter_context(typed_keys())
-        display = _HandDisplay(page, draw, pad_view(config.pad, str(config.out), bool(config.rig.mirrored)))
-        stack.push(display.show_end)
+
+        @stack.push
+        def show_end(kind: object, error: BaseException | None, trace: object) -> None:
+            if latest:  # the session has begun
+                page.show(latest | {"ended": str(error or "") or "ended"})
+
+        def show(view: dict[str, Any]) -> None:
+            if draw is None:
+                if view["message"] != latest.get("message", ""):
+                    common.echo(view["message"])
+            elif view["phase"] == "lift" != latest.get("phase"):
+                click.echo("\a", nl=False)  # a sound, since the person looks at the pad
+            latest.update(pad | view)
+            page.show(dict(latest))
+            if draw is not None:
+                draw(view_lines(latest))
 
         def poll_commands() -> list[str]:
             return [*page.read_commands(), *(commands[key] for key in typed() if key in commands)]
 
-        return record_by_hand(config, board, display.show, poll_commands, resume)
-
-
-class _HandDisplay:
-    """Shows the views of a session on a page, and in a terminal if there is one (`draw`)."""
-
-    def __init__(self, page: "LivePage", draw: Callable[[Sequence[str]], None] | None, pad: Mapping[str, Any]) -> None:
-        self._page, self._draw, self._pad = page, draw, pad
-        self._latest: dict[str, Any] = {}
-
-    def show(self, view: dict[str, Any]) -> None:
-        """Show a view; without a terminal, print its message if that has changed."""
-        from padforge.sense.rig.by_hand import view_lines
-
-        previous, self._latest = self._latest, {**self._pad, **view}
-        if self._draw is None and view["message"] != previous.get("message", ""):
-            common.echo(view["message"])
-        if self._draw is not None and view["phase"] == "lift" != previous.get("phase"):
-            click.echo("\a", nl=False)  # a sound, since the person looks at the pad
-        self._page.show(self._latest)
-        if self._draw is not None:
-            self._draw(view_lines(self._latest))
-
-    def show_end(self, kind: object, error: BaseException | None, trace: object) -> None:
-        """Show the reason of the end on the page, if the session has begun."""
-        if self._latest:
-            self._page.show(self._latest | {"ended": str(error or "") or "ended"})
+        return record_by_hand(config, board, show, poll_commands, resume)
 
 
 @click.command()
@@ -235,8 +223,7 @@ class _HandDisplay:
 @click.option("--morphology", type=FILE, help="Pad whose fibres are examined (default: all inputs that are named).")
 @common.spec_option
 @common.json_option
-@click.pass_context
-def doctor(ctx: click.Context, rig: str, morphology: Path | None, spec: Path | None, as_json: bool) -> None:
+def doctor(rig: str, morphology: Path | None, spec: Path | None, as_json: bool) -> int:
     """Examine the rig before a long run; nothing moves. Exit 1 if something fails.
 
     \b
@@ -265,4 +252,4 @@ def doctor(ctx: click.Context, rig: str, morphology: Path | None, spec: Path | N
     lines = [f"{diagnosis.status:<4} {diagnosis.name}: {diagnosis.message}" for diagnosis in diagnoses]
     rows = [asdict(diagnosis) for diagnosis in diagnoses]
     common.show_result({"passed": passed, "diagnoses": rows}, lines, as_json)
-    ctx.exit(0 if passed else 1)
+    return int(not passed)

@@ -12,7 +12,7 @@ from typing import BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from padforge.common.files import check_file
+from padforge.common.files import check_file, to_disk
 from padforge.common.validation import InputError
 from padforge.sense.arrays import MAX_BYTES, Array, Mask
 
@@ -50,14 +50,14 @@ class BlockWriter:
         self._first = rows
 
     @classmethod
-    def resume(cls, path: Path, fibres: int) -> tuple["BlockWriter", BinaryIO, Array]:
-        """Cut off the torn tail of a file; return a writer, the open file, and the (R,) times of its rows."""
+    def resume(cls, path: Path, fibres: int) -> tuple["BlockWriter", Array]:
+        """Cut off the torn tail of a file; return a writer, and the (R,) times of its rows."""
         blocks = _intact_blocks(path, fibres)
         times_s = blocks["rows"][_has_row(blocks), 0]
         file = path.open("r+b", buffering=0)
         file.seek(blocks.nbytes)
         file.truncate()
-        return cls(file, fibres, len(blocks), len(times_s)), file, times_s
+        return cls(file, fibres, len(blocks), len(times_s)), times_s
 
     def append(self, rows: Array) -> None:
         """Add (n, 1 + C) rows of time and volts."""
@@ -71,6 +71,15 @@ class BlockWriter:
         self._write(self._pending)
         self._pending = self._pending[:0]
         self._file.flush()
+
+    def sync(self) -> None:
+        """Write everything to the disk."""
+        self.flush()
+        to_disk(self._file.fileno())
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
 
     def _write(self, rows: Array) -> None:
         blocks = np.zeros(-(-len(rows) // self._rows), self._dtype)

@@ -40,13 +40,10 @@ def name_presses(recording: Recording, mask: Mask) -> str:
 def suggest_unit(
     source: Mapping[str, Any], quantity: str, readings: Array | None = None, rate_hz: float = MIN_RATE_HZ / 1000
 ) -> str:
-    """Return the probable unit of a quantity, and the entry of the mapping that states it.
+    """Return the probable unit of `time`, `positions` or `fibres`, and the entry of the mapping that states it.
 
-    Args:
-        source: source of the recording, with its mapping as `columns`.
-        quantity: `time`, `positions` or `fibres`.
-        readings: readings that were read as V, for the number of bits of a converter.
-        rate_hz: rate of times that were read as s, for the choice of ms, us or ns.
+    The mapping is in the source of the recording, as `columns`. Readings that were read as V give the number of bits of
+    a converter, the rate of times that were read as s the choice of ms, us or ns.
     """
     columns = str(source.get("columns", ""))
     names = [piece.partition("=")[::2] for piece in columns.split(",")] if columns else []

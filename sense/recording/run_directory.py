@@ -116,26 +116,16 @@ class Recorder:
             with contextlib.ExitStack() as undo:
                 for name in {*_BEFORE_START, START} - present:
                     undo.callback((path / name).unlink, missing_ok=True)
-                self._journal: BinaryIO = undo.enter_context(_create(path / JOURNAL))
-                self._stream: BinaryIO = undo.enter_context(_create(path / READINGS))
+                (path / JOURNAL).touch()
+                (path / READINGS).touch()
                 write_json(path / _NEW_START, document)
                 sync(path / _NEW_START)
                 (path / _NEW_START).replace(path / START)
                 sync(path)
                 sync(path.parent)
                 undo.pop_all()
+            self._open(path, fibres)
             self._lock = lock.pop_all()
-        self._set_state(path, BlockWriter(self._stream, fibres), journal_bytes=0)
-
-    def _set_state(self, path: Path, blocks: BlockWriter, journal_bytes: int) -> None:
-        self._path, self._blocks, self.fibres = path, blocks, blocks.fibres
-        self._journal_bytes = journal_bytes
-        self._states: tuple[BlockWriter, BinaryIO] | None = None
-        self._lines: list[str] = []
-        self._press, self._is_down = 0, False
-        self.done: set[int] = set()
-        self.n_readings = 0
-        self.last_s = -np.inf
 
     @classmethod
     def resume(cls, path: Path) -> "Recorder":
@@ -151,34 +141,35 @@ class Recorder:
             if is_uncommitted(path):  # interrupted before the first reading
                 for name in (JOURNAL, READINGS):
                     (path / name).touch()
-            self._journal = (path / JOURNAL).open("r+b", buffering=0)
-            try:
-                journal = read_journal(path / JOURNAL)
-                times_s, _ = read_blocks(path / READINGS, fibres)
-                if (journal and not len(times_s)) or not (np.diff(times_s) > 0).all():
-                    # No interruption can cause this, so nothing is cut off.
-                    what = f"the readings of {len(journal)} presses of {fibres} fibres in the journal"
-                    raise InputError(f"{path / READINGS}: not {what}")
-                blocks, self._stream, times_s = BlockWriter.resume(path / READINGS, fibres)
-            except InputError:
-                self._journal.close()
-                raise
-            end = (path / JOURNAL).read_bytes().rfind(b"\n") + 1
-            self._journal.truncate(end)  # without a torn line
-            self._set_state(path, blocks, end)
-            self._update_last_time(times_s)
-            if (path / STATES).exists():
-                states, file, state_times_s = BlockWriter.resume(path / STATES, len(STATE_COLUMNS) - 1)
-                self._states = (states, file)
-                self._update_last_time(state_times_s)
+            self._open(path, fibres)
             self._lock = lock.pop_all()
+        self.sync()
+        return self
+
+    def _open(self, path: Path, fibres: int) -> None:
+        """Open the files of a locked run directory, and cut off torn ends."""
+        journal = read_journal(path / JOURNAL)
+        times_s, _ = read_blocks(path / READINGS, fibres)
+        if (journal and not len(times_s)) or not (np.diff(times_s) > 0).all():
+            # No interruption can cause this, so nothing is cut off.
+            what = f"the readings of {len(journal)} presses of {fibres} fibres in the journal"
+            raise InputError(f"{path / READINGS}: not {what}")
+        self._path, self.fibres, self.last_s = path, fibres, -np.inf
+        self._blocks, times_s = BlockWriter.resume(path / READINGS, fibres)
+        self._update_last_time(times_s)
+        self._states: BlockWriter | None = None
+        if (path / STATES).exists():
+            self._states, state_times_s = BlockWriter.resume(path / STATES, len(STATE_COLUMNS) - 1)
+            self._update_last_time(state_times_s)
+        self._journal: BinaryIO = (path / JOURNAL).open("r+b", buffering=0)
+        self._journal_bytes = (path / JOURNAL).read_bytes().rfind(b"\n") + 1
+        self._journal.truncate(self._journal_bytes)  # without a torn line
+        self._lines: list[str] = []
         self.n_readings = len(times_s)
         self.done = {number for number, press in journal.items() if press.up_command <= len(times_s)}
         for number in sorted(journal.keys() - self.done):  # otherwise further readings would make them valid again
             self._write_event("aborted", number, len(times_s), reason="its readings were torn off")
-        self.sync()
-        self._press = max(self.done, default=-1) + 1
-        return self
+        self._press, self._is_down = max(self.done, default=-1) + 1, False
 
     def append(self, times_s: ArrayLike, readings: ArrayLike) -> None:
         """Add readings; after an OSError (a full disk) none is added.
@@ -205,10 +196,9 @@ class Recorder:
             rows: states, by `STATE_COLUMNS`; shape (n, 10).
         """
         if self._states is None:
-            file = (self._path / STATES).open("xb", buffering=0)
+            self._states = BlockWriter((self._path / STATES).open("xb", buffering=0), len(STATE_COLUMNS) - 1)
             sync(self._path)
-            self._states = (BlockWriter(file, len(STATE_COLUMNS) - 1), file)
-        self._states[0].append(rows)
+        self._states.append(rows)
         self._update_last_time(rows[:, 0])
 
     def _update_last_time(self, times_s: Array) -> None:
@@ -265,11 +255,9 @@ class Recorder:
 
     def sync(self) -> None:
         """Write everything to the disk: first readings and states, then the journal."""
-        self._blocks.flush()
-        to_disk(self._stream.fileno())
+        self._blocks.sync()
         if self._states is not None:
-            self._states[0].flush()
-            to_disk(self._states[1].fileno())
+            self._states.sync()
         lines = "".join(self._lines).encode()
         write_at(self._journal, self._journal_bytes, lines)
         self._journal_bytes += len(lines)
@@ -281,8 +269,8 @@ class Recorder:
 
     def __exit__(self, kind: object, *error: object) -> None:
         with self._lock, contextlib.ExitStack() as files:
-            for file in (self._journal, self._stream, *(self._states or ())[1:]):
-                files.enter_context(file)
+            for file in filter(None, (self._journal, self._blocks, self._states)):
+                files.callback(file.close)
             with contextlib.suppress(*([OSError] if kind else [])):  # do not hide the error of the body
                 self.sync()
 
@@ -325,8 +313,3 @@ def is_uncommitted(path: Path) -> bool:
 def busy_message(path: Path) -> str:
     """Return the message for a recording that another recorder has locked."""
     return f"{path}: another program is recording into it"
-
-
-def _create(path: Path) -> BinaryIO:
-    path.touch()
-    return path.open("r+b", buffering=0)

@@ -6,8 +6,7 @@ session is JSON, for the page (`live/pages/hand.html`), and a few lines of text 
 
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from enum import StrEnum
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -18,7 +17,7 @@ from padforge.sense.arrays import Array
 from padforge.sense.localizer.features import REST, interpolate_gaps
 from padforge.sense.recording.press_plan import fit_pad_settings, make_plan, pressable_test
 from padforge.sense.recording.recording import Recording
-from padforge.sense.recording.run_directory import JOURNAL, START, Recorder, check_new_recording, read_journal
+from padforge.sense.recording.run_directory import JOURNAL, Recorder, check_new_recording, read_journal
 from padforge.sense.rig.config import RigConfig, open_recorder, read_source
 from padforge.sense.rig.devices import Board, RigFault
 from padforge.sense.rig.streams import HISTORY, SLACK, RingBuffer, stream_board
@@ -89,34 +88,27 @@ def _order_in_rounds(positions_mm: Array) -> Array:
 
 def open_recorder_by_hand(config: RigConfig, board: Mapping[str, Any], resume: bool) -> tuple[Recorder, Array, Array]:
     """Return the recorder, new or resumed, the targets (Q, 2) of its plan, and the remaining targets (P, 2), mm."""
-    is_resumed = resume and (config.out / START).exists()
-    if is_resumed:
+    if resume:
         targets_mm = np.array(read_source(config, config.rig, KIND)["plan"]["presses"], np.float64)
     else:
         targets_mm = plan_targets(config)
     recorder = open_recorder(config, config.rig, targets_mm.tolist(), config.out, resume, {"board": board}, KIND)
     remaining = targets_mm.tolist()
-    for press in read_journal(config.out / JOURNAL).values() if is_resumed else ():
+    for press in read_journal(config.out / JOURNAL).values() if resume else ():
         if list(press[:2]) in remaining:
             remaining.remove(list(press[:2]))
     return recorder, targets_mm, np.array(remaining).reshape(-1, 2)
 
 
-class HandPhase(StrEnum):
-    """State of a session: what the person is asked to do.
+HandPhase = Literal["settle", "wait", "press", "hold", "lift", "done"]
+"""State of a session: what the person is asked to do.
 
-    SETTLE --ready--> PRESS --touch--> HOLD --held for hold_s--> LIFT --release--> WAIT --ready--> PRESS ... DONE
+settle --ready--> press --touch--> hold --held for hold_s--> lift --release--> wait --ready--> press ... done
 
-    A touch in SETTLE, WAIT or DONE leads to LIFT and is rejected. Rejected are also presses that were held for too
-    short or too long, were too weak, or moved.
-    """
-
-    SETTLE = "settle"  # hands off before the first press
-    WAIT = "wait"  # for the pad to recover
-    PRESS = "press"
-    HOLD = "hold"
-    LIFT = "lift"
-    DONE = "done"  # all presses are made
+The hands are off the pad in "settle", before the first press, and in "wait", while the pad recovers. A touch in these,
+or in "done", leads to "lift" and is rejected. Rejected are also presses that were held for too short or too long, were
+too weak, or moved.
+"""
 
 
 def press_responses(readings: Array, down_command: int, up_command: int) -> Array:
@@ -229,10 +221,10 @@ class PressSequence:
         """Return the state at a time."""
         if self.is_pressed:
             is_over = self._rejection or self.held_s(now_s) >= self.hold_s
-            return HandPhase.LIFT if is_over else HandPhase.HOLD
+            return "lift" if is_over else "hold"
         if now_s < self._ready_s:
-            return HandPhase.SETTLE if self._is_settling else HandPhase.WAIT
-        return HandPhase.PRESS if self.remaining else HandPhase.DONE
+            return "settle" if self._is_settling else "wait"
+        return "press" if self.remaining else "done"
 
     def progress(self, now_s: float) -> float:
         """Return the elapsed fraction of the wait or the hold, 0 to 1."""
@@ -322,7 +314,7 @@ class HandSession:
                 if len(times_s):
                     self.feed(times_s, readings)
                     on_view(self.view())
-                if self._phase() is HandPhase.DONE:
+                if self._phase() == "done":
                     return
         except OSError as error:
             raise RigFault("disk", f"the recording cannot be written ({error.strerror or error})") from error
@@ -420,8 +412,8 @@ class HandSession:
     def view(self) -> dict[str, Any]:
         """Return the present view as JSON; positions are [x, y], mm, or None.
 
-        "progress" is the elapsed fraction of the phase, 0 to 1; "rejected" the target of the last press if that was
-        rejected; "swing" the deviation of a fibre from its baseline over the maximum response so far, None if missing.
+        "rejected" is the target of the last press if that was rejected; "swing" the deviation of a fibre from its
+        baseline over the maximum response so far, None if missing.
         """
         sequence, end = self._sequence, self._ring.end
         baseline = self._baseline if sequence.is_pressed else self._ring.baseline(end)
@@ -444,7 +436,7 @@ class HandSession:
         }
 
     def _phase(self) -> HandPhase:
-        return HandPhase.LIFT if self._detector is None else self._sequence.phase(self._now_s)
+        return "lift" if self._detector is None else self._sequence.phase(self._now_s)
 
     def _prompt(self) -> str:
         sequence = self._sequence
@@ -452,30 +444,22 @@ class HandSession:
             return "lift; if nothing touches the pad, say so (f)"
         target = _position_text(sequence.target)
         return {
-            HandPhase.SETTLE: "hands off the pad",
-            HandPhase.WAIT: f"next {target}: wait" if target else "hands off the pad",
-            HandPhase.PRESS: f"press {target}",
-            HandPhase.HOLD: "hold",
-            HandPhase.LIFT: "lift",
-            HandPhase.DONE: "all presses are made",
+            "settle": "hands off the pad",
+            "wait": f"next {target}: wait" if target else "hands off the pad",
+            "press": f"press {target}",
+            "hold": "hold",
+            "lift": "lift",
+            "done": "all presses are made",
         }[self._phase()]
 
 
 def record_by_hand(
     config: RigConfig, board: Board, on_view: OnView, poll_commands: PollCommands, resume: bool = False
 ) -> Recording:
-    """Record presses by hand; completed presses are on the disk even if the session fails.
+    """Record presses by hand, with a board that is not yet connected.
 
-    Args:
-        config: pad, settings and run directory.
-        board: board, not yet connected.
-        on_view: receives every `HandSession.view`.
-        poll_commands: returns the commands, of `COMMANDS`, since its last call.
-        resume: whether to continue a recording in the run directory.
-
-    Raises:
-        InputError: settings, targets or the run directory are invalid, or no press was made.
-        RigFault: the board or the disk failed.
+    Completed presses are on the disk even if the session fails. `on_view` receives every `HandSession.view`;
+    `poll_commands` returns the commands, of `COMMANDS`, since its last call.
     """
     if not resume:
         check_new_recording(config.out)

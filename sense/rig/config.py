@@ -14,7 +14,7 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import BeforeValidator, Field
 
-from padforge.common.files import provenance, read_json, reraise_as_input_error
+from padforge.common.files import provenance, read_json
 from padforge.common.settings import Settings, as_tuple, validate
 from padforge.common.validation import InputError
 from padforge.design.morphology import Morphology
@@ -105,8 +105,7 @@ def cast_thickness_mm(folder: Path) -> float | None:
     path = folder / FABRICATION_FILE
     if not path.is_file():
         return None
-    with reraise_as_input_error(path):
-        return float(read_json(path, FABRICATION_FORMAT)["sizes"]["pad_thickness_mm"])
+    return read_json(path, FABRICATION_FORMAT)["sizes"]["pad_thickness_mm"]
 
 
 def locate_on_bed(rig: RigSettings, folder: Path) -> RigSettings:
@@ -119,7 +118,7 @@ def locate_on_bed(rig: RigSettings, folder: Path) -> RigSettings:
     check_probe(rig)
     path = folder / FABRICATION_FILE
     stored = read_json(path, FABRICATION_FORMAT).get("frame") if path.is_file() else None
-    if not isinstance(stored, Mapping):
+    if stored is None:
         if None not in (rig.pad_mm, rig.contact_mm, rig.box_mm):
             return rig
         reason = f"{path} is of a pad without a holder" if path.is_file() else f"there is no {path}"
@@ -128,8 +127,7 @@ def locate_on_bed(rig: RigSettings, folder: Path) -> RigSettings:
     frame = validate(HolderFrame, stored, f"{path}: frame")
     x, y = rig.pad_mm or frame.centre_mm
     contact = frame.surface_mm if rig.contact_mm is None else rig.contact_mm
-    side = frame.pad_mm
-    half_x, half_y = (length / 2 for length in (side if isinstance(side, tuple) else (side, side)))
+    half_x, half_y = (side / 2 for side in np.broadcast_to(frame.pad_mm, 2).tolist())
     if round(frame.angle_deg / 90) % 2:  # quarter turn of the pad on the bed
         half_x, half_y = half_y, half_x
     width, depth, height = frame.bed_mm
@@ -166,7 +164,7 @@ class RigConfig:
 
 def load_or_make_plan(config: RigConfig, rig: RigSettings, resume: bool) -> PressPlan:
     """Return the stored plan of a resumed recording, otherwise a new one by `rig`."""
-    if resume and (config.out / START).exists():
+    if resume:
         plan = PressPlan.from_rows(read_source(config, rig, KIND)["plan"]["presses"])
         free = pressable_test(config.pad, fit_pad_settings(config.pad, config.pad_settings))
         return check_pressable(plan, config.out, free)
@@ -174,29 +172,23 @@ def load_or_make_plan(config: RigConfig, rig: RigSettings, resume: bool) -> Pres
 
 
 def read_source(config: RigConfig, rig: RigSettings, kind: str) -> dict[str, Any]:
-    """Return the source of the recording to resume.
-
-    Raises:
-        InputError: the recording has no plan, is of another kind or pad, or was begun with other settings that matter.
-    """
-    source = read_json(config.out / START, FORMAT).get("source")
-    if not isinstance(source, dict) or not isinstance(plan := source.get("plan"), dict) or "presses" not in plan:
+    """Return the source of the recording to resume; InputError if it has no plan, or its presses would differ."""
+    source = read_json(config.out / START, FORMAT)["source"]
+    if "plan" not in source:
         raise InputError(f"{config.out}: has no plan, so that it cannot be resumed")
-    if source.get("kind") != kind:
-        raise InputError(f"{config.out}: holds a recording of kind {source.get('kind')!r}, not {kind!r}")
+    if source["kind"] != kind:
+        raise InputError(f"{config.out}: holds a recording of kind {source['kind']!r}, not {kind!r}")
     current = _settings_and_pad(config, rig)
-    if source.get("morphology") != current["morphology"]:
+    if source["morphology"] != current["morphology"]:
         raise InputError(f"{config.out}: was begun with another pad than the one given")
     for key in sorted(current["rig"].keys() - _CHANGEABLE):
-        if (stored := _get(source.get("rig"), key)) != (value := current["rig"][key]):
+        if (stored := source["rig"].get(key)) != (value := current["rig"][key]):
             raise InputError(f"[rig] {key}: got {value}, the recording in {config.out} was begun with {stored}")
     return source
 
 
 def plan_notice(config: RigConfig) -> str:
     """Return a notice that a resumed recording keeps its plan although `[rig]` sets another; "" if it does not."""
-    if not (config.out / START).exists():
-        return ""
     stored, current = read_json(config.out / START, FORMAT)["source"]["rig"], config.rig.model_dump(mode="json")
     changed = [f"{key} = {stored.get(key)}" for key in _PLAN_KEYS if stored.get(key) != current[key]]
     return f"{config.out}: goes on by the plan it was begun with, [rig] {', '.join(changed)}" if changed else ""
@@ -213,24 +205,16 @@ def open_recorder(
 ) -> Recorder:
     """Return the recorder of a new recording in `folder`, or of the one there if `resume`.
 
-    Args:
-        config: pad, settings and provenance.
-        rig: settings to store, completed for the devices.
-        presses: plan, x and y or x, y and depth of each press, mm.
-        folder: run directory.
-        resume: whether to continue a recording in `folder`, if there is one.
-        identities: results of `connect`, by "arm" and "board".
-        kind: kind of the source.
-
-    Raises:
-        InputError: the recording cannot be resumed, or was begun with another arm, tool or board.
+    `rig` are the settings completed for the devices, `presses` x and y, or x, y and depth, of each press of the plan,
+    mm, and `identities` the results of `connect`, by "arm" and "board". Raises InputError for a recording that was
+    begun with another arm, tool or board.
     """
     devices = json.loads(json.dumps({name: dict(identity) for name, identity in identities.items()}))
-    if resume and (folder / START).exists():
-        stored = read_json(folder / START, FORMAT)["source"].get("devices")
+    if resume:
+        stored = read_json(folder / START, FORMAT)["source"]["devices"]
         for device, identity in devices.items():
             for key in _IDENTITY_KEYS[device]:
-                if (before := _get(_get(stored, device), key)) != (now := identity.get(key)):
+                if (before := stored[device].get(key)) != (now := identity.get(key)):
                     raise InputError(f"{device}: {key} is {now}, the recording in {folder} was begun with {before}")
         return Recorder.resume(folder)
     plan = {"columns": list(COLUMNS[: len(presses[0])]), "presses": presses}
@@ -243,7 +227,3 @@ def _settings_and_pad(config: RigConfig, rig: RigSettings) -> dict[str, Any]:
     """Return `[rig]`, with the wired inputs and the pad's side filled in, and the pad, as JSON."""
     wired = rig.model_copy(update={"channels": rig.inputs(len(config.pad.knots)), "mirrored": bool(rig.mirrored)})
     return {"rig": wired.model_dump(mode="json"), "morphology": pad_source(config.pad)}
-
-
-def _get(mapping: object, key: str) -> Any:
-    return mapping.get(key) if isinstance(mapping, dict) else None

@@ -8,18 +8,13 @@ of the fibres, that return a `Board`.
 
 import errno
 import math
-import os
 import platform
-import subprocess
-import sys
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from importlib.metadata import entry_points
-from pathlib import Path
 from typing import Any, Literal, Protocol
 
-import padforge
 from padforge.common.validation import Fault, InputError
 from padforge.sense.arrays import Array, Indices
 from padforge.sense.rig import clock
@@ -27,18 +22,10 @@ from padforge.sense.rig import clock
 Pose = tuple[float, float, float, float, float, float]  # x, y, z in mm and a rotation vector in radians
 Cause = Literal["refused", "lost", "stale", "protective_stop", "emergency_stop", "deadline", "force", "data", "disk"]
 Group = Literal["padforge.arms", "padforge.boards"]
-ROOT = Path(padforge.__file__).parents[1]
-"""The folder that `padforge` is imported from; in a checkout, this file is not below that package."""
 
 
 class RigFault(Fault):
-    """A fault of the rig that ends or prevents a recording.
-
-    Args:
-        cause: kind of the fault, for programs; "refused" if nothing was begun.
-        message: what happened.
-        advice: what a person can do about it.
-    """
+    """A fault of the rig that ends or prevents a recording; its cause is "refused" if nothing was begun."""
 
     def __init__(self, cause: Cause, message: str, advice: str = "") -> None:
         super().__init__(f"{message}; {advice}" if advice else message)
@@ -80,27 +67,21 @@ class Arm(Protocol):
         `serial` and, where the controller keeps the tool, `tcp` (the tip from the flange, mm and rad) are compared when
         a recording is resumed. Raises RigFault("refused") if another program controls the arm.
         """
-        ...
 
     def state(self) -> ArmState:
         """Return the latest state; raises RigFault("stale") if it is older than 0.5 s, "lost" if the link is down."""
-        ...
 
     def drain(self) -> Array:
         """Return the states since the last call, each exactly once; shape (n, 10), by `STATE_COLUMNS`."""
-        ...
 
     def move(self, pose: Pose, speed_mm_s: float, acceleration_mm_s2: float) -> None:
         """Start a straight move and return; the caller has checked it against the limits."""
-        ...
 
     def stop(self) -> None:
         """Stop the arm where it is, within 0.5 s; safe to call at any time and more than once."""
-        ...
 
     def close(self) -> None:
         """Stop the arm and close the link; never raises."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -121,15 +102,12 @@ class Board(Protocol):
         These keys are used: `rate_hz`, samples a second; `channels`, the number C; `inputs`, their numbers on the
         board; optionally `supply_v`, the reading at full scale; and `warning`, which `doctor` shows.
         """
-        ...
 
     def read(self) -> BoardSamples:
         """Return all samples since the last call, without waiting; raises RigFault("stale") after 1 s without any."""
-        ...
 
     def close(self) -> None:
         """Stop sampling and close the link; never raises."""
-        ...
 
 
 def load_device(group: Group, name: str) -> Callable[..., Any]:
@@ -150,22 +128,6 @@ def check_platform() -> None:
         raise InputError(f"a rig needs Linux or macOS, this is {system}; allowed here is --rig simulated")
 
 
-def start(module: str, *arguments: str, stderr: int | None = None) -> subprocess.Popen[bytes]:
-    """Start `python -m module` with pipes to its stdin and stdout, in a session that Ctrl-C does not reach.
-
-    Its path contains this installation of padforge, and not the current folder (`-P`).
-    """
-    path = os.pathsep.join((str(ROOT), *filter(None, os.environ.get("PYTHONPATH", "").split(os.pathsep))))
-    return subprocess.Popen(
-        [sys.executable, "-P", "-m", module, *arguments],
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        stderr=stderr,
-        env=os.environ | {"PYTHONPATH": path},
-        start_new_session=True,
-    )
-
-
 def host_ports() -> list[Any]:
     """List the serial ports of this host, as pyserial does; raises RigFault("refused") without pyserial."""
     _import_pyserial()
@@ -175,19 +137,10 @@ def host_ports() -> list[Any]:
 
 
 class SerialStream:
-    """An open serial port, locked by this process. `receive` and `send` raise RigFault("lost") once the device is gone.
-
-    Args:
-        port: name of the port.
-        baud: speed.
-        timeout_s: longest wait of `receive`.
-        device: name of the device in messages.
-
-    Raises:
-        RigFault: "refused" if the port cannot be opened.
-    """
+    """An open serial port, locked by this process; once the device is gone, methods raise RigFault("lost")."""
 
     def __init__(self, port: str, baud: int, timeout_s: float, device: str = "board") -> None:
+        """Open a port; `timeout_s` is the longest wait of `receive`, `device` a name for messages."""
         serial = _import_pyserial()
         self.port, self._device = port, device
         try:

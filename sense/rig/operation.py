@@ -5,8 +5,8 @@ An adaptive plan moves its next presses to where the errors of a localizer are l
 
 import logging
 import tempfile
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, closing, contextmanager, nullcontext
+from collections.abc import Mapping, Sequence
+from contextlib import closing, nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -44,7 +44,7 @@ from padforge.sense.rig.config import (
     open_recorder,
     plan_notice,
 )
-from padforge.sense.rig.devices import Arm, Board, RigFault, host_ports, load_device
+from padforge.sense.rig.devices import Board, RigFault, host_ports, load_device
 from padforge.sense.rig.doctor import Diagnosis, examine_arm, examine_board
 from padforge.sense.rig.press_loop import Interrupts, PressLoop, check_plan
 from padforge.sense.rig.safety import Limits, check_start_state, check_tcp
@@ -55,18 +55,12 @@ _log = logging.getLogger(__name__)
 
 ADAPT_EVERY = 20  # presses between two evaluations of the localizer by an adaptive plan
 
-OpenedRig = AbstractContextManager[tuple[Arm, Board, RigSettings]]
-"""An arm and a board, not yet connected, and their settings, with the inputs of the board filled in."""
-
 
 class AdaptivePlanner:
     """Moves presses to the random candidates with the largest `acquisition`.
 
-    Args:
-        localizer: localizer calibrated on an earlier recording.
-        run: run directory of the current recording, synced after every press.
-        rng: generator of candidates.
-        free: returns which positions (n, 2), mm, may be pressed.
+    The localizer is of an earlier recording, `run` the directory of the current one, synced after every press, and
+    `free` tells which positions (n, 2), mm, may be pressed.
     """
 
     def __init__(self, localizer: LocalizerModel, run: Path, rng: np.random.Generator, free: PositionTest) -> None:
@@ -90,16 +84,10 @@ class AdaptivePlanner:
 
 
 def acquisition(candidates: Array, evaluated: Array, errors: Array, pressed: Array) -> Array:
-    """Return the acquisition score (K,) of candidate positions, which prefers large errors and unexplored positions.
+    """Return the acquisition score (K,) of candidate positions (K, 2): large errors, and unexplored positions.
 
-    Args:
-        candidates: positions (K, 2).
-        evaluated: positions (N, 2) of presses with an error of the localizer.
-        errors: these errors (N,).
-        pressed: positions (P, 2) that have been pressed or are planned.
-
-    Returns:
-        Mean error of the five nearest evaluated presses, times the distance to the nearest pressed position.
+    It is the mean of the errors (N,) of the five nearest evaluated presses (N, 2), times the distance to the nearest
+    position (P, 2) that has been pressed or is planned.
     """
     _, nearest = KDTree(evaluated).query(candidates, k=min(5, len(evaluated)))
     distance, _ = KDTree(pressed).query(candidates)
@@ -115,16 +103,10 @@ def record_simulated(
     like: Twin | None = None,
     replacing: bool = False,
 ) -> Recording:
-    """Simulate a recording faster than real time, see `simulate`, and save it.
+    """Simulate a recording faster than real time, see `simulate`, and save it in `out`; see `Recording.save`.
 
-    Args:
-        spec: settings.
-        pad: pad, or its twin.
-        out: run directory.
-        overrides: values of `[rig]` that take precedence over `spec`.
-        inputs: files for the provenance.
-        like: twin of another pad; the simulated pad has its sensitivity, gain and noise.
-        replacing: whether to replace a simulated recording in `out`.
+    `overrides` are values of `[rig]` that take precedence over `spec`; the pad has the sensitivity, gain and noise of
+    the twin `like`, if there is one.
     """
     if not replacing:
         check_new_folder(out)
@@ -139,16 +121,9 @@ def record_simulated(
 
 
 def check_press_depths(pad: Morphology, rig: RigSettings, contact: Contact, folder: Path) -> None:
-    """Check that presses are shallower than the pad is thick; warn if none has the depth that the pad is designed for.
+    """Raise InputError for a press as deep as the pad is thick, by `[contact]` or by the mould in the pad's folder.
 
-    Args:
-        pad: pad that is pressed.
-        rig: settings of the presses.
-        contact: contact of the settings, used if the pad does not state the contact it is designed for.
-        folder: folder of the pad, with the files of `fabricate`.
-
-    Raises:
-        InputError: a press is as deep as the pad is thick, by `[contact]` or by its mould.
+    Warn if no press has the depth that the pad is designed for, by itself or else by `[contact]`.
     """
     depths_mm = planned_depths_mm(rig)
     if contact.model == "layer":
@@ -157,24 +132,6 @@ def check_press_depths(pad: Morphology, rig: RigSettings, contact: Contact, fold
         check_depths(depths_mm, thickness_mm, str(folder / FABRICATION_FILE))
     if notice := describe_other_depth(depths_mm, contact_designed_for(pad.provenance) or contact):
         _log.warning(notice)
-
-
-@contextmanager
-def opened_rig(kind: str, config: RigConfig, inputs: Sequence[int]) -> Iterator[tuple[Arm, Board, RigSettings]]:
-    """Open a rig with real devices; see `OpenedRig`, `make_arm` and `make_board`."""
-    arm, rig = make_arm(kind, config, inputs)
-    # Closing stops the arm, and comes before the board is closed.
-    with closing(make_board(rig, inputs)) as board, closing(arm):
-        yield arm, board, rig
-
-
-def make_arm(kind: str, config: RigConfig, inputs: Sequence[int]) -> tuple[Arm, RigSettings]:
-    """Return an arm by its name, not yet connected, and its settings, with the inputs of the board filled in."""
-    rig = config.rig.model_copy(update={"channels": tuple(inputs)})
-    if kind == "printer":
-        _check_ports(rig)
-        rig = locate_on_bed(rig, config.folder)
-    return load_device("padforge.arms", kind)(rig), rig
 
 
 def _check_ports(rig: RigSettings) -> None:
@@ -189,31 +146,28 @@ def make_board(rig: RigSettings, inputs: Sequence[int]) -> Board:
 
 
 def record(
+    kind: str,
     config: RigConfig,
-    opened: OpenedRig,
     *,
     model: Path | None = None,
     dry: bool = False,
     resume: bool = False,
     on_progress: OnProgress = ignore_progress,
 ) -> Recording | None:
-    """Record with a rig; completed presses are on the disk even if the recording fails.
+    """Record with an arm, by its name; completed presses are on the disk even if the recording fails.
 
-    Args:
-        config: pad, settings and run directory.
-        opened: context of the devices, see `opened_rig`.
-        model: folder of a localizer, for an adaptive plan.
-        dry: whether to move above the pad only, and to store nothing.
-        resume: whether to continue a recording in the run directory.
-        on_progress: called after every press.
-
-    Returns:
-        The recording; None if `dry`.
-
-    Raises:
-        RigFault: a device failed, or the plan is not safe.
+    An adaptive plan needs a `model`, the folder of a localizer. If `dry`, the arm moves above the pad only, and nothing
+    is stored or returned. `on_progress` is called after every press. Raises RigFault if a device fails, or the plan is
+    not safe.
     """
-    with opened as (arm, board, rig):
+    inputs = config.rig.inputs(len(config.pad.knots))
+    rig = config.rig.model_copy(update={"channels": inputs})
+    if kind == "printer":
+        _check_ports(rig)
+        rig = locate_on_bed(rig, config.folder)
+    arm = load_device("padforge.arms", kind)(rig)
+    # Closing stops the arm, and comes before the board is closed.
+    with closing(make_board(rig, inputs)) as board, closing(arm):
         with Interrupts() as interrupts:
             plan = load_or_make_plan(config, rig, resume)
             planner = _make_planner(config, rig, model)
@@ -231,7 +185,7 @@ def record(
             _log.warning('[rig] max_force_n is "unwatched": no force stops the arm')
         folder = temporary_folder(Path(tempfile.gettempdir()), "padforge-dry-") if dry else nullcontext(config.out)
         with folder as out:
-            with open_recorder(config, rig, plan.to_rows(), out, resume, identities) as recorder:
+            with open_recorder(config, rig, plan.to_rows(), out, resume and not dry, identities) as recorder:
                 on_progress(len(recorder.done), len(plan), "")
                 PressLoop(arm, board, recorder, rig, dry=dry).run(plan, on_progress, planner)
             return None if dry else Recording.open(out)
@@ -249,15 +203,9 @@ def _make_planner(config: RigConfig, rig: RigSettings, model: Path | None) -> Ad
 def diagnose(kind: str, config: RigConfig, inputs: Sequence[int]) -> list[Diagnosis]:
     """Diagnose a rig before a long run, without moving it.
 
-    Each device is examined even if the other one fails, and a printer even if the pose of the pad is unknown.
-
-    Args:
-        kind: name of the arm; "hand" for a board alone.
-        config: settings, and the folder of the pad.
-        inputs: inputs of the board to read, () for all.
-
-    Raises:
-        RigFault: there is no board, and `kind` is "hand".
+    Each device is examined even if the other one fails, and a printer even if the pose of the pad is unknown. `kind` is
+    the name of the arm, or "hand" for the board alone, whose lack raises RigFault; `inputs` are those of the board to
+    read, () for all.
     """
     ports = [f"{port.device} ({port.description})" for port in host_ports() if port.vid is not None]
     diagnoses = [Diagnosis("ports", "ok", ", ".join(ports) or "no board seen on USB")]
@@ -267,11 +215,6 @@ def diagnose(kind: str, config: RigConfig, inputs: Sequence[int]) -> list[Diagno
         diagnoses += examine_board(make_board(config.rig, inputs))
     except RigFault as fault:
         diagnoses.append(Diagnosis("board", "fail", str(fault)))
-    return diagnoses + _diagnose_arm(kind, config, inputs)
-
-
-def _diagnose_arm(kind: str, config: RigConfig, inputs: Sequence[int]) -> list[Diagnosis]:
-    """Diagnose an arm, and whether the pose of the pad on a printer's bed is known."""
     rig, location = config.rig.model_copy(update={"channels": tuple(inputs)}), []
     try:
         if kind == "printer":
@@ -282,5 +225,5 @@ def _diagnose_arm(kind: str, config: RigConfig, inputs: Sequence[int]) -> list[D
                 location = [Diagnosis("place", "fail", str(fault))]
         arm = load_device("padforge.arms", kind)(rig)
     except RigFault as fault:
-        return [Diagnosis("arm", "fail", str(fault)), *location]
-    return examine_arm(arm, rig) + location
+        return [*diagnoses, Diagnosis("arm", "fail", str(fault)), *location]
+    return diagnoses + examine_arm(arm, rig) + location

@@ -113,15 +113,7 @@ class PressLoop:
     Presses that the recorder already has are skipped; if `dry`, the arm never touches the pad.
     """
 
-    def __init__(
-        self,
-        arm: Arm,
-        board: Board,
-        recorder: Recorder,
-        rig: RigSettings,
-        *,
-        dry: bool = False,
-    ) -> None:
+    def __init__(self, arm: Arm, board: Board, recorder: Recorder, rig: RigSettings, *, dry: bool = False) -> None:
         self._arm, self._board, self._recorder, self._rig, self._dry = arm, board, recorder, rig, dry
         self._frame, self._limits = RobotFrame.from_settings(rig), Limits.from_settings(rig)
         self._half_s = rig.half_cycle_s
@@ -140,14 +132,9 @@ class PressLoop:
     ) -> None:
         """Make every press of the plan that the recorder does not have.
 
-        Args:
-            plan: positions and depths.
-            on_progress: called after every press, once it is on the disk.
-            planner: called before every press with the plan and its number; returns the plan, or one with the presses
-                from that number on moved. None to keep the plan.
-
-        Raises:
-            RigFault: the plan is not safe, or a device failed; the arm stands still, completed presses are on the disk.
+        `on_progress` is called after every press, once it is on the disk, and `planner` before every press with the
+        plan and its number; it returns the plan, or one with the presses from that number on moved. After a RigFault
+        the arm stands still, and completed presses are on the disk.
         """
         check_plan(plan, self._rig)
         check_start_state(self._arm.state(), self._limits)

@@ -190,20 +190,10 @@ def check_state(state: ArmState, limits: Limits, now_s: float, until_s: float = 
         raise RigFault("deadline", f"the move was not over after {limits.deadline_s:g} s")
 
 
-def wait_until_still(
-    arm: Arm,
-    limits: Limits,
-    on_wait: Callable[[], None] = lambda: None,
-) -> ArmState:
+def wait_until_still(arm: Arm, limits: Limits, on_wait: Callable[[], None] = lambda: None) -> ArmState:
     """Wait until the arm has ended its move, and return its state; the arm is stopped before any exception is raised.
 
-    Args:
-        arm: a moving arm.
-        limits: limits that every state is checked against.
-        on_wait: called between two states.
-
-    Raises:
-        RigFault: see `check_state`.
+    Every state is checked against the limits; `on_wait` is called between two states.
     """
     until_s = clock.now() + limits.deadline_s
     try:
@@ -248,7 +238,7 @@ def retreat(arm: Arm, limits: Limits, acceleration_mm_s2: float) -> None:
     speed_mm_s = min(RETREAT_MM_S, limits.max_speed_mm_s)
     check_target(up, speed_mm_s, acceleration_mm_s2, relaxed)
     arm.move(up, speed_mm_s, acceleration_mm_s2)
-    on_wait = _FallingForceCheck(arm, force_n, max_n) if overloaded and max_n else lambda: None
+    on_wait = _falling_force_check(arm, force_n, max_n) if overloaded and max_n else lambda: None
     check_state(wait_until_still(arm, relaxed, on_wait), limits, clock.now())
 
 
@@ -267,21 +257,21 @@ def _await_state(arm: Arm) -> ArmState:
         clock.sleep(POLL_S)
 
 
-class _FallingForceCheck:
-    """A check, called repeatedly, that raises RigFault("force") unless the force on the tool falls."""
+def _falling_force_check(arm: Arm, first_n: float, max_n: float) -> Callable[[], None]:
+    """Return a check, to be called repeatedly, that raises RigFault("force") unless the force on the tool falls."""
+    start_s, min_n = clock.now(), first_n
 
-    def __init__(self, arm: Arm, first_n: float, max_n: float) -> None:
-        self._arm, self._first_n, self._max_n = arm, first_n, max_n
-        self._start_s, self._min_n = clock.now(), first_n
-
-    def __call__(self) -> None:
-        force_n = self._arm.state().total_force_n or 0.0
-        self._min_n = min(self._min_n, force_n)
+    def check() -> None:
+        nonlocal min_n
+        force_n = arm.state().total_force_n or 0.0
+        min_n = min(min_n, force_n)
         # The allowed force falls linearly from the first one to the limit, and is at most MAX_RISE_N above the minimum.
-        remaining = min((self._start_s + FALL_END_S - clock.now()) / (FALL_END_S - FALL_START_S), 1.0)
-        line_n = self._max_n + (self._first_n + MAX_RISE_N - self._max_n) * remaining
-        if not force_n <= max(self._max_n, min(self._min_n + MAX_RISE_N, line_n)):
+        remaining = min((start_s + FALL_END_S - clock.now()) / (FALL_END_S - FALL_START_S), 1.0)
+        line_n = max_n + (first_n + MAX_RISE_N - max_n) * remaining
+        if not force_n <= max(max_n, min(min_n + MAX_RISE_N, line_n)):
             raise RigFault("force", f"the force does not fall, it is {force_n:.1f} N", "free the tool by hand")
+
+    return check
 
 
 def _refuse(problem: str, allowed: str) -> NoReturn:

@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 
 from padforge.common.files import read_json
-from padforge.common.settings import validate
 from padforge.common.validation import InputError
 from padforge.design import Contact, Morphology
 from padforge.design.settings import PadSettings
@@ -27,22 +26,11 @@ class SimulatedBoard:
     """A board that samples a simulated pad at `[rig] rate_hz`; implements `Board`.
 
     The pad, with the baselines of its fibres, is the one that `simulate` makes of the same arguments. Presses have the
-    same timing, other positions, and the depths of `[rig]` in turn.
-
-    Args:
-        pad: the pad.
-        rig: rate, timing and depths of the presses, and seed.
-        contact: contact of the presses.
-        size: sensed area and keep-outs; those of the pad if None.
+    same timing, other positions, and the depths of `[rig]` in turn. `size` has the sensed area and keep-outs, which
+    are those of the pad by default.
     """
 
-    def __init__(
-        self,
-        pad: Morphology,
-        rig: RigSettings,
-        contact: Contact,
-        size: PadSettings | None = None,
-    ) -> None:
+    def __init__(self, pad: Morphology, rig: RigSettings, contact: Contact, size: PadSettings | None = None) -> None:
         rig = rig.for_contact(contact)
         rng = np.random.default_rng(rig.seed)
         if rig.plan_file is None:
@@ -95,21 +83,15 @@ def simulated_board_of(model: Path) -> SimulatedBoard:
     path = model / RECORDED / START
     if not path.is_file():
         raise InputError(f"{path}: not there, though it says which pad to simulate; name a model of `padforge run`")
-    source = read_json(path, FORMAT).get("source")
-    if not isinstance(source, dict) or source.get("kind") != "simulated":
+    source = read_json(path, FORMAT)["source"]
+    if source.get("kind") != "simulated":
         raise InputError(f"{path}: of no simulated pad, but --rig simulated needs one; --replay shows a recording")
     if "twin" in source:
         raise InputError(f"{path}: of a pad simulated by its twin, which is not live; --replay shows a recording")
     try:
         pad = Morphology.from_dict(source["morphology"])
-        contact, rig = dict(source["contact"]), dict(source["rig"])
-        rig.pop("channels", None)  # a simulated pad is not wired to inputs
+        rig = RigSettings(**source["rig"] | {"channels": ()})  # a simulated pad is not wired to inputs
         size = {key: source[key] for key in ("sensed_mm", "keep_out_mm") if key in source}
+        return SimulatedBoard(pad, rig, Contact(**source["contact"]), PadSettings(**pad.layout.settings | size))
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(f"{path}: says of no pad that can be simulated ({error})") from error
-    return SimulatedBoard(
-        pad,
-        validate(RigSettings, rig, f"{path}: rig"),
-        validate(Contact, contact, f"{path}: contact"),
-        size=validate(PadSettings, {**pad.layout.settings, **size}, f"{path}: pad"),
-    )

@@ -70,18 +70,15 @@ class Averager:
 
     def feed(self, samples: BoardSamples) -> Block:
         """Return times (n,) and volts (n, C) of the completed blocks; samples of an incomplete block are stored."""
-        if len(samples.times_s) == 0:
-            return np.empty(0), np.empty((0, self._pending.shape[1] - 2))
         counts = self._index + np.arange(len(samples.times_s)) + np.cumsum(samples.missing)
-        self._index = int(counts[-1]) + 1
-        self.n_missing += int(samples.missing.sum())
+        n_missing = int(samples.missing.sum())
+        self._index += len(counts) + n_missing
+        self.n_missing += n_missing
         new = np.column_stack([counts // self._ratio, samples.times_s, samples.volts])
         rows = np.vstack([self._pending, new])
         complete = rows[:, 0] < self._index // self._ratio
         self._pending, rows = rows[~complete], rows[complete]
-        blocks, first, count = np.unique(rows[:, 0], return_index=True, return_counts=True)
-        if len(blocks) == 0:
-            return np.empty(0), np.empty((0, rows.shape[1] - 2))
+        _, first, count = np.unique(rows[:, 0], return_index=True, return_counts=True)
         means = np.add.reduceat(rows[:, 1:], first) / count[:, None]
         return means[:, 0], means[:, 1:]
 

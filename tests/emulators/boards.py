@@ -1,7 +1,6 @@
-"""Emulated boards at pseudo-terminals, which speak the line protocol. POSIX only.
+"""Emulated boards at pseudo-terminals, which speak the line protocol and fail on demand. POSIX only.
 
-What they sample is a function of time, so that one simulated pad can be behind a board and an emulated arm. They sample
-by the host's clock, at a rate that may be off by some ppm, and fail on demand.
+What they sample is a function of time, so that one simulated pad can be behind a board and an emulated arm.
 """
 
 import os
@@ -116,26 +115,11 @@ class EmulatedLineBoard(SerialDevice):
     """A board that speaks the line protocol; the noise of `garble` is on what it sends."""
 
     def __init__(
-        self,
-        source: SampleSource,
-        header: LineHeader,
-        *,
-        skew_ppm: float = 0.0,
-        silent: bool = False,
-        seed: int = 0,
+        self, source: SampleSource, header: LineHeader, skew_ppm: float = 0.0, silent: bool = False, seed: int = 0
     ) -> None:
-        """Open the pseudo-terminal.
-
-        Args:
-            source: what the inputs are at.
-            header: what it tells of itself, and samples by.
-            skew_ppm: how much longer a period is than the header says.
-            silent: whether it sends nothing.
-            seed: of the noise.
-        """
+        """Open the pseudo-terminal; a period is longer than the header says by `skew_ppm`."""
         super().__init__("board", seed)
         self._source, self._header, self._skew_ppm, self._silent = source, header, skew_ppm, silent
-        self._columns = header.channels
         self._start_s: float | None = None
         self._first = 0  # index of the next sample
         self._stalled = self._resetting = False
@@ -146,18 +130,13 @@ class EmulatedLineBoard(SerialDevice):
 
     def true_times(self, index: int | Indices) -> Array:
         """Return the host times at which samples since the last start were complete."""
-        if self._start_s is None:
-            raise ValueError("the board is not sampling")
+        assert self._start_s is not None
         period_s = (1 + self._skew_ppm * 1e-6) / self._header.rate_hz
         return self._start_s + (np.asarray(index) + 1) * period_s
 
     def reset(self) -> None:
         """Start anew, as by its button."""
         self._resetting = True  # done by the board's own thread, for which the start must not vanish within a step
-
-    def send_columns(self, columns: int) -> None:
-        """Send this number of counts a line from now on."""
-        self._columns = columns
 
     def _step(self, data: bytes) -> None:
         if self._stalled:
@@ -190,7 +169,7 @@ class EmulatedLineBoard(SerialDevice):
             return
         self._first = end
         scale = self._header.full_scale
-        volts = self._source(self.true_times(index))[:, : self._columns]
+        volts = self._source(self.true_times(index))[:, : self._header.channels]
         counts = np.clip(np.rint(volts / self._header.reference_v * scale), 0, scale).astype(np.int64)
         for k, row in zip(index.tolist(), counts.tolist(), strict=True):
             if len(self._out) > MAX_OUT_BYTES:

@@ -44,12 +44,7 @@ class Finger:
     """A finger that looks at what is displayed (`look`) and moves as the samples go by (`volts`)."""
 
     def __init__(
-        self,
-        pad: Morphology,
-        contact: Contact,
-        rig: RigSettings,
-        rate_hz: float,
-        mishaps: float = 0.05,
+        self, pad: Morphology, contact: Contact, rig: RigSettings, rate_hz: float, mishaps: float = 0.05
     ) -> None:
         """Hold the finger over a pad; `mishaps` is the share of presses that become one of `MISHAPS`."""
         rig = rig.for_contact(contact)

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import Any
 
 import numpy as np
 
@@ -24,14 +25,7 @@ BED_MM = 1000.0  # width, depth and height of the emulated printer: room for any
 def emulate_ur5(
     pad: Morphology, contact: Contact, rig: RigSettings, series: Series = "e"
 ) -> Iterator[tuple[RigSettings, EmulatedUR5, EmulatedLineBoard]]:
-    """Run the emulators of a rig, and yield them after its settings, which name their ports.
-
-    Args:
-        pad: what is pressed.
-        contact: how.
-        rig: of `ur5_settings`.
-        series: of the controller; "cb3" measures no force.
-    """
+    """Run the emulators of a rig of `ur5_settings`, and yield them after its settings, which name their ports."""
     tip = RobotFrame.from_settings(rig).pose(np.zeros(2), -2 * rig.clearance_mm)
     tcp_mm = rig.tcp_mm or (0.0, 0.0, 0.0)
     with (
@@ -79,29 +73,18 @@ def _emulate_board(
 
 def ur5_settings(rig: RigSettings, pad: Morphology) -> RigSettings:
     """Return `rig` with a workspace around the emulated pad."""
-    x, y = 0.0, -400.0
-    reach = max(pad.layout.size_mm) + rig.clearance_mm  # however the pad is rotated
-    return rig.model_copy(
-        update={
-            "pad_mm": (x, y),
-            "tcp_mm": (0.0, 0.0, 0.0),
-            "contact_mm": 100.0,
-            "box_mm": (x - reach, x + reach, y - reach, y + reach, 100.0 - rig.max_depth_mm, 300.0),
-        }
-    )
+    return _with_pad(rig, pad, (0.0, -400.0), 100.0, tcp_mm=(0.0, 0.0, 0.0))
 
 
 def printer_settings(rig: RigSettings, pad: Morphology) -> RigSettings:
     """Return `rig` with the pad in the middle of the emulated printer's bed, and the probe beside its nozzle."""
-    middle, height = BED_MM / 2, 8.0
-    reach = max(pad.layout.size_mm) + rig.clearance_mm
-    sides = (middle - reach, middle + reach)
-    return rig.model_copy(
-        update={
-            "pad_mm": (middle, middle),
-            "contact_mm": height,
-            "box_mm": (*sides, *sides, height - rig.max_depth_mm, height + 200.0),
-            "tcp_mm": (30.0, 0.0, -20.0),
-            "max_force_n": None,
-        }
-    )
+    return _with_pad(rig, pad, (BED_MM / 2, BED_MM / 2), 8.0, tcp_mm=(30.0, 0.0, -20.0), max_force_n=None)
+
+
+def _with_pad(
+    rig: RigSettings, pad: Morphology, centre_mm: tuple[float, float], height_mm: float, **settings: Any
+) -> RigSettings:
+    reach = max(pad.layout.size_mm) + rig.clearance_mm  # however the pad is rotated
+    sides = (side for x in centre_mm for side in (x - reach, x + reach))
+    box_mm = (*sides, height_mm - rig.max_depth_mm, height_mm + 200.0)
+    return rig.model_copy(update={"pad_mm": centre_mm, "contact_mm": height_mm, "box_mm": box_mm, **settings})

@@ -17,12 +17,10 @@ from functools import partialmethod
 from typing import Any, Self
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from padforge.sense.rig import clock
 from padforge.sense.rig.arms import rtde
-from padforge.sense.rig.devices import Array, Pose, RigFault
-from tests.emulators.rtde_types import n_values, recipe_layout, variable_type
+from padforge.sense.rig.devices import Pose
 from tests.emulators.ur5_controller import RATES_HZ, VERSIONS, Controller, PoseLog, Series
 
 HOST = "127.0.0.1"
@@ -33,6 +31,29 @@ PORTS = {"rtde": rtde.RTDE_PORT, "script": SCRIPT_PORT, "dashboard": rtde.DASHBO
 INPUTS = ord("I")  # the kind of frame by which a client claims registers
 TO_MM = np.array([1000.0, 1000.0, 1000.0, 1.0, 1.0, 1.0])
 COMMAND_S = 5.0  # longest wait for a command to be executed
+_CODES = {"DOUBLE": "d", "INT32": "i", "UINT32": "I", "UINT64": "Q"}
+_CODES |= {"VECTOR3D": "3d", "VECTOR6D": "6d", "VECTOR6INT32": "6i"}
+_TYPES = (
+    (r"robot_mode|safety_mode|(input|output)_int_register_\d+", "INT32"),
+    (r"runtime_state|robot_status_bits|safety_status_bits|output_bit_registers\d+_to_\d+", "UINT32"),
+    (r"actual_digital_(in|out)put_bits", "UINT64"),
+    (r"actual_tool_accelerometer|payload_cog", "VECTOR3D"),
+    (r"joint_mode", "VECTOR6INT32"),
+    (r"actual_robot_(current|voltage)|actual_main_voltage", "DOUBLE"),
+    (r"(actual|target)_(q|qd|qdd|current|moment|TCP_\w+)|actual_current_as_torque|actual_joint_voltage", "VECTOR6D"),
+    (r"joint_(control_output|temperatures)|ft_raw_wrench|payload_inertia", "VECTOR6D"),
+    (r"\w+", "DOUBLE"),
+)
+
+
+def variable_type(name: str) -> str:
+    """Return the type of a variable that a controller sends or takes, by its name, as ur-rtde decodes it."""
+    return next(kind for pattern, kind in _TYPES if re.fullmatch(pattern, name))
+
+
+def recipe_layout(types: list[str]) -> struct.Struct:
+    """Return the layout of the values of a recipe."""
+    return struct.Struct(">" + "".join(_CODES[kind] for kind in types))
 
 
 class Connection:
@@ -45,8 +66,7 @@ class Connection:
         self.inputs: list[tuple[list[str], struct.Struct]] = []
         self.outputs: tuple[list[str], list[int], struct.Struct] = [], [], struct.Struct("")
         self.streaming = False
-        self.splitter = rtde.FrameSplitter()
-        self.text = b""
+        self.text = b""  # received, but not yet complete
 
     def pack_state(self, state: dict[str, Any]) -> bytes:
         """Return the values of the output recipe."""
@@ -78,7 +98,9 @@ class EmulatedUR5:
         x, y, z = (value / 1e3 for value in tcp_mm)
         pose_m = np.array(pose) / TO_MM
         self._controller = Controller(series, pose_m, surface_m, stiffness_n_mm * 1e3, clock.now(), (x, y, z))
-        self.pose_log = PoseLog()  # true poses of the tip
+        self.pose_log = PoseLog()
+        self.true_poses = self.pose_log.poses
+        self.dashboard_log = self._controller.dashboard_log  # every line that was sent to the dashboard
         self.host = host
         self._connections: list[Connection] = []
         self._listeners: dict[str, socket.socket] = {}
@@ -91,12 +113,7 @@ class EmulatedUR5:
         self._thread = threading.Thread(target=self._serve, name=f"emulated arm at {host}", daemon=True)
 
     def __enter__(self) -> Self:
-        try:
-            self._listen()
-        except OSError as error:
-            self._close_all()
-            message = f"no emulated arm at {self.host}: {error.strerror}"
-            raise RigFault("refused", message, "is there another one?") from error
+        self._listen()
         self._run_cycle(clock.now())  # so that there is a pose from the start on
         self._thread.start()
         return self
@@ -105,14 +122,6 @@ class EmulatedUR5:
         self._ending = True
         self._thread.join()
         self._close_all()
-
-    def true_poses(self, times_s: ArrayLike) -> Array:
-        """Return the (n, 6) true poses in mm and rad at monotonic times; see `PoseLog.poses`."""
-        return self.pose_log.poses(times_s)
-
-    def dashboard_log(self) -> list[str]:
-        """Return every line that was sent to the dashboard."""
-        return list(self._controller.dashboard_log)
 
     def _command(self, name: str, *arguments: Any) -> None:
         """Call a method between two cycles, and wait for its end."""
@@ -241,8 +250,10 @@ class EmulatedUR5:
         if not data:
             self._close(connection)
         elif connection.port == "rtde":
-            for kind, payload in connection.splitter.split(data):
-                self._process_frame(connection, kind, payload)
+            connection.text += data
+            while len(connection.text) >= (size := int.from_bytes(connection.text[:2].ljust(2, b"\xff"))):
+                frame, connection.text = connection.text[:size], connection.text[size:]
+                self._process_frame(connection, frame[2], frame[3:])
         elif connection.port == "script":
             connection.text += data
             if re.search(rb"(?m)^end\s*\Z", connection.text):
@@ -269,7 +280,7 @@ class EmulatedUR5:
             names = payload[8 * (kind == rtde.OUTPUTS) :].decode().strip(",").split(",")
             types = [variable_type(name) for name in names]
             if kind == rtde.OUTPUTS:
-                connection.outputs = names, [n_values(name) for name in types], recipe_layout(types)
+                connection.outputs = names, [int(_CODES[name][:-1] or 1) for name in types], recipe_layout(types)
             elif "IN_USE" not in (types := [self._claim(connection, name) for name in names]):
                 connection.inputs.append((names, recipe_layout(types)))
                 answer = bytes([len(connection.inputs)])

@@ -5,9 +5,10 @@ stopped. Lengths are m and angles rad, poses and velocities have six numbers. Th
 """
 
 import itertools
-import threading
+from bisect import bisect_right
 from collections import defaultdict
 from collections.abc import Iterator, Mapping
+from operator import itemgetter
 from typing import Any, Literal
 
 import numpy as np
@@ -20,7 +21,6 @@ from padforge.sense.rig.arms.rtde import PLAYING, RUNNING, STOPPED
 Series = Literal["cb3", "e"]
 RATES_HZ = {"cb3": 125, "e": 500}
 VERSIONS = {"cb3": (3, 15, 8, 106339), "e": (5, 12, 2, 1101534)}
-HALT_M_S2 = 4.0  # deceleration when the controller itself stops the arm
 START_S = 0.02  # from the last byte of a program to its first step
 NORMAL, PROTECTIVE, EMERGENCY = 1 << 0, 1 << 2, 1 << 7
 POWER_OFF = 3  # robot mode
@@ -29,87 +29,56 @@ UR_RTDE_PROGRAM = "def rtde_control():"
 
 MOVE_L, STOP, WATCHDOG, GET_TCP, END = 3, 33, 35, 40, 255
 """Commands of ur-rtde's control program that are emulated: those of our driver."""
-ROWS = 1 << 16  # length of the log of poses: 131 s at 500 Hz, 524 s at 125 Hz
 
 
-class StraightTrajectory:
-    """A straight move from rest to rest with a trapezoidal velocity profile; a pure rotation takes its speed in rad/s.
+class Motion:
+    """Straight moves of the tool with a trapezoidal velocity profile; stops are at once. A rotation is in rad/s.
 
     The rotation vector changes in proportion to the distance, which is right for the small rotations of a probe.
     """
 
-    def __init__(self, start: Array, end: Array, speed: float, acceleration: float) -> None:
-        offset = end - start
-        length = float(np.linalg.norm(offset[:3]) or np.linalg.norm(offset[3:]))
-        self._start, self.end = start, end
-        self._direction = offset / length if length else offset
-        self.profile = TrapezoidalProfile(length, speed, acceleration)
-        self.duration = self.profile.duration_s
-
-    def evaluate(self, t: float) -> tuple[Array, Array]:
-        """Return pose and velocity `t` seconds after the start."""
-        if t >= self.duration:
-            return self.end.copy(), np.zeros(6)
-        distance, speed = self.profile.evaluate(t)
-        return self._start + distance * self._direction, speed * self._direction
-
-
-class Braking:
-    """From a velocity to rest."""
-
-    def __init__(self, start: Array, velocity: Array, deceleration: float) -> None:
-        self._start, self._velocity = start, velocity
-        self.duration = float(np.linalg.norm(velocity)) / deceleration
-
-    def evaluate(self, t: float) -> tuple[Array, Array]:
-        """Return pose and velocity `t` seconds after the start."""
-        share = t / self.duration if self.duration else 1.0
-        return self._start + self._velocity * (1 - share / 2) * t, self._velocity * (1 - share)
-
-
-class Motion:
-    """Motion of the tool: pose and velocity at the last update."""
-
     def __init__(self, pose: Array) -> None:
         self.pose, self.velocity = pose, np.zeros(6)
-        self._trajectory: StraightTrajectory | Braking | None = None
-        self._start_s = 0.0
-        self._interrupted: StraightTrajectory | None = None
+        self._move: tuple[Array, Array, TrapezoidalProfile, float] | None = None  # start, end, profile, time of start
+        self._interrupted: tuple[Array, float, float] | None = None  # end, speed, acceleration
 
     @property
     def moving(self) -> bool:
-        return self._trajectory is not None
+        return self._move is not None
 
     def move_to(self, end: Array, speed: float, acceleration: float, now: float) -> None:
-        """Start a straight move; the tool has to be at rest."""
-        self._trajectory, self._start_s = StraightTrajectory(self.pose, end, speed, acceleration), now
+        """Start a move from rest."""
+        offset = end - self.pose
+        length = float(np.linalg.norm(offset[:3]) or np.linalg.norm(offset[3:]))
+        self._move = self.pose, end, TrapezoidalProfile(length, speed, acceleration), now
 
-    def brake(self, deceleration: float, now: float) -> None:
-        """Come to rest; braking again changes nothing."""
-        self._interrupted = None
-        if isinstance(self._trajectory, StraightTrajectory):
-            self._trajectory, self._start_s = Braking(self.pose, self.velocity, deceleration), now
+    def stop(self) -> None:
+        """Stop for good."""
+        self._move, self._interrupted, self.velocity = None, None, np.zeros(6)
 
-    def interrupt(self, deceleration: float, now: float) -> None:
-        """Come to rest, and remember the move under way."""
-        move = self._trajectory if isinstance(self._trajectory, StraightTrajectory) else None
-        self.brake(deceleration, now)
-        self._interrupted = move
+    def interrupt(self) -> None:
+        """Stop, and remember the move under way."""
+        move = self._move
+        self.stop()
+        self._interrupted = move and (move[1], move[2].max_speed, move[2].acceleration)
 
     def resume(self, now: float) -> None:
         """Go on with the interrupted move."""
         if move := self._interrupted:
             self._interrupted = None
-            self.move_to(move.end, move.profile.max_speed, move.profile.acceleration, now)
+            self.move_to(*move, now)
 
     def update(self, now: float) -> None:
         """Advance to the time `now`."""
-        if self._trajectory is None:
+        if self._move is None:
             return
-        t = now - self._start_s
-        self.pose, self.velocity = self._trajectory.evaluate(min(t, self._trajectory.duration))
-        if t >= self._trajectory.duration:
-            self._trajectory, self.velocity = None, np.zeros(6)
+        start, end, profile, start_s = self._move
+        distance, speed = profile.evaluate(now - start_s)
+        direction = (end - start) / (profile.length or 1.0)
+        self.pose, self.velocity = start + distance * direction, speed * direction
+        if now - start_s >= profile.duration_s:
+            self.pose = end
+            self.stop()
 
 
 class Controller:
@@ -180,12 +149,12 @@ class Controller:
         """End the program and brake the arm."""
         self._threads, self._program_start, self._watchdog_s = [], None, np.inf
         self._runtime = STOPPED
-        self.motion.brake(HALT_M_S2, self.now)
+        self.motion.stop()
 
     def protective_stop(self) -> None:
         """Brake and pause: the program goes on if a person unlocks the arm and presses play."""
         self._safety = PROTECTIVE
-        self.motion.interrupt(HALT_M_S2, self.now)
+        self.motion.interrupt()
         if self._runtime == PLAYING:
             self._runtime = PAUSED
 
@@ -264,14 +233,14 @@ class Controller:
     def _execute(self, command: int) -> Iterator[None]:
         if command == MOVE_L:
             *pose, speed, acceleration = map(self._read_double, range(8))
-            yield from self._halt(HALT_M_S2)
+            self._halt()
             thread = self._move(np.array(pose), speed, acceleration)
             if self.inputs["input_int_register_1"]:  # asynchronous
                 self._threads.append(thread)
             else:
                 yield from thread
         elif command == STOP:
-            yield from self._halt(self._read_double(0))
+            self._halt()
         elif command == GET_TCP:
             tcp = (*self.tcp, 0.0, 0.0, 0.0)
             self.outputs |= {f"output_double_register_{i}": value for i, value in enumerate(tcp)}
@@ -288,13 +257,11 @@ class Controller:
             yield
         self._set_progress(moving=False)
 
-    def _halt(self, deceleration: float) -> Iterator[None]:
+    def _halt(self) -> None:
         if len(self._threads) > 1:
             self._set_progress(moving=False)
         del self._threads[1:]
-        self.motion.brake(deceleration, self.now)
-        while self.motion.moving:
-            yield
+        self.motion.stop()
 
     def _set_progress(self, moving: bool) -> None:
         """Write register 2 as ur-rtde packs it: number of the operation, number of writes, whether it runs."""
@@ -307,34 +274,22 @@ class Controller:
 
 
 class PoseLog:
-    """The newest true poses of the tip, at least `ROWS` of them; threads may read while one writes."""
+    """The true poses of the tip; threads may read while one writes."""
 
     def __init__(self) -> None:
-        self._rows = np.empty((2 * ROWS, 8))
-        self._end = 0
-        self._lock = threading.Lock()
+        self._rows: list[tuple[float, ...]] = []
 
     def append(self, time_s: float, pose: ArrayLike, force_n: float) -> None:
         """Add a row: time on the host's monotonic clock, pose in mm and rad, force on the tool."""
-        with self._lock:
-            if self._end == len(self._rows):
-                self._end //= 2
-                self._rows[: self._end] = self._rows[self._end :]
-            row = self._rows[self._end]
-            row[0], row[1:7], row[7] = time_s, pose, force_n
-            self._end += 1
+        self._rows.append((time_s, *np.asarray(pose).tolist(), force_n))
 
     def rows(self, since_s: float = -np.inf) -> Array:
         """Return the (n, 8) rows from the last one before a time on, oldest first."""
-        with self._lock:
-            first = int(np.searchsorted(self._rows[: self._end, 0], since_s, side="right")) - 1
-            return self._rows[max(first, 0) : self._end].copy()
+        first = bisect_right(self._rows, since_s, key=itemgetter(0)) - 1
+        return np.array(self._rows[max(first, 0) :])
 
     def poses(self, times_s: ArrayLike) -> Array:
-        """Return the (n, 6) poses in mm and rad at monotonic times; ValueError for a time before the oldest row."""
+        """Return the (n, 6) poses in mm and rad at monotonic times."""
         times = np.atleast_1d(np.asarray(times_s, dtype=np.float64))
-        first_s = np.min(times, initial=np.inf)
-        rows = self.rows(first_s)
-        if not len(rows) or rows[0, 0] > first_s:
-            raise ValueError("a time before the oldest pose of the log")
+        rows = self.rows(np.min(times, initial=np.inf))
         return np.column_stack([np.interp(times, rows[:, 0], column) for column in rows.T[1:7]])

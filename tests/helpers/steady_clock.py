@@ -8,6 +8,7 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from unittest.mock import patch
 
 from padforge.sense.rig import clock
 
@@ -46,5 +47,5 @@ class SteadyClock:
 def steady_clock() -> Iterator[SteadyClock]:
     """Have rigs, in all threads of this process, go by a steady clock."""
     steady = SteadyClock()
-    with clock.replaced(steady.now, steady.sleep):
+    with patch.multiple(clock, now=steady.now, sleep=steady.sleep):
         yield steady

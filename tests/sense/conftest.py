@@ -231,7 +231,7 @@ class Robots:
         if arm is not None:
             arm.close()
         if robot is not None:
-            asked = robot.dashboard_log()
+            asked = robot.dashboard_log
             robot.__exit__()
             assert not [line for line in asked if any(word in line for word in FORBIDDEN)]
 

@@ -16,7 +16,6 @@ from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, wait
 from contextlib import suppress
-from dataclasses import dataclass
 from typing import Any, NoReturn
 
 import numpy as np
@@ -48,30 +47,22 @@ _START_S = 0.1  # time for which a firmware waits for further moves before it st
 _MAX_IMPLAUSIBLE = 3  # implausible positions in a row; fewer are noise
 
 
-@dataclass(frozen=True)
-class NozzleState:
-    """State of the nozzle at one moment."""
-
-    time_s: float  # host time of the printer's report
-    position: Position  # mm
-    speed_mm_s: float  # >= 0
-    moving: bool  # whether a move is in progress
-
-
 class NozzleThread(threading.Thread):
-    """The thread that moves the nozzle and polls its position."""
+    """The thread that moves the nozzle and polls its position; its states are those of the tip."""
 
-    def __init__(self, link: MarlinLink, position: Position, max_mm_s: Position, max_mm_s2: Position) -> None:
+    def __init__(
+        self, link: MarlinLink, position: Position, rig: RigSettings, max_mm_s: Position, max_mm_s2: Position
+    ) -> None:
         super().__init__(name="printer", daemon=True)
-        self._link, self._max_mm_s, self._max_mm_s2 = link, max_mm_s, max_mm_s2
-        self._position = position  # at rest
+        self._link, self._rig, self._max_mm_s, self._max_mm_s2 = link, rig, max_mm_s, max_mm_s2
+        self._position = self._reported = position  # at rest, and reported last
         self._move: StraightMove | None = None
         self._move_start_s, self._acceleration, self._n_implausible = 0.0, 0.0, 0
         self._commands: queue.Queue[tuple[Callable[[], None], Future[None]]] = queue.Queue()
-        self._states: deque[NozzleState] = deque(maxlen=100_000)  # for `drain`
+        self._states: deque[ArmState] = deque(maxlen=100_000)  # for `drain`
         self._ending = threading.Event()
         self.fault: RigFault | None = None  # why the position is unknown, if it is
-        self.latest = NozzleState(clock.now(), position, 0.0, False)
+        self.latest = self._to_arm_state(clock.now(), position, 0.0)
 
     def run(self) -> None:
         """Poll the position and execute commands until `end` is called or a fault occurs."""
@@ -88,7 +79,7 @@ class NozzleThread(threading.Thread):
         except Exception as error:  # a thread that dies silently would look like a printer at rest
             self.fault = RigFault("lost", f"the thread that moves the printer has failed ({error!r})")
 
-    def drain(self) -> list[NozzleState]:
+    def drain(self) -> list[ArmState]:
         """Return the states since the last call."""
         return [self._states.popleft() for _ in range(len(self._states))]
 
@@ -214,10 +205,21 @@ class NozzleThread(threading.Thread):
         raise RigFault("lost", f"the printer {problem} mm, but was sent to {_format(target)} mm", advice)
 
     def _add_state(self, now_s: float, position: Position) -> None:
-        moving, elapsed_s = self._move is not None, now_s - self.latest.time_s
-        speed = math.dist(position, self.latest.position) / elapsed_s if moving and elapsed_s > 0 else 0.0
-        self.latest = NozzleState(now_s, position, speed, moving)
+        elapsed_s = now_s - self.latest.time_s
+        is_moving = self._move is not None and elapsed_s > 0
+        speed_mm_s = math.dist(position, self._reported) / elapsed_s if is_moving else 0.0
+        self._reported, self.latest = position, self._to_arm_state(now_s, position, speed_mm_s)
         self._states.append(self.latest)
+
+    def _to_arm_state(self, now_s: float, position: Position, speed_mm_s: float) -> ArmState:
+        x, y, z = (a + b for a, b in zip(position, _tip_offset(self._rig), strict=True))
+        moving = self._move is not None
+        return ArmState(now_s, (x, y, z, *self._rig.tool_rad), speed_mm_s, None, False, False, moving)
+
+
+def _tip_offset(rig: RigSettings) -> Position:
+    """Return the probe's tip from the nozzle, or the nozzle itself if the tip is unknown."""
+    return rig.tcp_mm or (0.0, 0.0, 0.0)
 
 
 def _format(position: Position) -> str:
@@ -235,7 +237,6 @@ class Printer:
         self._rig = rig
         self._link: MarlinLink | None = None
         self._thread: NozzleThread | None = None
-        self._tcp: Position = (0.0, 0.0, 0.0)
 
     @classmethod
     def from_settings(cls, rig: RigSettings) -> "Printer":
@@ -255,7 +256,6 @@ class Printer:
         rig = self._rig
         if rig.printer_port is None:
             raise RigFault("refused", "[rig] printer_port is unknown, allowed is a serial port such as /dev/ttyUSB0")
-        self._tcp = rig.tcp_mm or (0.0, 0.0, 0.0)
         self._link = link = MarlinLink(rig.printer_port, rig.printer_baud)
         try:
             link.handshake(CONNECT_S)
@@ -268,7 +268,7 @@ class Printer:
         except BaseException:
             self.close()
             raise
-        self._thread = NozzleThread(link, position, max_mm_s, max_mm_s2)
+        self._thread = NozzleThread(link, position, rig, max_mm_s, max_mm_s2)
         self._thread.start()
         return {
             "port": rig.printer_port,
@@ -284,7 +284,7 @@ class Printer:
         if (age_s := clock.now() - state.time_s) > STALE_S:
             message = f"the printer's last answer is {age_s:.2f} s old; allowed {STALE_S} s"
             raise RigFault("stale", message, "it may be busy: look at its display")
-        return self._to_arm_state(state)
+        return state
 
     def drain(self) -> Array:
         """Return the (n, 10) states since the last call; a fault is raised once those before it are returned."""
@@ -292,7 +292,7 @@ class Printer:
         if not states:
             self._connected()
             return np.empty((0, len(STATE_COLUMNS)))
-        return np.array([self._to_arm_state(state).to_row() for state in states])
+        return np.array([state.to_row() for state in states])
 
     def move(self, pose: Sequence[float], speed_mm_s: float, acceleration_mm_s2: float) -> None:
         """Start a straight move from rest, slowed to the limits of the axes; a turn of the tool is refused, too."""
@@ -300,7 +300,7 @@ class Printer:
         check_probe(self._rig)
         if not np.allclose(pose[3:], self._rig.tool_rad, atol=1e-6):
             raise RigFault("refused", f"a turn of the tool to {list(pose[3:])} rad; a printer cannot turn it")
-        x, y, z = (float(value) - offset for value, offset in zip(pose, self._tcp, strict=False))
+        x, y, z = (float(value) - offset for value, offset in zip(pose, _tip_offset(self._rig), strict=False))
         self._connected().move((x, y, z), speed_mm_s, acceleration_mm_s2)
 
     def stop(self) -> None:
@@ -324,11 +324,6 @@ class Printer:
         if self._thread.fault:
             raise self._thread.fault
         return self._thread
-
-    def _to_arm_state(self, state: NozzleState) -> ArmState:
-        x, y, z = (a + b for a, b in zip(state.position, self._tcp, strict=True))
-        pose = (x, y, z, *self._rig.tool_rad)
-        return ArmState(state.time_s, pose, state.speed_mm_s, None, False, False, state.moving)
 
     def _check_press_time(self, max_mm_s: Position, max_mm_s2: Position) -> None:
         """Raise RigFault("refused") if a press would end before the tip has reached its depth."""

@@ -1,14 +1,10 @@
-"""RTDE, the data link of Universal Robots controllers: frames, a reader of states, and the dashboard.
-
-Frames are big-endian, both ways.
-"""
+"""RTDE, the data link of Universal Robots controllers: a reader of states, and the dashboard. Frames are big-endian."""
 
 import math
 import socket
 import struct
 import time
-from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -44,26 +40,6 @@ def pack_frame(kind: int, payload: bytes = b"") -> bytes:
     return _HEADER.pack(_HEADER.size + len(payload), kind) + payload
 
 
-class FrameSplitter:
-    """Splits a stream of bytes into frames."""
-
-    def __init__(self) -> None:
-        self._bytes = bytearray()
-
-    def split(self, data: bytes) -> Iterator[tuple[int, bytes]]:
-        """Yield kind and payload of every frame that `data` completes; ValueError for an impossible size."""
-        self._bytes += data
-        while len(self._bytes) >= _HEADER.size:
-            size, kind = _HEADER.unpack_from(self._bytes)
-            if size < _HEADER.size:
-                raise ValueError(f"a frame of {size} bytes; expected at least {_HEADER.size}")
-            if len(self._bytes) < size:
-                return
-            payload = bytes(self._bytes[_HEADER.size : size])
-            del self._bytes[:size]
-            yield kind, payload
-
-
 def ask_dashboard(host: str, questions: Sequence[str], timeout_s: float) -> list[str]:
     """Return the answer, one line, to each question; OSError if the dashboard is unreachable or one is late."""
     with socket.create_connection((host, DASHBOARD_PORT), timeout_s) as link, link.makefile("rb") as lines:
@@ -87,16 +63,17 @@ def stop_program(host: str, timeout_s: float) -> bool:
 
 @dataclass(frozen=True)
 class RtdeState:
-    """A state of the arm, in the controller's units."""
+    """A state of the arm; mm, rad."""
 
     time_s: float  # time of the measurement, host's monotonic clock
-    pose: tuple[float, ...]  # of the tool, m and rad
-    speed: float  # of the tool, m/s
+    pose: tuple[float, ...]  # of the tool
+    speed_mm_s: float  # of the tool
     force_n: float | None  # on the tool along z; None without a sensor
     sideways_n: float  # force across z; 0 without a sensor
+    protective_stop: bool  # whether the controller has stopped the arm
+    emergency_stop: bool  # whether a person has stopped the arm
     mode: int  # robot mode
     runtime: int  # runtime state of the program
-    safety: int  # safety status bits
     progress: int  # register in which ur-rtde's program reports its moves
 
 
@@ -130,37 +107,13 @@ class RtdeReader:
         """Connect and start the stream; ValueError if the controller lacks the protocol or a variable."""
         self._link = socket.create_connection((host, RTDE_PORT), timeout_s)
         self._link.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        self._splitter = FrameSplitter()
-        self._queue: deque[tuple[float, bytes]] = deque()
+        self._stream = self._link.makefile("rb")
         self._clock = HostClock()
         if self._request(VERSION, struct.pack(">H", PROTOCOL)) != b"\x01":
             raise ValueError(f"the controller does not speak RTDE {PROTOCOL}")
         self.version: tuple[int, ...] = _unpack(struct.Struct(">4I"), self._request(CONTROLLER))  # of PolyScope
-        self.rate_hz = 500 if self.version[0] >= FORCE_SERIES else 125  # one state per control cycle
-        self._start()
-
-    def read(self, timeout_s: float) -> RtdeState:
-        """Return the next state; TimeoutError after `timeout_s` without a byte, ValueError for a damaged state."""
-        self._link.settimeout(timeout_s)
-        while not self._queue:
-            self._read_frames()
-        arrival_s, payload = self._queue.popleft()
-        values = _unpack(_LAYOUT, payload[1:])
-        if not all(map(math.isfinite, values)):
-            raise ValueError("the controller sent a state that holds NaN or infinity")
-        stamp, pose, speed, force = values[0], values[1:7], values[7:10], values[13:16]
-        has_sensor = self.version[0] >= FORCE_SERIES
-        return RtdeState(
-            time_s=self._clock.host_time(stamp, arrival_s),
-            pose=pose,
-            speed=math.hypot(*speed),
-            force_n=force[2] if has_sensor else None,
-            sideways_n=math.hypot(*force[:2]) if has_sensor else 0.0,
-            **dict(zip(("mode", "runtime", "safety", "progress"), values[19:], strict=True)),
-        )
-
-    def _start(self) -> None:
-        """Request the variables and start the stream."""
+        self._has_sensor = self.version[0] >= FORCE_SERIES
+        self.rate_hz = 500 if self._has_sensor else 125  # one state per control cycle
         answer = self._request(OUTPUTS, struct.pack(">d", self.rate_hz) + ",".join(VARIABLES).encode())
         types = answer[1:].decode().split(",")
         if missing := [name for name, kind in zip(VARIABLES, types, strict=False) if kind == "NOT_FOUND"]:
@@ -169,26 +122,47 @@ class RtdeReader:
             raise ValueError(f"the controller would send {','.join(types)[:200]!r} for {','.join(VARIABLES)}")
         self._request(START)
 
+    def read(self, timeout_s: float) -> RtdeState:
+        """Return the next state; TimeoutError after `timeout_s` without a byte, ValueError for a damaged state."""
+        self._link.settimeout(timeout_s)
+        values = _unpack(_LAYOUT, self._read_frame(DATA)[1:])
+        arrival_s = time.monotonic()
+        if not all(map(math.isfinite, values)):
+            raise ValueError("the controller sent a state that holds NaN or infinity")
+        stamp, pose, speed, force = values[0], values[1:7], values[7:10], values[13:16]
+        mode, runtime, safety, progress = values[19:]
+        emergency_stop = bool(safety & EMERGENCY_BITS)
+        return RtdeState(
+            self._clock.host_time(stamp, arrival_s),
+            (*(1e3 * value for value in pose[:3]), *pose[3:]),
+            1e3 * math.hypot(*speed),
+            force[2] if self._has_sensor else None,
+            math.hypot(*force[:2]) if self._has_sensor else 0.0,
+            bool(safety & PROTECTIVE_BITS) and not emergency_stop,
+            emergency_stop,
+            mode,
+            runtime,
+            progress,
+        )
+
     def _request(self, kind: int, payload: bytes = b"") -> bytes:
         self._link.sendall(pack_frame(kind, payload))
-        while True:
-            for answer_kind, answer in self._read_frames():
-                if answer_kind == kind:
-                    return answer
+        return self._read_frame(kind)
 
-    def _read_frames(self) -> list[tuple[int, bytes]]:
-        """Wait for bytes; queue the data packages that they complete and return the other frames."""
-        data = self._link.recv(65536)
-        if not data:
+    def _read_frame(self, kind: int) -> bytes:
+        """Return the payload of the next frame of a kind; other frames are skipped."""
+        while True:
+            size, received = _HEADER.unpack(self._read_bytes(_HEADER.size))
+            if size < _HEADER.size:
+                raise ValueError(f"a frame of {size} bytes; expected at least {_HEADER.size}")
+            payload = self._read_bytes(size - _HEADER.size)
+            if received == kind:
+                return payload
+
+    def _read_bytes(self, count: int) -> bytes:
+        if len(data := self._stream.read(count)) < count:
             raise ConnectionError("the controller closed the link")
-        now = time.monotonic()
-        answers = []
-        for kind, payload in self._splitter.split(data):
-            if kind == DATA:
-                self._queue.append((now, payload))
-            else:
-                answers.append((kind, payload))
-        return answers
+        return data
 
 
 def _unpack(layout: struct.Struct, payload: bytes) -> tuple[Any, ...]:

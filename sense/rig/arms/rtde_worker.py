@@ -16,11 +16,12 @@ import socket
 import sys
 import threading
 import time
+from collections.abc import Sequence
+from importlib.metadata import version
 from typing import Any, NoReturn
 
 from padforge.sense.rig.arms import rtde
 from padforge.sense.rig.arms.rtde import RtdeReader, RtdeState
-from padforge.sense.rig.arms.ur_rtde import UrRtdeControl
 
 KICK_S = 0.04  # a sixth of the time after which the watchdog stops the arm
 HEARTBEAT_TIMEOUT_S = 0.3  # maximum silence of the parent during a move; six times the period of its heartbeats
@@ -29,6 +30,11 @@ FIRST_STATE_S = 0.05  # longest wait for a state after a stop, so that the paren
 HALT_S = 0.15  # longest wait for the arm, and then for the parent, before this process ends
 ANSWER_S = 1.0  # longest wait for an answer of the arm while connecting
 SESSION_END_S = 1.0  # longest wait for the end of another session, whose watchdog takes 0.25 s
+STOP_M_S2 = 5.0  # deceleration of a stop
+OPERATION = 0x7F << 24  # bits of ur-rtde's progress register: number of the operation
+UNDER_WAY = 1 << 15  # bit of the same register: the operation is in progress
+ARM_STATE = ("time_s", "pose", "speed_mm_s", "force_n", "sideways_n", "protective_stop", "emergency_stop")
+"""Fields of an `ArmState` that the controller states."""
 UNLOCK_ADVICE = "look at the arm, unlock it at the pendant, then connect again"
 
 
@@ -37,9 +43,9 @@ class CommandRejected(Exception):  # noqa: N818  the parent raises it as a RigFa
 
 
 def _check_ready(state: RtdeState) -> None:
-    if state.safety & rtde.EMERGENCY_BITS:
+    if state.emergency_stop:
         raise CommandRejected("emergency_stop", "the arm is in an emergency stop", UNLOCK_ADVICE)
-    if state.safety & rtde.PROTECTIVE_BITS:
+    if state.protective_stop:
         raise CommandRejected("protective_stop", "the arm is in a protective stop", UNLOCK_ADVICE)
     if state.mode != rtde.RUNNING:
         message = f"the arm is not ready: robot mode {state.mode}, expected {rtde.RUNNING}"
@@ -79,6 +85,55 @@ def lock_arm(host: str) -> socket.socket:
                 raise
             message = f"another program on this computer uses the arm {host}"
             raise CommandRejected("refused", message, "wait for its end, or end it") from None
+
+
+class UrRtdeControl:
+    """A connection to ur-rtde's program on the arm. Methods raise an error if the link is lost; lengths are m."""
+
+    def __init__(self, host: str) -> None:
+        """Send ur-rtde's program and set its watchdog; RuntimeError if there is no arm."""
+        import rtde_control
+
+        self.moving = False  # whether the last move is in progress
+        self._progress = 0  # latest value of the register
+        self._previous_operation = 0  # number of the operation before the current move
+        self._control: Any = rtde_control.RTDEControlInterface(host)
+        if not self._control.setWatchdog(4.0):  # Hz, minimum rate of kicks
+            raise RuntimeError("it does not take a watchdog")
+        self.identity: dict[str, Any] = {"driver": f"ur-rtde {version('ur-rtde')}"}
+
+    def tcp_offset(self) -> Sequence[float]:
+        """Return the tool centre point from the flange, m and rad."""
+        return self._control.getTCPOffset()
+
+    def update(self, progress: int, is_stopped: bool) -> None:
+        """Update `moving` from the progress register; a protective or emergency stop (`is_stopped`) ends the move."""
+        self._progress = progress
+        has_arrived = progress & OPERATION != self._previous_operation and not progress & UNDER_WAY
+        if has_arrived or is_stopped:
+            self.moving = False
+
+    def kick(self) -> None:
+        """Kick the watchdog, which stops the arm 0.25 s after the last kick."""
+        self._control.kickWatchdog()
+
+    def move(self, pose: Sequence[float], speed: float, acceleration: float) -> bool:
+        """Start a straight move (m, rad, m/s, m/s²); return whether the arm accepts it."""
+        self._previous_operation = self._progress & OPERATION
+        self.moving = True
+        if not (accepted := self._control.moveL(list(pose), speed, acceleration, True)):
+            self.moving = False
+        return accepted
+
+    def stop(self) -> None:
+        """Stop the arm, and return once it is at rest."""
+        self._control.stopL(STOP_M_S2)
+        self.moving = False
+
+    def end(self) -> None:
+        """Stop the arm and end the program."""
+        self._control.stopL(STOP_M_S2)
+        self._control.stopScript()
 
 
 class WorkerProcess:
@@ -168,8 +223,8 @@ class WorkerProcess:
 
     def _ask_identity(self) -> dict[str, str]:
         """Return the arm's identity by its dashboard; reject an arm that is not in remote control."""
-        polyscope, model = rtde.ask_dashboard(self._host, ["PolyscopeVersion", "get robot model"], ANSWER_S)
-        remote, serial = rtde.ask_dashboard(self._host, ["is in remote control", "get serial number"], ANSWER_S)
+        questions = ["PolyscopeVersion", "get robot model", "is in remote control", "get serial number"]
+        polyscope, model, remote, serial = rtde.ask_dashboard(self._host, questions, ANSWER_S)
         if remote == "false":
             raise CommandRejected("refused", "the arm is not in remote control", "switch it over at the pendant")
         answers = {"polyscope": polyscope.removeprefix("URSoftware "), "model": model, "serial": serial}
@@ -215,7 +270,8 @@ class WorkerProcess:
             self._latest = state
             self._update(state)
             self._new_state.set()
-            self._send({"state": self._to_arm_state(state)})
+            known = {name: getattr(state, name) for name in ARM_STATE}
+            self._send({"state": known | {"moving": self._is_moving()}})
             try:
                 state = reader.read(STREAM_TIMEOUT_S)
             except TimeoutError:
@@ -225,7 +281,7 @@ class WorkerProcess:
                 self._exit("lost", "the arm closed the link", "check that it is switched on, connect again")
 
     def _update(self, state: RtdeState) -> None:
-        stopped = bool(state.safety & (rtde.PROTECTIVE_BITS | rtde.EMERGENCY_BITS))
+        stopped = state.protective_stop or state.emergency_stop
         if self._control is not None:
             self._control.update(state.progress, stopped)
         if stopped and not self._stopped_by_arm:
@@ -238,20 +294,6 @@ class WorkerProcess:
         elif self._program_running.is_set() and not stopped and not self._halting:
             self._exit("lost", "the arm's program has ended", "look at the arm, then connect again")
         self._stopped_by_arm = stopped
-
-    def _to_arm_state(self, state: RtdeState) -> dict[str, Any]:
-        """Return the fields of an `ArmState`."""
-        emergency = bool(state.safety & rtde.EMERGENCY_BITS)
-        return {
-            "time_s": state.time_s,
-            "pose": [*(1e3 * value for value in state.pose[:3]), *state.pose[3:]],
-            "speed_mm_s": 1e3 * state.speed,
-            "force_n": state.force_n,
-            "protective_stop": bool(state.safety & rtde.PROTECTIVE_BITS) and not emergency,
-            "emergency_stop": emergency,
-            "moving": self._is_moving(),
-            "sideways_n": state.sideways_n,
-        }
 
     def _halt(self, cause: str, message: str) -> None:
         """Stop the arm and end this process; if the driver does not stop the arm, the watchdog does."""

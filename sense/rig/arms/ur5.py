@@ -5,6 +5,7 @@ import itertools
 import json
 import os
 import subprocess
+import sys
 import threading
 from collections import deque
 from collections.abc import Mapping, Sequence
@@ -17,7 +18,7 @@ import numpy as np
 from padforge.sense.recording.run_directory import STATE_COLUMNS
 from padforge.sense.rig import clock
 from padforge.sense.rig.arms.rtde import stop_program
-from padforge.sense.rig.devices import ArmState, Array, Cause, Pose, RigFault, start
+from padforge.sense.rig.devices import ArmState, Array, Cause, Pose, RigFault
 from padforge.sense.rig.safety import check_finite_move
 from padforge.sense.settings import RigSettings
 
@@ -41,7 +42,13 @@ class RtdeWorker:
         self._received = threading.Condition()
         self._supervised_s = clock.now()
         self._killed = threading.Event()
-        self.process = start("padforge.sense.rig.arms.rtde_worker", host, stderr=subprocess.DEVNULL)
+        self.process = subprocess.Popen(
+            [sys.executable, "-P", "-m", "padforge.sense.rig.arms.rtde_worker", host],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+            start_new_session=True,  # Ctrl-C does not reach it
+        )
         assert self.process.stdin is not None
         os.set_blocking(self.process.stdin.fileno(), False)
         self._threads = [threading.Thread(target=run, daemon=True) for run in (self._receive, self._send_heartbeats)]
@@ -163,11 +170,6 @@ class UR5:
         except BaseException:
             self._end_worker()
             raise
-
-    @property
-    def worker_pid(self) -> int | None:
-        """Process id of the worker, None before `connect`."""
-        return self._worker.process.pid if self._worker else None
 
     def state(self) -> ArmState:
         """Return the latest state; also RigFault("deadline") if nobody asked for one for 2 s during a move."""

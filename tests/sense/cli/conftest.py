@@ -79,28 +79,42 @@ def single_precision() -> AbstractContextManager[Any]:
 
 
 @pytest.fixture(autouse=True)
-def alike_on_all_processors() -> Iterator[None]:
-    with single_precision():
+def short_calibrations() -> Iterator[None]:
+    """They are alike on all processors, and evaluated at two moments of a press, which takes longest of a short one."""
+    with single_precision(), few_moments():
         yield
 
 
-@pytest.fixture(autouse=True)
-def two_moments() -> Iterator[None]:
-    """Errors are evaluated at two moments of a press, which takes longest of a short calibration."""
-    with few_moments():
-        yield
+def command_in(folder: str) -> Any:
+    """Make a fixture: `padforge_sense` in a copy of the folder that another fixture makes."""
+
+    @pytest.fixture
+    def run(padforge_sense: Run, request: pytest.FixtureRequest) -> Run:
+        shutil.copytree(request.getfixturevalue(folder), Path(), dirs_exist_ok=True)
+        return padforge_sense
+
+    return run
+
+
+few, enough, deep = (command_in(folder) for folder in ("few_presses", "enough_presses", "deep_presses"))
+
+
+@pytest.fixture(scope="session")
+def few_presses(once: Once) -> Path:
+    """A folder with `rec` of 60 presses and `model`."""
+    return once("few presses and their model", lambda folder: make_model(folder, 60))
+
+
+@pytest.fixture(scope="session")
+def enough_presses(once: Once) -> Path:
+    """The same with enough presses to learn health from."""
+    return once("enough presses and their model", lambda folder: make_model(folder, 360))
 
 
 @pytest.fixture(scope="session")
 def deep_presses(once: Once) -> Path:
+    """The same with presses of several depths and a localizer of depth and force."""
     return once("deep presses and their model", make_deep_presses)
-
-
-@pytest.fixture
-def deep(padforge_sense: Run, deep_presses: Path) -> Run:
-    """As `few`, with presses of several depths and a localizer of depth and force."""
-    shutil.copytree(deep_presses, Path(), dirs_exist_ok=True)
-    return padforge_sense
 
 
 @pytest.fixture
@@ -113,27 +127,3 @@ def calibrate_once(monkeypatch: pytest.MonkeyPatch) -> None:
         return trained[0]
 
     monkeypatch.setattr("padforge.sense.report.calibration.calibrate", calibrate_at_first)
-
-
-@pytest.fixture(scope="session")
-def few_presses(once: Once) -> Path:
-    return once("few presses and their model", lambda folder: make_model(folder, 60))
-
-
-@pytest.fixture(scope="session")
-def enough_presses(once: Once) -> Path:
-    return once("enough presses and their model", lambda folder: make_model(folder, 360))
-
-
-@pytest.fixture
-def few(padforge_sense: Run, few_presses: Path) -> Run:
-    """As `padforge_sense`, in a folder with `rec` of 60 presses and `model`."""
-    shutil.copytree(few_presses, Path(), dirs_exist_ok=True)
-    return padforge_sense
-
-
-@pytest.fixture
-def enough(padforge_sense: Run, enough_presses: Path) -> Run:
-    """As `few`, with enough presses to learn health from."""
-    shutil.copytree(enough_presses, Path(), dirs_exist_ok=True)
-    return padforge_sense

@@ -1,6 +1,4 @@
 import json
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -50,19 +48,3 @@ def test_calibrate_replaces_a_model_in_use_only_by_force_and_leaves_parts_out(fe
     assert (code, json.loads(out)["by_moment"]) == (0, [])
     left = {"localizer.json", "localizer.safetensors", "calibration.json", "fibre_loss.json", "pad.toml"}
     assert files_in(".").keys() == left
-
-
-def test_interrupted_calibrate_leaves_no_file(few, monkeypatch: pytest.MonkeyPatch) -> None:
-    @contextmanager
-    def progress_bar(name: str) -> Iterator[object]:
-        def interrupt(done: int, total: int, what: str) -> None:
-            assert name == "training"
-            raise KeyboardInterrupt
-
-        yield interrupt
-
-    monkeypatch.setattr("padforge.common.command_line.progress_bar", progress_bar)
-    code, _, err = few("calibrate", "rec", "--out", "new")
-    assert code == 130
-    assert "interrupted" in err
-    assert not Path("new").exists()

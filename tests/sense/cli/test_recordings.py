@@ -9,7 +9,7 @@ import pytest
 import scipy.io
 
 from padforge.common.validation import InputError
-from padforge.sense import Recording, export_csv, export_hdf5
+from padforge.sense import Recording, export_csv
 from padforge.sense.cli import options
 
 
@@ -34,14 +34,6 @@ def test_import_notes_a_cut_end(padforge_sense, recording: Recording) -> None:
     assert Recording.open("out/cut/recording").source["note"] in note
     assert padforge_sense("export", "cut.mat", "cut.csv")[2] == note
     assert padforge_sense("export", "out/cut/recording", "again.csv")[2] == ""
-
-
-def test_note_of_a_file_is_one_line(padforge_sense, recording: Recording) -> None:
-    noted = replace(recording, source={"note": "whole\x1b[1A\x1b[2K\nall fibres sound"})
-    export_hdf5(noted, "noted.h5")
-    line = r"noted.h5: whole\x1b[1A\x1b[2K\nall fibres sound" + "\n"
-    assert padforge_sense("import", "noted.h5")[2] == line
-    assert padforge_sense("export", "noted.h5", "noted.csv")[2] == line
 
 
 def test_recording_line_counts_what_is_unknown_and_missing() -> None:

@@ -9,9 +9,6 @@ from padforge.design.settings import PadSettings
 from padforge.sense.recording.press_plan import PressPlan, make_plan, read_plan
 from padforge.sense.settings import RigSettings
 
-KEEP_OUT = ((2.0, -6.0), (9.0, -6.0), (9.0, 6.0), (2.0, 6.0))
-KINDS = ("uniform", "grid", "serpentine", "adaptive")
-
 
 def plan_of(size: PadSettings | None = None, **settings: object) -> PressPlan:
     pad = Morphology.straight(4 if size is None else size.layout)
@@ -40,22 +37,6 @@ def test_make_plan_of_grids_row_by_row():
     uniform = plan_of(presses=2000).positions_mm
     assert np.abs(uniform).max() > 22.4
     np.testing.assert_allclose(uniform.mean(axis=0), 0, atol=1.5)
-
-
-@pytest.mark.parametrize("kind", KINDS)
-def test_make_plan_avoids_keep_outs_of_a_rectangle(kind: str) -> None:
-    size = PadSettings(horizontals=3, verticals=2, pitch_mm=(8.0, 15.0), keep_out_mm=(KEEP_OUT,))
-
-    def in_keep_out(plan: PressPlan) -> np.ndarray:
-        low, high = np.array(KEEP_OUT).min(axis=0), np.array(KEEP_OUT).max(axis=0)
-        return ((plan.positions_mm > low) & (plan.positions_mm < high)).all(axis=1)
-
-    plan = plan_of(size, presses=300, plan=kind)
-    assert len(plan) == 300
-    assert not in_keep_out(plan).any()
-    # half a pitch beyond the outermost of 2 verticals, 8 mm apart, and of 3 horizontals, 15 mm apart
-    np.testing.assert_allclose(np.abs(plan.positions_mm).max(axis=0), [8.0, 22.5], rtol=0.05)
-    assert in_keep_out(plan_of(size.model_copy(update={"keep_out_mm": ()}), presses=300, plan=kind)).any()
 
 
 @pytest.mark.parametrize("counts", [(3, 6), (9, 1)])

@@ -4,6 +4,7 @@ from collections.abc import Callable
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from typing import Any
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -41,7 +42,7 @@ class Time:
 
     def of_all(self) -> AbstractContextManager[None]:
         """In its body all of a rig goes by this clock."""
-        return clock.replaced(self, self.sleep)
+        return mock.patch.multiple(clock, now=self, sleep=self.sleep)
 
 
 @dataclass

@@ -13,11 +13,9 @@ import numpy as np
 import pytest
 from numpy.typing import ArrayLike
 
-from padforge.common.validation import InputError
 from padforge.design import Contact, Morphology
 from padforge.design.settings import PadSettings
 from padforge.sense import Recording
-from padforge.sense.localizer.calibration import calibrate
 from padforge.sense.recording.run_directory import read_journal
 from padforge.sense.rig import by_hand
 from padforge.sense.rig.by_hand import (
@@ -39,7 +37,6 @@ from padforge.sense.settings import RigSettings
 from padforge.sense.signals.press_detection import PressDetector, PressEvent
 from tests.emulators.finger import SCATTER_MM, Finger
 from tests.helpers.page_names import names_in_view
-from tests.sense.conftest import QUICK, few_moments
 from tests.sense.rig.fakes import FingerBoard, Time
 
 
@@ -57,10 +54,7 @@ def test_plan_targets_orders_uniform_ones_in_short_rounds() -> None:
         assert (np.ptp(positions[first : first + ROUND], axis=0) > 0.6 * 45).all()
 
 
-def test_plan_targets_keeps_the_order_of_a_grid_or_file(tmp_path: Path) -> None:
-    grid = plan_targets(config_of(presses=9, plan="serpentine"))
-    assert (np.diff(grid[:3, 0]) > 0).all()
-    assert (np.diff(grid[3:6, 0]) < 0).all()
+def test_plan_targets_keeps_the_order_of_a_file(tmp_path: Path) -> None:
     (tmp_path / "places.csv").write_text("x_mm,y_mm\n3.25,-1\n0,2\n3.25,-1\n")
     assert plan_targets(config_of(plan=str(tmp_path / "places.csv"))).tolist() == [[3.25, -1], [0, 2], [3.25, -1]]
 
@@ -89,10 +83,10 @@ IDENTITY = {"name": "virtual", "channels": 2 * HAND_PAD.grid, "rate_hz": HAND_RI
 class Hands:
     """Records by hand, again and again, with one finger on one pad; keeps the views, and the outcomes in order."""
 
-    def __init__(self, folder: Path, finger: type[Finger] = Finger, mishaps: float = 0.0, **settings: Any) -> None:
+    def __init__(self, folder: Path, mishaps: float = 0.0, **settings: Any) -> None:
         rig = HAND_RIG.model_copy(update=settings)
         self.out, self.clock = folder / "hand", Time(least_s=0.025)
-        self.finger = finger(HAND_PAD, Contact(), rig, rig.board_rate_hz, mishaps=mishaps)
+        self.finger = Finger(HAND_PAD, Contact(), rig, rig.board_rate_hz, mishaps=mishaps)
         self.config = RigConfig(HAND_PAD, Contact(), rig, self.out, "test")
         self.targets = plan_targets(self.config)
         self.messages: list[str] = []
@@ -123,18 +117,6 @@ class Hands:
         times_s = recording.times_s[recording.down_command]
         return [self.finger.strokes[int(np.argmin(np.abs(downs - time_s)))] for time_s in times_s]
 
-    def interrupt(self, done: int, phase: str) -> None:
-        """Record until Ctrl-C after so many presses in that phase; half a minute later nothing touches the pad."""
-
-        def watch(view: dict) -> None:
-            if (view["done"], view["phase"]) == (done, phase):
-                raise KeyboardInterrupt
-
-        with pytest.raises(KeyboardInterrupt):
-            self.record(watch=watch)
-        self.finger.look({"phase": "settle"})
-        self.clock.sleep(30)
-
 
 @pytest.fixture
 def hands(tmp_path: Path) -> Callable[..., Hands]:
@@ -151,15 +133,10 @@ def distances_mm(recording: Recording, strokes: np.ndarray) -> list[float]:
     return [float(np.linalg.norm(stroke.position_mm - place)) for stroke, place in made]
 
 
-@pytest.fixture(scope="module")
-def clumsy(tmp_path_factory: pytest.TempPathFactory) -> tuple[Hands, Recording]:
-    """A recording in which three presses of ten go wrong."""
-    hand = Hands(tmp_path_factory.mktemp("hand"), mishaps=0.3, presses=40)
-    return hand, hand.record()
-
-
-def test_session_accepts_every_target_once_and_rejects_mishaps(clumsy: tuple[Hands, Recording]) -> None:
-    hand, recording = clumsy
+def test_session_accepts_every_target_once_and_rejects_mishaps(hands) -> None:
+    """Three presses of ten go wrong."""
+    hand = hands(mishaps=0.3, presses=40)
+    recording = hand.record()
     np.testing.assert_array_equal(accepted_mm(recording), hand.targets)
     strokes = np.array(hand.strokes_of(recording))
     rejected, accepted = (
@@ -175,21 +152,6 @@ def test_session_accepts_every_target_once_and_rejects_mishaps(clumsy: tuple[Han
     assert held_s.min() > 0.45
     last = [{"x_mm": x, "y_mm": y} for x, y in hand.targets[-12:].tolist()]
     assert hand.views[-1]["presses"] == last
-
-
-def test_swings_are_towards_the_response(clumsy: tuple[Hands, Recording]) -> None:
-    """Of the press that the view shows as held the longest; the share is of the largest response, that is kept."""
-    hand, recording = clumsy
-    view = max(
-        (view for view in hand.views if view["phase"] == "hold"), key=lambda view: (view["progress"], view["done"])
-    )
-    press = np.flatnonzero(recording.has_position)[view["done"]]
-    down, up = int(recording.down_command[press]), int(recording.up_command[press])
-    response = recording.readings[up - 3 : up].mean(axis=0) - recording.readings[down - 8 : down].mean(axis=0)
-    swings = np.array([fibre["swing"] for fibre in view["fibres"]])
-    assert np.corrcoef(swings, response)[0, 1] > 0.95
-    assert 0.1 < np.abs(swings).max() < 2
-    assert hand.views[-1]["done"] == hand.views[-1]["total"] == 40
     assert names_in_view("hand.html") <= (pad_view(HAND_PAD, "hand") | hand.views[-1]).keys()
 
 
@@ -248,22 +210,28 @@ def test_session_tells_what_to_do_and_keeps_what_was_done(hands, golden) -> None
     np.testing.assert_array_equal(np.sort(accepted_mm(Recording.open(hand.out)), axis=0), np.sort(hand.targets, axis=0))
 
 
-def test_session_quits_and_never_overwrites(hands) -> None:
+def test_session_quits(hands) -> None:
     hand = hands()
     recording = hand.record(commands=lambda: ["quit"] if len(hand.messages) == 3 else [])
     assert len(accepted_mm(recording)) == 3
-    with pytest.raises(InputError, match="never written over"):
-        hand.record()
 
 
 @pytest.mark.parametrize(("phase", "killed"), [("wait", False), ("hold", True)])
 def test_session_resumes(hands, monkeypatch, phase: str, killed: bool) -> None:
     """A press that was under way is none; after a kill nothing tells the journal of it."""
     hand = hands(presses=5)
+
+    def watch(view: dict) -> None:
+        if (view["done"], view["phase"]) == (3, phase):
+            raise KeyboardInterrupt
+
     with monkeypatch.context() as patched:
         if killed:
             patched.setattr(by_hand.Recorder, "abort", lambda self, reason: None)
-        hand.interrupt(3, phase)
+        with pytest.raises(KeyboardInterrupt):
+            hand.record(watch=watch)
+    hand.finger.look({"phase": "settle"})
+    hand.clock.sleep(30)  # nothing touches the pad any more
     assert len(read_journal(hand.out / "journal.ndjson")) == 3
     before = Recording.open(hand.out)
     np.testing.assert_array_equal(before.presses_mm, hand.targets[:3])
@@ -286,24 +254,6 @@ def test_session_raises_a_full_disk(hands, monkeypatch: pytest.MonkeyPatch) -> N
     assert fault.value.cause == "disk"
 
 
-class Resting(Finger):
-    """Leaves the hand on the pad at its third press, for long."""
-
-    def _touch(self, time_s: float) -> tuple[np.ndarray, float]:
-        place, depth = super()._touch(time_s)
-        if len(self.strokes) == 3 and self.strokes[2].up_s < np.inf:
-            self.strokes[2].up_s = self.strokes[2].down_s + 10.0
-        return place, depth
-
-
-def test_session_asks_a_resting_hand_to_lift(hands) -> None:
-    hand = hands(finger=Resting, presses=4)
-    recording = hand.record()
-    np.testing.assert_array_equal(accepted_mm(recording), hand.targets)
-    assert [why for why in hand.messages if "held for" in why and "lift after 0.6 s" in why]
-    assert any(view["prompt"].startswith("lift; if nothing") for view in hand.views)
-
-
 BASELINE = np.array([2.0, 1.8, 1.9])
 PRESS = np.array([0.1, -0.2, 0.2])
 
@@ -319,8 +269,7 @@ def press(sequence: PressSequence, down_s: float, up_s: float) -> str:
     return sequence.release(up_s)
 
 
-def test_sequence_goes_through_all_phases(sequence: PressSequence) -> None:
-    assert [sequence.phase(time_s) for time_s in (98.5, 100.0)] == ["settle", "press"]
+def test_sequence_holds_waits_and_ends(sequence: PressSequence) -> None:
     assert sequence.touch(100.5) == (1.0, 2.0)
     assert [sequence.phase(time_s) for time_s in (101.4, 101.5)] == ["hold", "lift"]
     assert sequence.progress(101.0) == pytest.approx(0.5)
@@ -328,10 +277,7 @@ def test_sequence_goes_through_all_phases(sequence: PressSequence) -> None:
     sequence.accept(101.8)
     assert (sequence.accepted_mm, sequence.target) == ([(1.0, 2.0)], (3.0, 4.0))
     assert [sequence.phase(time_s) for time_s in (102.6, 102.7)] == ["wait", "press"]
-    assert press(sequence, 106.0, 107.0) == ""
-    sequence.accept(107.1)
-    assert [sequence.phase(time_s) for time_s in (107.9, 108.0)] == ["wait", "done"]
-    sequence.skip(108.1)
+    sequence.skip(103.0)
     assert press(sequence, 110.0, 111.0) == "it came before it was asked for"
 
 
@@ -406,14 +352,6 @@ def test_validator_follows_the_drift_of_the_baseline(validator: PressValidator) 
     assert validator.is_touched(BASELINE) is True
     validator.reset_baseline()
     assert validator.is_touched(BASELINE) is None
-
-
-def test_calibrate_learns_from_a_recording_by_hand(clumsy: tuple[Hands, Recording]) -> None:
-    hand, recording = clumsy
-    with few_moments():
-        _, evaluation = calibrate(recording, QUICK.model_copy(update={"members": 1, "epochs": 6}))
-    scale_mm = np.linalg.norm(hand.targets - hand.targets.mean(axis=0), axis=1).mean()
-    assert evaluation.errors[0]["mean_mm"] < 0.4 * scale_mm
 
 
 def test_presses_are_held_for_half_a_cycle_at_the_rate_of_the_board(monkeypatch: pytest.MonkeyPatch, tmp_path) -> None:

@@ -17,10 +17,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from padforge.design.settings import PUBLISHED_CONTACT
-from padforge.sense.recording.block_file import read_blocks
 from padforge.sense.recording.press_plan import PressPlan
 from padforge.sense.recording.recording import Recording
-from padforge.sense.recording.run_directory import STATE_COLUMNS, Recorder, read_journal
+from padforge.sense.recording.run_directory import Recorder, read_journal
 from padforge.sense.rig import operation
 from padforge.sense.rig.arms.ur5 import UR5
 from padforge.sense.rig.config import RigConfig
@@ -76,14 +75,6 @@ def test_run_records_every_press(tmp_path):
     journal = [json.loads(line) for line in (tmp_path / "run" / "journal.ndjson").read_text().splitlines()]
     reached = np.array([event["at_mm"] for event in journal if event["event"] == "done"])
     assert reached == pytest.approx(np.column_stack([PLAN.positions_mm, PLAN.depths_mm]), abs=0.1)
-
-
-def test_run_leaves_a_gap_for_lost_samples(tmp_path):
-    arm, board, options = rig()
-    arm.hook = lambda arm: setattr(board, "lose", 35 if 101.0 < arm.time() < 101.05 else 0)
-    run(tmp_path / "run", arm, board, options)
-    assert 0.02 < np.diff(Recording.open(tmp_path / "run").times_s).max() < 0.06
-    assert "lost" in (tmp_path / "run" / "journal.ndjson").read_text()
 
 
 def test_press_begins_with_the_first_reading_after_the_command(tmp_path):
@@ -234,102 +225,62 @@ def test_run_stops_and_retreats_and_says_whether_the_tool_stays_on_the_pad(tmp_p
     golden("rig/faults.txt", "\n".join(reports))
 
 
-def test_run_loses_nothing_on_a_full_disk(tmp_path):
-    arm, board, options = rig()
-    with open_run(tmp_path / "run") as recorder:
+def run_on_disk(path, arm, board, disturb, **more):
+    """Record on a disk that is disturbed each time before it synchronises."""
+    with open_run(path) as recorder:
         sync = recorder.sync
 
-        def full():
-            if len(recorder.done) >= 3:
-                raise OSError(28, "No space left on device")
+        def disturbed():
+            disturb(recorder)
             sync()
 
-        recorder.sync = full
-        with pytest.raises(RigFault, match="No space left") as fault:
-            press(arm, board, recorder, options)
-        recorder.sync = sync
+        recorder.sync = disturbed
+        try:
+            press(arm, board, recorder, RIG, FOUR, **more)
+        finally:
+            recorder.sync = sync
+
+
+def test_run_loses_nothing_on_a_full_disk(tmp_path):
+    def fill(recorder):
+        if len(recorder.done) >= 3:
+            raise OSError(28, "No space left on device")
+
+    arm, board, _ = rig()
+    with pytest.raises(RigFault, match="No space left") as fault:
+        run_on_disk(tmp_path / "run", arm, board, fill)
     assert fault.value.cause == "disk"
     assert arm.stops >= 1
     assert n_done(tmp_path / "run") >= 2
 
 
 def test_run_begins_no_press_before_the_last_one_is_on_the_disk(tmp_path):
-    arm, board, options = rig()
+    arm, board, _ = rig()
     progress = []
-    with open_run(tmp_path / "run") as recorder:
-        sync = recorder.sync
 
-        def slow():
-            time.sleep(0.02)
-            sync()
+    def note(done, total, what):
+        progress.append((done, n_done(tmp_path / "run"), len(arm.moves)))
 
-        recorder.sync = slow
-        press(
-            arm,
-            board,
-            recorder,
-            options,
-            FOUR,
-            on_progress=lambda done, total, what: progress.append((done, n_done(tmp_path / "run"), len(arm.moves))),
-        )
+    run_on_disk(tmp_path / "run", arm, board, lambda recorder: time.sleep(0.02), on_progress=note)
     assert progress == [(done, done, 3 * done) for done in range(1, 5)]
 
 
 def test_run_raises_a_disk_that_hangs(tmp_path):
-    arm, board, options = rig()
+    arm, board, _ = rig()
     resume = threading.Event()
-    with open_run(tmp_path / "run") as recorder:
-        sync = recorder.sync
 
-        def hangs():
-            resume.wait(20)
-            sync()
+    def hook(arm):
+        if len(arm.moves) >= 3 and arm.pose[2] == 60:
+            arm.time.sleep(1.0)
+            board.read()
+        if arm.stops:
+            resume.set()
 
-        def hook(arm):
-            if len(arm.moves) >= 3 and arm.pose[2] == 60:
-                arm.time.sleep(1.0)
-                board.read()
-            if arm.stops:
-                resume.set()
-
-        recorder.sync, arm.hook = hangs, hook
-        with pytest.raises(RigFault, match="the disk took more than 30 s") as fault:
-            press(arm, board, recorder, options)
+    arm.hook = hook
+    with pytest.raises(RigFault, match="the disk took more than 30 s") as fault:
+        run_on_disk(tmp_path / "run", arm, board, lambda recorder: resume.wait(20))
     assert fault.value.cause == "disk"
     assert len(arm.moves) == 3
-
-
-def test_run_waits_for_a_press_alone_on_a_disk_that_never_rests(tmp_path):
-    """What is recorded while a press is awaited takes the disk until there is more of it."""
-    arm, board, options = rig()
-    drain, more, over = arm.drain, threading.Semaphore(0), threading.Event()
-
-    def counted_drain():
-        if len(arm.moves) == 3 and arm.pose[2] > 50:
-            if over.is_set():
-                more.release()
-            over.set()  # the only press is
-            arm.time.sleep(0.1)
-        return drain()
-
-    with open_run(tmp_path / "run") as recorder:
-        append_states = recorder.append_states
-
-        def slow(rows):
-            if over.is_set():
-                more.acquire(timeout=0.5)
-            append_states(rows)
-
-        arm.drain, recorder.append_states = counted_drain, slow
-        press(
-            arm,
-            board,
-            recorder,
-            options,
-            PressPlan(PLAN.positions_mm[:1], PLAN.depths_mm[:1]),
-            on_progress=lambda *progress: more.release(1000),
-        )
-    assert n_done(tmp_path / "run") == 1
 
 
 def test_resumed_run_drops_what_came_while_it_connected(tmp_path):
@@ -341,37 +292,6 @@ def test_resumed_run_drops_what_came_while_it_connected(tmp_path):
     recording = Recording.open(tmp_path / "run")
     assert recording.times_s[0] < 0.05
     assert np.sort(np.diff(recording.times_s))[-2:] == pytest.approx([0.01, 1.01], abs=0.02)
-
-
-def test_run_keeps_what_each_press_reached(tmp_path):
-    """As the states on the disk have it: where the tip stood at the end, and the median of the force at rest.
-
-    The arm stands beside where it was sent, and the force has spikes, so that its mean is above its median.
-    """
-    arm, board, options = rig(pad_angle_deg=30.0, press_mm_s=400.0)
-    move = arm.move
-
-    def beside(pose, speed_mm_s, acceleration_mm_s2):
-        move((pose[0] + 0.01234, pose[1], pose[2] + 0.03456, *pose[3:]), speed_mm_s, acceleration_mm_s2)
-
-    arm.move = beside
-    arm.hook = lambda arm: setattr(arm, "force_n", -min(50 - arm.pose[2], 4.5) * (1 + (7 * arm.time() % 1) ** 6))
-    run(tmp_path / "run", arm, board, options, PressPlan(PLAN.positions_mm[:2], np.array([4.0, 5.0])))
-    recording = Recording.open(tmp_path / "run")
-    _, states = read_blocks(tmp_path / "run" / "states.bin", len(STATE_COLUMNS) - 1)
-    journal = [json.loads(line) for line in (tmp_path / "run" / "journal.ndjson").read_text().splitlines()]
-    for press, done in enumerate(event for event in journal if event["event"] == "done"):
-        x, y, z, *_, force_n, _ = states[np.abs(states[:, 2] - 50.03456 + recording.depths_mm[press]) < 1e-6].T
-        turned = ((x[-1] + 1j * (y[-1] + 400)) * np.exp(-1j * np.pi / 6)).round(4)
-        assert done["at_mm"] == [turned.real, turned.imag, round(50 - z[-1], 4)]
-        n = len(force_n)  # but for those until the arm is known to rest, and one as it is sent up
-        assert done["force_n"] in [np.median(np.abs(force_n[a:b])) for a in (0, 1, 2) for b in (n - 1, n)]
-        assert abs(np.abs(force_n).mean() - done["force_n"]) > 0.05
-    assert recording.depths_mm.tolist() == [4.0, 5.0]
-    arm, board, options = rig(max_force_n=None)
-    arm.force_n = None  # no sensor
-    run(tmp_path / "without", arm, board, options, PressPlan(PLAN.positions_mm[:1], np.array([4.0])))
-    assert np.isnan(Recording.open(tmp_path / "without").forces_n).all()
 
 
 @settings(max_examples=20)
@@ -472,9 +392,11 @@ def test_record_handles_a_second_ctrl_c_after_the_loop(tmp_path: Path, monkeypat
 
     arm = FakeArm(Time())
     monkeypatch.setattr(operation, "PressLoop", InterruptedLoop)
+    monkeypatch.setattr(operation, "load_device", lambda group, name: lambda rig: arm)
+    monkeypatch.setattr(operation, "make_board", lambda rig, inputs: FakeBoard(arm))
     config = RigConfig(PAD, PUBLISHED_CONTACT, RIG, tmp_path / "run", "test")
     with pytest.raises(KeyboardInterrupt):
-        operation.record(config, contextlib.nullcontext((arm, FakeBoard(arm), RIG)))
+        operation.record("ur5", config)
     assert received == [signal.SIGINT] * 2
 
 

@@ -230,7 +230,7 @@ def test_recordings_are_not_resumed_in_these_words(golden, tmp_path: Path) -> No
     with recorder:
         pass
     broken.mkdir()
-    (broken / START).write_text(json.dumps({"format": FORMAT, "fibres": 4, "source": {"plan": 5}}))
+    (broken / START).write_text(json.dumps({"format": FORMAT, "fibres": 4, "source": {"kind": "arrays"}}))
 
     def resumed(out: Path = run, pad: Morphology = PAD, **settings: Any) -> Callable[[], object]:
         other = replace(config, out=out, pad=pad)
@@ -278,4 +278,4 @@ def test_recordings_are_not_resumed_in_these_words(golden, tmp_path: Path) -> No
     assert plan_notice(replace(config, rig=rig(seed=9, presses=30))) == (
         f"{run}: goes on by the plan it was begun with, [rig] presses = 6, seed = 0"
     )
-    assert plan_notice(config) == plan_notice(replace(config, out=tmp_path / "new")) == ""
+    assert plan_notice(config) == ""

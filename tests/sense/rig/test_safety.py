@@ -38,66 +38,28 @@ SAFE: Pose = (0.0, -400.0, 60.0, 0.0, math.pi, 0.0)
 X, Y, Z, *TOOL = SAFE
 STILL = ArmState(10.0, SAFE, 0.0, 0.0, False, False, moving=False)
 numbers = st.floats(allow_nan=True, allow_infinity=True)
-inside = st.tuples(st.floats(-100, 100), st.floats(-500, -300), st.floats(44, 120))
-
-
-def refusal(pose: object, speed: float = 50.0, acceleration: float = 500.0, limits: Limits = LIMITS) -> str:
-    """Why a target is refused, one line."""
-    with pytest.raises(RigFault) as caught:
-        check_target(pose, speed, acceleration, limits)  # pyright: ignore[reportArgumentType]
-    assert caught.value.cause == "refused"
-    assert "\n" not in str(caught.value)
-    return str(caught.value)
-
-
-def tilted(degrees: float) -> tuple[float, float, float]:
-    return 0.0, math.pi - math.radians(degrees), 0.0
-
-
-@given(inside, st.floats(0.1, 250), st.floats(1, 1200))
-def test_check_target_passes_inside(position: tuple[float, float, float], speed: float, acceleration: float) -> None:
-    check_target((*position, *TOOL), speed, acceleration, LIMITS)
 
 
 @given(st.lists(numbers, max_size=8), numbers.filter(lambda value: not 0 < value <= 250))
 def test_check_target_passes_only_within_every_limit(pose: list[float], speed: float) -> None:
     with contextlib.suppress(RigFault):
-        check_target(pose, 50, 500, LIMITS)
+        check_target(pose, 50, 500, LIMITS)  # pyright: ignore[reportArgumentType]
         assert len(pose) == 6
         assert all(low <= value <= high for value, (low, high) in zip(pose[:3], LIMITS.box_mm, strict=True))
         assert 50 - pose[2] <= 6
         assert tilt_deg(pose[3:], LIMITS.tool) <= MAX_TILT_DEG
-    assert "speed" in refusal(SAFE, speed)
+    with pytest.raises(RigFault, match="speed"):
+        check_target(SAFE, speed, 500, LIMITS)
 
 
-def test_check_target_on_the_limits_and_without_a_surface() -> None:
+def test_check_target_passes_on_the_limits() -> None:
+    """What lies beyond them is in the table of refusals."""
     for position in ((-100, Y, Z), (100, Y, Z), (X, -500, Z), (X, -300, Z), (X, Y, 44), (X, Y, 120)):
         check_target((*position, *TOOL), 250, 1200, LIMITS)
-    for position in ((-100.1, Y, Z), (100.1, Y, Z), (X, -500.1, Z), (X, -299.9, Z), (X, Y, 43.9), (X, Y, 120.1)):
-        assert "; allowed" in refusal((*position, *TOOL))
-    for speed, acceleration in ((250.1, 500), (50, 1200.1), (50, 0)):
-        assert "; allowed" in refusal(SAFE, speed, acceleration)
-    for pose in (SAFE[:5], (*SAFE[:5], -math.inf)):
-        assert "; allowed" in refusal(pose)
-    check_target((X, Y, Z, *tilted(1.99)), 50, 500, LIMITS)
-    assert "tilted" in refusal((X, Y, Z, *tilted(2.01)))
-    assert "surface unknown" in refusal(SAFE, limits=replace(LIMITS, contact_mm=None))
-
-
-@pytest.mark.parametrize(
-    "change",
-    [
-        {"box_mm": ((0, 0), (0, 1), (0, 1))},
-        {"max_depth_mm": 0.0},
-        {"deadline_s": math.nan},
-        {"contact_mm": math.nan},
-        {"tool": (0.0, math.pi * 0.94, 0.0)},
-    ],
-)
-def test_limits_that_limit_nothing_are_refused(change: dict[str, object]) -> None:
-    with pytest.raises(ValueError, match=next(iter(change)).split("_")[0]):
-        replace(LIMITS, **change)  # pyright: ignore[reportArgumentType]
+    check_target((X, Y, Z, 0.0, math.pi - math.radians(1.99), 0.0), 50, 500, LIMITS)
     replace(LIMITS, tool=(0.0, math.pi * 0.95, 0.0))
+    with pytest.raises(ValueError, match="points the tool down"):
+        replace(LIMITS, tool=(0.0, math.pi * 0.94, 0.0))
 
 
 def test_limits_from_settings() -> None:
@@ -152,20 +114,16 @@ def test_check_tcp_compares_with_the_controller() -> None:
         ({"time_s": 9.51}, None),
         ({"force_n": -39.9}, None),
         ({"pose": (900.0, 900.0, 44.0 - 0.29, *TOOL)}, None),
-        ({"force_n": 40.1}, "force"),
-        ({"force_n": -40.1}, "force"),
-        ({"force_n": 30.0, "sideways_n": 27.0}, "force"),
         ({"force_n": 0.0, "sideways_n": math.nan}, "force"),
         ({"pose": (0.0, -400.0, math.nan, *TOOL)}, "refused"),
     ],
 )
-def test_check_state_raises_the_cause(change: dict[str, object], cause: str | None) -> None:
+def test_check_state_accepts_the_limits_and_no_nan(change: dict[str, object], cause: str | None) -> None:
+    """What lies beyond them is in the table of refusals."""
     state = replace(STILL, **change)  # pyright: ignore[reportArgumentType]
     with pytest.raises(RigFault) if cause else contextlib.nullcontext() as caught:
         check_state(state, LIMITS, 10.0, until_s=10.0)
-    if caught is not None:
-        assert caught.value.cause == cause
-        assert "\n" not in str(caught.value)
+    assert caught is None or caught.value.cause == cause
 
 
 def test_checks_of_an_unwatched_force() -> None:

@@ -10,8 +10,7 @@ import pytest
 from padforge.common.validation import InputError
 from padforge.sense import Recording
 from padforge.sense.recording.run_directory import FORMAT, START
-from padforge.sense.rig.devices import BoardSamples, RigFault
-from padforge.sense.rig.streams import RECORDED, is_pad_mirrored, stream_board, stream_recording
+from padforge.sense.rig.streams import RECORDED, is_pad_mirrored, stream_recording
 from padforge.sense.settings import RigSettings
 from tests.sense.rig.fakes import Time
 
@@ -37,31 +36,6 @@ def test_stream_recording_gives_every_reading_when_it_is_due(brief: Recording, s
     assert max(map(len, blocks)) <= 64
     with pytest.raises(InputError, match="speed is"):
         stream_recording(brief, 0.0)  # it would wait for ever
-
-
-def test_stream_board_averages_to_the_rate(still: Time) -> None:
-    class Ramp:
-        def connect(self) -> dict:
-            return {"channels": 2, "rate_hz": 1000.0}
-
-        def read(self) -> BoardSamples:
-            if still() > 102:
-                raise RigFault("lost", "the board is gone")
-            times_s = np.arange(still(), still() + 0.01, 0.001)[:10]
-            return BoardSamples(times_s, np.stack([times_s, -times_s], axis=1), np.zeros(10, np.int64))
-
-        def close(self) -> None:
-            """Nothing to close."""
-
-    stream = stream_board(Ramp(), 13.4)
-    assert (stream.fibres, stream.rate_hz) == (2, pytest.approx(1000 / 75))
-    blocks = [next(stream.blocks) for _ in range(100)]
-    times_s, readings = (np.concatenate(parts) for parts in zip(*blocks, strict=True))
-    assert len(times_s) == 1000 // 75
-    np.testing.assert_allclose(np.diff(times_s), 0.075)
-    np.testing.assert_allclose(readings, np.stack([times_s, -times_s], axis=1))
-    with pytest.raises(RigFault, match="the board is gone"):
-        list(stream.blocks)
 
 
 @pytest.mark.parametrize(

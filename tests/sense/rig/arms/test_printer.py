@@ -13,11 +13,9 @@ from padforge.sense.rig import clock
 from padforge.sense.rig.arms import printer_link
 from padforge.sense.rig.arms.printer import Printer
 from padforge.sense.rig.arms.printer_link import MarlinLink
-from padforge.sense.rig.boards.line_board import LineHeader
 from padforge.sense.rig.devices import ArmState, RigFault
 from padforge.sense.settings import RigSettings
 from tests.emulators import printer as firmware
-from tests.emulators.boards import EmulatedLineBoard
 from tests.emulators.printer import EmulatedPrinter
 from tests.sense.rig.fakes import fault_of
 
@@ -57,9 +55,7 @@ def to_rest(arm: Printer) -> ArmState:
 def test_moves_keep_to_the_limits_of_the_axes():
     with EmulatedPrinter(AT) as printer, closing(driven(printer)) as arm:
         arm.connect()
-        state = arm.state()
-        assert state.pose == pytest.approx(pose(110, 110, 40))
-        assert (state.moving, state.force_n) == (False, None)
+        assert (arm.state().pose, arm.state().force_n) == (pytest.approx(pose(110, 110, 40)), None)
         arm.move(pose(110, 110, 38), 200.0, 50.0)
         to_rest(arm)
         move = printer.firmware.moves[-1].move
@@ -263,14 +259,6 @@ def test_handshake_refuses_silent_and_restarting_printer():
             fault_of(lambda: link.handshake(2.0), "refused", "restarted")
         with closing(MarlinLink(printer.port, BAUD)) as link:
             link.handshake(2.0)
-
-
-@pytest.mark.slow
-def test_handshake_refuses_endless_talker():
-    """As where the port is that of the board that reads the fibres."""
-    board = EmulatedLineBoard(lambda times_s: np.zeros((len(times_s), 4)), LineHeader(1000, 12, 3.3, 4))
-    with board, closing(MarlinLink(board.port, BAUD)) as link:
-        assert fault_of(lambda: link.handshake(0.5), "refused", "no printer answers") < 5
 
 
 M115 = ["FIRMWARE_NAME:Marlin 2.1.2 (Nov 22 2023 12:00:00) SOURCE_CODE_URL:github.com MACHINE_TYPE:Ender-3 Pro UUID:0"]

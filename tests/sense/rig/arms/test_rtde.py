@@ -1,7 +1,7 @@
-"""What comes over the wires of the arm: frames in any portions, states that are none, and times on the host's clock."""
+"""What comes over the wires of the arm: states, states that are none, and times on the host's clock."""
 
+import io
 import struct
-from itertools import chain, repeat
 from unittest import mock
 
 import numpy as np
@@ -15,16 +15,6 @@ from padforge.sense.rig.arms.rtde import VARIABLES, HostClock, RtdeReader
 TYPES = list(VARIABLES.values())
 VALUES = (1.0, *np.linspace(-0.5, 0.5, 6), 0.3, 0.0, 0.4, 0.0, 0.0, 0.0, 6.0, 8.0, -25.0, 0.0, 0.0, 0.0, 7, 1, 1, 5)
 """Of a state: stamp, pose, speed, force, mode, runtime, safety and progress."""
-
-
-@settings(max_examples=20)
-@given(st.lists(st.tuples(st.integers(0, 255), st.binary(max_size=40)), max_size=8), st.integers(1, 20))
-def test_splitter_returns_frames_in_any_portions(sent: list[tuple[int, bytes]], size: int) -> None:
-    splitter, stream = rtde.FrameSplitter(), b"".join(rtde.pack_frame(*frame) for frame in sent)
-    portions = [stream[at : at + size] for at in range(0, len(stream), size)]
-    assert [frame for portion in portions for frame in splitter.split(portion)] == sent
-    with pytest.raises(ValueError, match="2 bytes"):
-        list(rtde.FrameSplitter().split(b"\x00\x02U"))
 
 
 @settings(max_examples=15)
@@ -53,7 +43,7 @@ def stream(*states: bytes, major: int = 5, version: bytes = b"\x01", types: list
 
 def reader(sent: list[bytes]) -> RtdeReader:
     """One that connects to a controller which sends that, frame by frame, and then no more."""
-    link = mock.Mock(recv=mock.Mock(side_effect=chain(sent, repeat(b""))))
+    link = mock.Mock(makefile=lambda mode: io.BytesIO(b"".join(sent)))
     with mock.patch("socket.create_connection", return_value=link):
         return RtdeReader("arm", 1.0)
 
@@ -62,9 +52,10 @@ def test_reader_converts_state() -> None:
     link = reader(stream(state(*VALUES)))
     first = link.read(1.0)
     assert (link.version, link.rate_hz) == ((5, 11, 0, 0), 500)
-    assert first.pose == pytest.approx(VALUES[1:7])
-    assert (first.speed, first.force_n, first.sideways_n) == pytest.approx((0.5, -25.0, 10.0))
-    assert (first.mode, first.runtime, first.safety, first.progress) == (7, 1, 1, 5)
+    assert first.pose == pytest.approx([*(1000 * np.array(VALUES[1:4])), *VALUES[4:7]])
+    assert (first.speed_mm_s, first.force_n, first.sideways_n) == pytest.approx((500, -25.0, 10.0))
+    assert (first.mode, first.runtime, first.progress) == (7, 1, 5)
+    assert (first.protective_stop, first.emergency_stop) == (False, False)
     without = reader(stream(state(*VALUES), major=3)).read(1.0)
     assert (without.force_n, without.sideways_n) == (None, 0)
 
@@ -76,9 +67,10 @@ def test_reader_converts_state() -> None:
         (stream(types=["NOT_FOUND", *TYPES[1:]]), "the controller has no timestamp"),
         (stream(types=TYPES[::-1]), "the controller would send"),
         (stream(rtde.pack_frame(rtde.DATA, b"\x01" + b"x" * 10)), "sent 10 bytes, expected 168"),
+        (stream(b"\x00\x02U"), "a frame of 2 bytes"),
         (stream(state(*VALUES[:15], np.inf, *VALUES[16:])), "NaN"),
     ],
-    ids=range(5),
+    ids=range(6),
 )
 def test_reader_refuses_other_controller_and_impossible_state(sent: list[bytes], match: str) -> None:
     with pytest.raises(ValueError, match=match):

@@ -1,13 +1,15 @@
-"""One program at a time moves an arm."""
+"""One program at a time moves an arm, by ur-rtde: what its library is asked, and when a move is over."""
 
 import sys
+from types import SimpleNamespace
+from unittest.mock import MagicMock, call
 
 import pytest
 
 if sys.platform != "linux":
     pytest.skip("names of local sockets are locks on Linux alone", allow_module_level=True)
 from padforge.sense.rig.arms import rtde_worker
-from padforge.sense.rig.arms.rtde_worker import CommandRejected, lock_arm
+from padforge.sense.rig.arms.rtde_worker import CommandRejected, UrRtdeControl, lock_arm
 
 
 def test_lock_admits_one_program_until_that_ends(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -20,3 +22,59 @@ def test_lock_admits_one_program_until_that_ends(monkeypatch: pytest.MonkeyPatch
     lock.close()
     lock_arm("192.0.2.1").close()
     another.close()
+
+
+UNDER_WAY = 1 << 15
+
+
+def operation(number: int) -> int:
+    """Return ur-rtde's register of moves while the operation of this number is not under way."""
+    return number << 24
+
+
+@pytest.fixture
+def library(monkeypatch: pytest.MonkeyPatch) -> MagicMock:
+    """Its interface to an arm that takes everything."""
+    interface = MagicMock()
+    monkeypatch.setitem(sys.modules, "rtde_control", SimpleNamespace(RTDEControlInterface=lambda host: interface))
+    monkeypatch.setattr(rtde_worker, "version", lambda name: "1.6.0")
+    return interface
+
+
+def test_stops_and_moves_are_asked_of_the_library(library: MagicMock) -> None:
+    control = UrRtdeControl("host")
+    assert control.identity == {"driver": "ur-rtde 1.6.0"}
+    pose = (0.1, 0.2, 0.3, 0.0, 3.0, 0.0)
+    assert control.move(pose, 0.05, 0.5)
+    assert library.moveL.call_args == call(list(pose), 0.05, 0.5, True)  # and returns at once
+    assert control.moving
+    control.stop()
+    assert library.stopL.call_args == call(5.0)  # m/s²: from 0.25 m/s at rest within 50 ms
+    assert not control.moving
+    control.kick()
+    assert library.setWatchdog.call_args == call(4.0)  # Hz: the arm stops 0.25 s after the last kick
+    control.end()
+    assert [each[0] for each in library.method_calls[-2:]] == ["stopL", "stopScript"]
+    library.setWatchdog.return_value = False
+    with pytest.raises(RuntimeError, match="watchdog"):
+        UrRtdeControl("host")
+
+
+def test_a_move_is_over_once_another_operation_has_ended(library: MagicMock) -> None:
+    control = UrRtdeControl("host")
+    control.update(operation(3), False)
+    control.move((0.0,) * 6, 0.05, 0.5)
+    control.update(operation(3), False)  # of the move before
+    assert control.moving
+    control.update(operation(4) | UNDER_WAY, False)
+    assert control.moving
+    control.update(operation(4), False)
+    assert not control.moving
+    control.move((0.0,) * 6, 0.05, 0.5)
+    control.update(operation(4), False)
+    assert control.moving
+    control.update(operation(4), True)  # a protective stop ends any move
+    assert not control.moving
+    library.moveL.return_value = False
+    assert not control.move((0.0,) * 6, 0.05, 0.5)
+    assert not control.moving

@@ -1,48 +1,32 @@
 """Boards that print lines of their own, on pseudo-terminals."""
 
-import os
-import threading
-import tty
-from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing
 from typing import Any
 
 import numpy as np
 import pytest
 
 from padforge.sense.rig import clock
-from padforge.sense.rig.boards import csv_board, line_board
+from padforge.sense.rig.boards import csv_board
 from padforge.sense.rig.boards.csv_board import CsvBoard, parse_numbers
-from padforge.sense.rig.boards.line_board import LineBoard
 from padforge.sense.rig.devices import RigFault
+from tests.emulators.boards import SerialDevice
 
 RATE_HZ = 200.0
 
 
-@contextmanager
-def printing(lines: bytes) -> Iterator[str]:
-    """Print a line at RATE_HZ, with its number in place of %d, after bytes of a start; yield the port."""
-    board, port = os.openpty()
-    tty.setraw(port)
-    done = threading.Event()
+class PrintingBoard(SerialDevice):
+    """It prints lines at RATE_HZ, with their number in place of %d, after bytes of a start."""
 
-    def run() -> None:
-        os.write(board, b"\xff\x80boot\r\nready\r\n")
-        start_s, n = clock.now(), 0
-        while not done.wait(0.002):
-            while clock.now() - start_s > n / RATE_HZ:
-                n += 1
-                os.write(board, lines.replace(b"%d", str(5000 * n).encode()) + b"\r\n")
+    def __init__(self, line: bytes) -> None:
+        super().__init__("board", seed=0)
+        self._line, self._start_s, self._n_lines = line, clock.now(), 0
+        self._out += b"\xff\x80boot\r\nready\r\n"
 
-    thread = threading.Thread(target=run, daemon=True)
-    thread.start()
-    try:
-        yield os.ttyname(port)
-    finally:
-        done.set()
-        thread.join()
-        os.close(board)
-        os.close(port)
+    def _step(self, data: bytes) -> None:
+        while clock.now() - self._start_s > self._n_lines / RATE_HZ:
+            self._n_lines += 1
+            self._out += self._line.replace(b"%d", str(5000 * self._n_lines).encode()) + b"\r\n"
 
 
 @pytest.mark.parametrize(
@@ -62,23 +46,19 @@ def test_parse_numbers(line: bytes, numbers: list[float] | None) -> None:
 def test_csv_board_finds_columns_and_rate(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(csv_board, "_START_S", 0.1)
     monkeypatch.setattr(csv_board, "LISTEN_S", 0.7)
-    with printing(b"%d,502,1.5,500") as port:
-        board = CsvBoard(port, 115200, RATE_HZ, (2, 0), count_v=0.01)
-        try:
+    with PrintingBoard(b"%d,502,1.5,500") as printing:
+        with closing(CsvBoard(printing.port, 115200, RATE_HZ, (2, 0), count_v=0.01)) as board:
             identity = board.connect()
             assert (identity["inputs"], identity["time"]) == ([2, 0], "first column")
             assert identity["rate_hz"] == pytest.approx(RATE_HZ, rel=0.05)
             assert "no header and no check" in identity["warning"]
             clock.sleep(0.2)
             samples = board.read()
-            assert np.allclose(samples.volts, [5.0, 5.02])
-            assert not samples.missing.any()
-            assert np.diff(samples.times_s).mean() == pytest.approx(1 / RATE_HZ, rel=0.1)
-            board.close()
-            with pytest.raises(RigFault, match=r"lines come a second, .rig. says 50; set board_rate_hz = "):
-                CsvBoard(port, 115200, 50).connect()
-        finally:
-            board.close()
+        assert np.allclose(samples.volts, [5.0, 5.02])
+        assert not samples.missing.any()
+        assert np.diff(samples.times_s).mean() == pytest.approx(1 / RATE_HZ, rel=0.1)
+        with pytest.raises(RigFault, match=r"lines come a second, .rig. says 50; set board_rate_hz = "):
+            CsvBoard(printing.port, 115200, 50).connect()
 
 
 class Port:
@@ -101,15 +81,9 @@ def test_csv_board_counts_damaged_lines_that_arrive_alone(monkeypatch: pytest.Mo
     assert blocks == [[[[1, 2]]], [], [], [[[1], [3, 2], [], [5, 6]]], [[[7, 8]]]]
 
 
-def test_line_board_shows_a_line_without_header(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(line_board, "_ANSWER_S", 0.3)
-    with printing(b"502,501") as port, pytest.raises(RigFault, match="it sends lines such as '502,501' without"):
-        LineBoard(port, 115200, RATE_HZ).connect()
-
-
 def test_csv_board_asks_for_more_lines(monkeypatch: pytest.MonkeyPatch) -> None:
     """200 come a second, which is enough but for a minimum that is raised here."""
     for name, value in {"_START_S": 0.1, "LISTEN_S": 0.2, "_MIN_LINES": 100}.items():
         monkeypatch.setattr(csv_board, name, value)
-    with printing(b"502,501") as port, pytest.raises(RigFault, match="numbers alone, 500 lines a second or more"):
-        CsvBoard(port, 115200, RATE_HZ).connect()
+    with PrintingBoard(b"502,501") as printing, pytest.raises(RigFault, match="numbers alone, 500 lines a second"):
+        CsvBoard(printing.port, 115200, RATE_HZ).connect()

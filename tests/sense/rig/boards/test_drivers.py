@@ -5,15 +5,17 @@ import threading
 from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
 from padforge.sense.rig import clock
-from padforge.sense.rig.boards import board_reader, line_board
+from padforge.sense.rig.boards import board_reader, due, line_board
 from padforge.sense.rig.boards.line_board import LineBoard, LineHeader
 from padforge.sense.rig.devices import BoardSamples
+from padforge.sense.settings import RigSettings
 from tests.emulators.boards import EmulatedLineBoard
 from tests.sense.rig.fakes import fault_of
 
@@ -220,3 +222,24 @@ def test_connect_refuses_port_in_use_until_closed() -> None:
         second.connect()
         second.close()
     assert not any(thread.name == f"reader of {board.port}" for thread in threading.enumerate())
+
+
+BUILT_IN = SimpleNamespace(device="/dev/ttyS0", vid=None, pid=None, serial_number=None)
+UNO = SimpleNamespace(device="/dev/ttyACM2", vid=0x2341, pid=0x0043, serial_number="uno")
+PROGRAMMING = SimpleNamespace(device="/dev/ttyACM1", vid=0x2341, pid=0x003D, serial_number="7")
+NATIVE = SimpleNamespace(device="/dev/ttyACM3", vid=0x2341, pid=0x003E, serial_number=None)
+
+
+def test_ports_of_boards_are_found(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A Due by its native port before that for programming, any other board where it is the only one on USB."""
+
+    def connect(*ports: SimpleNamespace) -> None:
+        monkeypatch.setattr("serial.tools.list_ports.comports", lambda: [BUILT_IN, *ports])
+
+    connect(PROGRAMMING, NATIVE, UNO)
+    assert due.list_due_ports() == ["/dev/ttyACM3", "/dev/ttyACM1"]
+    assert due.find_due_port(RigSettings()) == "/dev/ttyACM3"
+    connect(UNO)
+    assert line_board.find_line_port(RigSettings()) == "/dev/ttyACM2"
+    for find_port in (due.find_due_port, line_board.find_line_port):
+        assert find_port(RigSettings(port="COM3")) == "COM3"

@@ -1,5 +1,7 @@
 """The sketch itself, compile_sketch for this computer with a stand-in for the chip; the program's decoder reads it."""
 
+import shutil
+import subprocess
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
@@ -11,7 +13,6 @@ from padforge.sense.rig.boards import line_board
 from padforge.sense.rig.boards.line_board import LineAssembler, LineDecoder, LineHeader, LineSample
 from padforge.sense.rig.devices import BoardSamples
 from tests.emulators.boards import format_header, format_sample
-from tests.sense.rig.boards.firmware import compile_sketch, run_sketch
 
 FIRMWARE = Path(line_board.__file__).parent / "firmware" / "padforge_line"
 PAGE = Path(__file__).parents[4] / "docs" / "howto-boards.md"
@@ -24,6 +25,26 @@ HEADERS = {
     ),
 }
 BOOT_US, PERIOD_US = 4_294_900_000, 2000
+
+
+STUBS = Path(__file__).parent / "stub"
+
+
+def compile_sketch(stub: str, sketch: Path, folder: Path, *defines: str) -> Path:
+    """Compile a sketch with a stub for its chip; skip the test without g++."""
+    compiler = shutil.which("g++")
+    if compiler is None:
+        pytest.skip("there is no g++")
+    path = folder / "board"
+    flags = ["-std=gnu++11", "-Wall", "-Wextra", "-Werror", *(f"-D{name}" for name in defines)]
+    subprocess.run([compiler, *flags, "-I", STUBS, "-I", sketch, STUBS / f"{stub}.cpp", "-o", path], check=True)
+    return path
+
+
+def run_sketch(program: Path, script: list[str]) -> bytes:
+    """Return what the board sends while it runs a script, see the stubs."""
+    text = "\n".join(script).encode()
+    return subprocess.run([program], input=text, capture_output=True, check=True, timeout=20).stdout
 
 
 @pytest.fixture(scope="module")

@@ -14,7 +14,7 @@ from padforge.sense.rig.boards.line_board import (
     LineHeader,
     LineSample,
 )
-from padforge.sense.rig.devices import BoardSamples, RigFault
+from padforge.sense.rig.devices import BoardSamples
 from tests.emulators.boards import format_header, format_sample
 
 PAGE = Path(__file__).parents[4] / "docs" / "howto-boards.md"
@@ -130,15 +130,6 @@ def test_assemble_follows_inexact_rate_and_late_lines(share: float) -> None:
     slots = np.sort(rng.choice(4000, 3000, replace=False))
     samples = read(1000 * slots + rng.uniform(0, 450, 3000))
     assert np.array_equal(np.cumsum(1 + samples.missing) - 1, slots - slots[0])
-
-
-def test_assemble_notices_a_reset_after_half_the_range() -> None:
-    """Other times that cannot be are in the table of refusals."""
-    assembler = LineAssembler(THREE, (0, 1, 2))
-    read(2**31 + 10**7 + np.arange(1001) * 1000, assembler)
-    with pytest.raises(RigFault, match="it was reset") as caught:
-        read(np.arange(1, 20) * 1000, assembler)
-    assert caught.value.cause == "data"
 
 
 def test_assemble_gives_volts_of_the_inputs_asked_for_in_their_order() -> None:
