@@ -272,7 +272,7 @@ def recalibrate(
     plan says of a new fibre takes the place of many presses: with --morphology, the fibres are on the channels in its
     order, and positions are from the middle of the pad. The old model is replaced only if --out names its folder.
     """
-    from padforge.common.files import atomic_files, check_replaceable, check_writable, write_json
+    from padforge.common.files import atomic_files, check_replaceable, locked_folder, write_json
     from padforge.design.morphology import Morphology
     from padforge.sense.health.fault_detector import HEALTH_FILES, FaultDetector, has_health
     from padforge.sense.localizer import recalibration
@@ -281,20 +281,22 @@ def recalibrate(
     target = out or common.pad_folder(recording)
     if out is None and target.resolve() == model.resolve():
         raise InputError(f"{target}: holds the old model; name a folder for the new one with --out")
-    check_writable(target)
-    old, opened = LocalizerModel.load(model), read_recording(recording)
-    detector = FaultDetector.load(model) if has_health(model) else None
-    with common.progress_bar("recalibrating") as report:
-        pad = None if morphology is None else Morphology.load(morphology)
-        localizer, result = recalibration.recalibrate(old, opened, pad=pad, seed=seed or 0, on_progress=report)
-    with atomic_files(target, without=HEALTH_FILES) as folder:
-        localizer.save(folder)
-        replaced = target / "localizer.json"
-        check_replaceable(replaced, folder / replaced.name, ["recalibration.json", *HEALTH_FILES], force)
-        write_json(folder / "recalibration.json", result.to_dict())
-        if detector:  # faults do not depend on positions
-            detector.include_rests(opened)
-            detector.save(folder)
+    with locked_folder(target):
+        old, opened = LocalizerModel.load(model), read_recording(recording)
+        replaced, remade = target / "localizer.json", ["recalibration.json", *HEALTH_FILES]
+        origin = {"seed": seed or 0, "inputs": {"recording": opened.digest, "localizer": dict(old.provenance)}}
+        check_replaceable(replaced, origin, remade, force)
+        detector = FaultDetector.load(model) if has_health(model) else None
+        with common.progress_bar("recalibrating") as report:
+            pad = None if morphology is None else Morphology.load(morphology)
+            localizer, result = recalibration.recalibrate(old, opened, pad=pad, seed=seed or 0, on_progress=report)
+        with atomic_files(target, without=HEALTH_FILES) as folder:
+            localizer.save(folder)
+            check_replaceable(replaced, folder / replaced.name, remade, force)  # other models show in the result alone
+            write_json(folder / "recalibration.json", result.to_dict())
+            if detector:  # faults do not depend on positions
+                detector.include_rests(opened)
+                detector.save(folder)
     common.show_result(result.to_dict(), recalibration.recalibration_lines(result), as_json)
 
 
