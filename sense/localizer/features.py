@@ -72,15 +72,11 @@ def compute_features(
     is_published: bool = False,
     history: Array | None = None,
 ) -> PressFeatures:
-    """Compute the features of every press.
+    """Compute the features of every press from readings (R, C), V, NaN where missing.
 
-    Args:
-        readings: NaN where missing; shape (R, C), V.
-        down_command: first readings after the probe was sent down; shape (Q,).
-        up_command: first readings after it was sent up; shape (Q,).
-        until: first readings that are not used; shape (Q,). None for all readings up to the next press.
-        is_published: whether to compute the published running medians, which do not depend on `until`.
-        history: of the presses, if computed before, since it takes longest; shape (Q, C, J).
+    Commands (Q,) are the first readings after the probe was sent down and up, `until` (Q,) the first readings that are
+    not used, None for all up to the next press. The published running medians do not depend on it. The history
+    (Q, C, J) of the presses takes longest, and is given if it was computed before.
     """
     filled = interpolate_gaps(readings)
     _, next_begin = _neighbours(down_command, up_command, len(readings))

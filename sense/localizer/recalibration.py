@@ -218,14 +218,8 @@ def refit(
 ) -> tuple[LocalizerModel, Mask]:
     """Refit response, Bayesian localizers and networks to new presses; return the localizer, and which fibres are new.
 
-    Args:
-        old: the localizer as it is.
-        features: of the new presses, V.
-        positions_mm: of these; shape (Q, 2).
-        measures: depths and forces of these, NaN where unknown; shape (Q,) each.
-        plan: prior from the plan of the pad; None without a plan.
-        seed: of the training.
-        only_last: whether to retrain only the networks that answer at the end of a press.
+    Positions are (Q, 2), measures the depth and force (Q,), NaN where unknown; `plan` is the prior from the plan of the
+    pad. With `only_last`, only the networks that answer at the end of a press are retrained.
     """
     from padforge.sense.localizer.training import retrain  # torch takes long to import
 
@@ -338,13 +332,7 @@ def _transformed_table(table: Floats, rotation: Array, shift: Array) -> Floats:
 
 
 class CrossValidation:
-    """Cross-validation of changes on new presses, for subsets of failed fibres.
-
-    Args:
-        presses: features, positions (Q, 2), mm, and measures.
-        n_folds: number of folds, each of which is left out in turn.
-        subsets: subsets of failed fibres, by their size from 0.
-    """
+    """Cross-validation of changes on new presses in folds, for subsets of failed fibres, by their size from 0."""
 
     def __init__(
         self,

@@ -48,11 +48,7 @@ def stated_contact(recording: Recording) -> Contact:
 def plan_prior(pad: Morphology, contact: Contact, origin_mm: Array, scale_mm: float) -> ResponsePrior:
     """Return the prior of a pad from its plan: fibres with varying sensitivity and lateral offset.
 
-    Args:
-        pad: the plan, in the frame of the arm.
-        contact: of the presses.
-        origin_mm: position that is 0 when scaled, mm from the middle of the pad; shape (2,).
-        scale_mm: distance that is 1 when scaled, mm.
+    The plan is in the frame of the arm, whose position `origin_mm` (2,) is 0 when scaled; the distance `scale_mm` is 1.
     """
     # compiled kernels take long to import
     from padforge.design.contact import signals, widened
@@ -80,11 +76,7 @@ def plan_prior(pad: Morphology, contact: Contact, origin_mm: Array, scale_mm: fl
 
 
 def map_prior(maps: Array) -> ResponsePrior:
-    """Return the prior of a pad from the responses of an earlier one, each fibre scaled smoothly.
-
-    Args:
-        maps: responses, not centred; shape (S, S, C, F).
-    """
+    """Return the prior of a pad from the responses (S, S, C, F) of an earlier one, each fibre scaled smoothly."""
     envelope = np.sqrt((maps**2 / np.maximum((maps**2).max(axis=(0, 1)), 1e-12)).mean(axis=3))
     centres = np.linspace(-1, 1, RBF_SIDE)
     weights = np.exp(-0.5 * ((np.linspace(-1, 1, len(maps))[:, None] - centres) / RBF_STD) ** 2)

@@ -64,8 +64,7 @@ def split_presses(recording: Recording, training: Mask, hysteresis_s: float) -> 
     cycle = Cycle(2 * int(np.median(up - down)), recording.rate_hz)
 
     def smoothed(windows: Array) -> Array:
-        maps = smooth_maps(positions[training], windows[training], valid[training])
-        return interpolate_grid(maps.reshape(*maps.shape[:2], -1), positions).reshape(windows.shape)
+        return interpolate_grid(smooth_maps(positions[training], windows[training], valid[training]), positions)
 
     rig = RigSettings(hysteresis_s=hysteresis_s, memory=0.7, memory_mm=9.0)  # where the fit of the memory starts
     kernels, replaced, parts = part_kernels(cycle, rig), np.zeros(valid.shape), np.empty((4, *valid.shape))

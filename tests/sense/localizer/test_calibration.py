@@ -201,10 +201,8 @@ def test_calibrate_uncertainty_corrects_overconfidence(recording: Recording, loc
     assert not shift[:, :, :2].any()
     assert shift[0, 0, 2] == shift[0, 0, 3] == pytest.approx(np.log(50), abs=0.7)
     assert put_right.interval_factors.shape == (N_TIMED + 1, 2, 3)
-
-    presses = moments[-1].inputs, moments[-1].fibre_mask, moments[-1].complete
     before, after = (
-        predict_members(each.networks, *presses, *each.corrected)[-1, :, 2:] for each in (proud, put_right)
+        predict_members(each.networks, moments[-1], *each.corrected)[-1, :, 2:] for each in (proud, put_right)
     )
     np.testing.assert_allclose(after - before, np.full_like(before, shift[0, 0, 2]), atol=1e-4)
 
