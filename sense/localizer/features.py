@@ -1,14 +1,10 @@
 """Features of presses: means of each fibre's readings over windows of the press, and its history before it.
 
-Both are relative to the baseline of the fibre, its mean at rest just before the press (`REST` of `moments`):
-
-- The windows are those of `moments`: they show the response to the press. Where a window would reach into a
-  neighbouring press, the nearest reading of its own press is repeated.
-- The history is the mean over each of `HISTORY_WINDOWS` and the median over each of `SLOW`, which end before the press,
-  whatever happened in them. It shows how far the fibre has crept after earlier presses, and so how it still creeps.
-
-Each feature depends on one fibre alone, so that a failed fibre can be masked and affects no other.
-Short gaps (NaN) are interpolated; a fibre with too few readings in a press is masked in it.
+Both are relative to the baseline of the fibre, its mean at rest just before the press. Where a window of `moments`
+would reach into a neighbouring press, the nearest reading of its own press is repeated. The history shows how far the
+fibre has crept after earlier presses, and so how it still creeps. Each feature depends on one fibre alone, so that a
+failed fibre can be masked and affects no other. Short gaps (NaN) are interpolated; a fibre with too few readings in a
+press is masked in it.
 """
 
 from dataclasses import dataclass

@@ -1,14 +1,7 @@
 """Recalibration: adapt a localizer to its pad, or to another one of the same plan, with a few new presses.
 
-Three models are compared by cross-validation over these presses:
-
-1. The localizer as it is.
-2. Corrected: a gain for every fibre, and the position, angle and scale of the pad, which are folded into the scaling of
-   the features and the last layer of the networks.
-3. Refitted: the response of each fibre is fitted again. Its prior is the plan of the pad and the present maps,
-   corrected if that is more probable, so that an unchanged fibre keeps its map and a new one gets another. The Bayesian
-   localizers are fitted to this response, and the networks are fine-tuned on it. This serves a pad that has drifted,
-   that was cast again, or that has a new fibre.
+The localizer as it is, a corrected and a refitted one (`fit_correction`, `refit`) are compared by cross-validation over
+these presses.
 """
 
 from collections.abc import Callable, Sequence
@@ -218,8 +211,10 @@ def refit(
 ) -> tuple[LocalizerModel, Mask]:
     """Refit response, Bayesian localizers and networks to new presses; return the localizer, and which fibres are new.
 
-    Positions are (Q, 2), measures the depth and force (Q,), NaN where unknown; `plan` is the prior from the plan of the
-    pad. With `only_last`, only the networks that answer at the end of a press are retrained.
+    This serves a pad that has drifted, that was cast again, or that has a new fibre: an unchanged fibre keeps its map,
+    and a new one gets another. Positions are (Q, 2), measures the depth and force (Q,), NaN where unknown; `plan` is
+    the prior from the plan of the pad. With `only_last`, only the networks that answer at the end of a press are
+    retrained.
     """
     from padforge.sense.localizer.training import retrain  # torch takes long to import
 
@@ -272,7 +267,10 @@ def _fit_response(
 def fit_correction(
     model: LocalizerModel, features: PressFeatures, positions_mm: Array, measures: Measures = MappingProxyType({})
 ) -> LocalizerModel:
-    """Correct gains of fibres, rotation, scale and shift by robust least squares with a normal prior."""
+    """Correct gains of fibres, rotation, scale and shift by robust least squares with a normal prior.
+
+    They are folded into the scaling of the features and the last layer of the networks.
+    """
     from scipy.optimize import least_squares  # slow to import
 
     expected = model.predict_features(model.scaler.transform(features))

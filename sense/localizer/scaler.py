@@ -12,7 +12,7 @@ import numpy as np
 from pydantic import ConfigDict, Field, PlainSerializer, PlainValidator
 from pydantic_core import PydanticCustomError
 
-from padforge.sense.arrays import MAX_MM, MAX_VOLTS, MIN_SCALE_V, Array, Floats, Indices, Mask
+from padforge.sense.arrays import MAX_MM, MAX_VOLTS, MIN_SCALE_V, Array, Floats, Indices, Mask, masked_mean
 from padforge.sense.localizer.features import PressFeatures
 from padforge.sense.localizer.moments import LATEST_WINDOWS, PRESS_WINDOWS
 from padforge.sense.localizer.response_model import ResponseModel, interpolate_grid, leverages, remove_history
@@ -125,8 +125,9 @@ class FeatureScaler:
         response = ResponseModel.fit(scaled_mm, *inputs, features.fibre_mask, relative_depth, phases)
         history = response.history_coef, response.history_mean_v
         windows = remove_history(*inputs, *history)[:, :, : features.windows.shape[2]]
-        mean = _masked_mean(windows, features.fibre_mask)
-        variance = _masked_mean((windows - mean) ** 2, features.fibre_mask)
+        mask = features.fibre_mask[:, :, None]
+        mean = masked_mean(windows, mask)
+        variance = masked_mean((windows - mean) ** 2, mask)
         scale = (variance * variance.mean(axis=1, keepdims=True)) ** 0.25
         scale = np.where(scale >= MIN_SCALE_V, scale, 1.0)  # constant windows are not scaled
         padding = ((0, 0), (0, len(phases)))
@@ -194,12 +195,6 @@ class FeatureScaler:
         factor = self.scale_v[:, None, pressed] / self.scale_v[:, latest, None]
         offset = (self.mean_v[:, None, pressed] - self.mean_v[:, latest, None]) / self.scale_v[:, latest, None]
         return factor.astype(np.float32), offset.astype(np.float32)
-
-
-def _masked_mean(windows: Array, fibre_mask: Mask) -> Array:
-    """(C, F) means over the presses in which a fibre is valid; 0 if it is in none."""
-    total = np.where(fibre_mask[:, :, None], windows, 0.0).sum(axis=0)
-    return total / np.maximum(fibre_mask.sum(axis=0), 1)[:, None]
 
 
 @dataclass(frozen=True)

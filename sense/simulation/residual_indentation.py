@@ -22,14 +22,7 @@ def replaced_residues(
 
     At distance d a press removes the fraction `memory exp(-d^2 / 2 memory_mm^2)` of what remains of a residue. The
     effect on a fibre is proportional to the geometric mean of that residue and of the response to the press itself.
-
-    Args:
-        positions_mm: positions of the presses; shape (Q, 2).
-        touch_s: times at which they begin; shape (Q,).
-        release_s: times at which they end; shape (Q,).
-        residues: residue of each press at its end; shape (Q, C).
-        held: held response of each press; shape (Q, C).
-        rig: `memory`, `memory_mm` and `hysteresis_s`.
+    Presses at positions (Q, 2) begin and end at times (Q,); residues at their end and held responses are (Q, C).
     """
     replaced, remaining = np.zeros_like(residues), np.ones(len(residues))
     for q in range(1, len(residues) if rig.memory else 0):

@@ -15,10 +15,10 @@ from padforge.sense.localizer.evaluation import (
     error_row,
     errors_by_loss,
     errors_by_position,
+    find_doubts,
     idle_share,
-    sureness_lines,
 )
-from padforge.sense.localizer.model import Localization, MeasureEstimate
+from padforge.sense.localizer.model import Localization, LocalizerModel, MeasureEstimate
 
 PLACES = np.array([[0.0, 0.0], [10.0, 0.0], [0.0, 10.0], [10.0, 10.0]])
 
@@ -59,16 +59,10 @@ def test_error_row_summarizes_sets_and_known_measures() -> None:
 def test_conformal_takes_a_quantile_one_rank_higher() -> None:
     """Ninety-nine presses off by 0.01, 0.02 ... of their radius: the 50th and the 90th."""
     ranks = np.random.default_rng(0).permutation(np.arange(1, 100) / 100)
-    places = np.zeros((99, 2))
-    found = Localization(
-        np.column_stack([6 * ranks, 0 * ranks]), np.full((99, 2), 3.0), np.full(99, 2.0), np.full(99, 4.0)
-    )
-    spread, r50, r90 = conformal([found], places)
-    assert spread == pytest.approx(np.sqrt((np.square(2 * ranks)).mean() / 2))
-    assert r50 == pytest.approx(3 * 0.50)
-    assert r90 == pytest.approx(1.5 * 0.90)
-    few = Localization(found.positions_mm[:5], found.std_mm[:5], found.r50_mm[:5], found.r90_mm[:5])
-    assert conformal([few], places[:5])[2] == pytest.approx((1.5 * ranks[:5]).max())
+    spread, r50, r90 = conformal([make_localization(ranks)], np.zeros((99, 2)))
+    assert spread == pytest.approx(np.sqrt(np.square(ranks).mean()))
+    assert (r50, r90) == pytest.approx((0.50, 0.90))
+    assert conformal([make_localization(ranks[:5])], np.zeros((5, 2)))[2] == pytest.approx(ranks[:5].max())
 
 
 @pytest.mark.parametrize("presses", [9, 40])
@@ -76,14 +70,13 @@ def test_conformal_covers_of_few_presses_and_several_sets(presses: int) -> None:
     rng = np.random.default_rng(presses)
 
     def drawn(count: int) -> list[Localization]:
-        one, hard = np.ones(count), rng.exponential(size=count)  # a press that is hard to find is so with every set
-        off = [hard * rng.exponential(size=count) for _ in range(3)]
-        return [Localization(np.column_stack([each, 0 * each]), np.ones((count, 2)), one, one) for each in off]
+        hard = rng.exponential(size=count)  # a press that is hard to find is so with every set
+        return [make_localization(hard * rng.exponential(size=count)) for _ in range(3)]
 
     shares = []
     for _ in range(200):
         _, r50, r90 = conformal(drawn(presses), np.zeros((presses, 2)))
-        fresh = np.concatenate([each.positions_mm[:, 0] for each in drawn(100)])
+        fresh = np.concatenate([each.positions_mm[:, 0] / 2 for each in drawn(100)])
         shares.append([(fresh <= r50).mean(), (fresh <= r90).mean()])
     half, most = np.mean(shares, axis=0)
     assert 0.48 < half < 0.52 + 1 / presses
@@ -160,8 +153,17 @@ def test_errors_grow_more_after_few_presses_at_the_end_of_a_press_and_with_all_f
     assert RELEASE.ratio(300, 3 / 8) < RELEASE.ratio(300, 0) == RELEASE.mean_ratio
 
 
-def test_radii_of_few_presses_say_so() -> None:
-    assert sureness_lines({"radii_presses": 100}) == [
-        "radii rest on few presses: of many others 84% to 96% may lie in r90"
-    ]
-    assert sureness_lines({"radii_presses": 400}) == sureness_lines({}) == []
+def test_far_presses_are_named_and_another_recording_is_doubted(
+    localizer: LocalizerModel, recording: Recording
+) -> None:
+    localization = localizer.predict(recording)
+    assert find_doubts(recording, localization, 0.9, 45) == []
+    presses_mm = recording.presses_mm.copy()
+    corner = int(np.argmin(presses_mm.sum(axis=1)))
+    presses_mm[corner] *= -1  # a sign was lost
+    presses_mm[3] = np.nan
+    (line,) = find_doubts(replace(recording, presses_mm=presses_mm), localization, 0.9, 45)
+    assert line.startswith(f"more than 4 r90 from where the fibres say: press {corner} at (")
+    expected = ["2% of 300 presses lie within r90: is it the recording of this pad?"]
+    assert find_doubts(recording, localization, 0.02, 300) == expected
+    assert find_doubts(recording, localization, 0.02, 10) == []  # of so few it may be chance
