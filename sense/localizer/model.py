@@ -151,9 +151,9 @@ class LocalizerModel(LocalizerDocument):
 
     networks: Networks
     table: Floats
+    single_press: tuple[SinglePressTest, ...]
     bayes: tuple[BayesianLocalizer, ...] = ()
     residual_network: Weights = field(default_factory=dict)
-    single_press: tuple[SinglePressTest, ...] = ()
 
     @property
     def fibres(self) -> int:

@@ -229,7 +229,7 @@ def find_unlike(tests: Sequence[SinglePressTest], presses: ScaledFeatures) -> Ma
     """
     n_complete, unlike = count_complete(presses.complete), np.zeros(len(presses), bool)
     numbers = stages(presses.complete.shape[1])
-    for test, first, end in zip(tests, numbers, [*numbers[1:], np.inf], strict=False):
+    for test, first, end in zip(tests, numbers, [*numbers[1:], np.inf], strict=True):
         rows = np.flatnonzero((n_complete >= first) & (n_complete < end))
         unlike[rows] = test.is_unlike(presses.inputs[rows], presses.fibre_mask[rows])
     return unlike
@@ -241,9 +241,7 @@ def stages(n_timed: int) -> tuple[int, ...]:
 
 
 def find_misfits(tests: Sequence[SinglePressTest], presses: ScaledFeatures) -> Array:
-    """Return (Q, M) `SinglePressTest.misfits` of up to MAX_PRESSES complete presses; none without tests."""
-    if not tests:
-        return np.empty((0, 1))
+    """Return (Q, M) `SinglePressTest.misfits` of up to MAX_PRESSES complete presses."""
     finished = np.flatnonzero(presses.complete.all(axis=1))
     rows = finished[np.linspace(0, len(finished) - 1, min(len(finished), MAX_PRESSES)).astype(np.int64)]
     return tests[-1].misfits(presses.inputs[rows], presses.fibre_mask[rows])

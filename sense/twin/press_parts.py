@@ -26,9 +26,9 @@ from padforge.sense.simulation.pad_model import (
     Motion,
     Viscoelasticity,
     probe_motion,
+    replaced_residues,
     superpose_strain,
 )
-from padforge.sense.simulation.residual_indentation import replaced_residues
 from padforge.sense.twin.responses import Responses, near_pairs, normalize
 
 N_ROUNDS = 3  # times that parts and removed residues are estimated in turn

@@ -19,7 +19,6 @@ from padforge.sense.health.fault_likelihoods import (
     fit_step_filters,
 )
 from padforge.sense.health.trace_model import COMPONENTS, REST, TARGETS, TRACE
-from tests.sense.health.pads import Array
 
 PRESSES, FIBRES = 5, 3
 OFFSETS = (2.0, -2.0, 4.0, -4.0, 12.0, -12.0)
@@ -184,21 +183,3 @@ def test_cusum_is_the_best_sum_over_all_onsets() -> None:
         # A fault that was present before the first press is as good as any onset.
         earlier = [llr_continuing[first : press + 1].sum() for first in range(press + 2)]
         assert height == pytest.approx(max(0.0, *sums, *earlier))
-
-
-def test_exceedance_fit_leads_to_the_rate_of_false_alarms() -> None:
-    def llrs(presses: int, seed: int) -> Array:
-        """Of a mean of 1 against 0, for numbers of mean 0."""
-        return np.random.default_rng(seed).standard_normal((presses, 3, 1)) - 0.5
-
-    model = ExceedanceModel.fit([(llrs(10_000, 0), llrs(10_000, 0))])
-    # Sums of exact ratios exceed h with a probability of about exp(-h) (Wald).
-    assert model.slope[0, 0] == pytest.approx(1, abs=0.15)
-    threshold = model.level[0] + model.slope[0] * np.log(1 / 2e-3)
-    height, alarms = np.zeros((3, 1)), 0
-    for llr in llrs(40_000, 1):
-        height = cusum_update(height, llr, llr)
-        alarms += int((height > threshold).sum())
-        height = np.where(height > threshold, 0.0, height)
-    # Eighty are allowed; the level is conservative by a factor of ten at most.
-    assert 8 <= alarms <= 80

@@ -1,4 +1,4 @@
-"""The Bayesian localizer finds what least squares find of linear responses, and what a fine grid finds of others."""
+"""The Bayesian localizer finds what least squares find of linear responses."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -74,18 +74,6 @@ def test_predict_solves_least_squares_of_linear_responses(fitted_line: Fitted, l
     assert np.sqrt(((found - places) ** 2).mean()) < 1.05 * np.sqrt(bound.mean())
     variance = np.exp(4 * (summary[:, 2:4] - 1)).mean(axis=0)
     np.testing.assert_allclose(variance, bound / (1 + PRIOR_WEIGHT), rtol=0.15)
-
-
-def test_predict_finds_the_maximum_of_a_fine_grid(fitted_waves: Fitted) -> None:
-    bayes, inputs, places = fitted_waves
-    inputs, places = inputs[:40], places[:40]
-    found, _ = bayes.predict(inputs, np.ones((40, FIBRES), dtype=bool))
-    at = grid_positions(201).reshape(-1, 2)
-    answers = waves(at).reshape(len(at), -1)
-    likeliest = np.stack([at[((answers - press.ravel()) ** 2).sum(axis=1).argmin()] for press in inputs])
-    off = np.hypot(*(found - likeliest).T)
-    assert off.max() < 0.03
-    assert off.mean() < 0.2 * np.hypot(*(likeliest - places).T).mean() + 0.5 * 0.01  # half a step of the grid
 
 
 def test_predict_spreads_over_positions_of_equal_response() -> None:

@@ -19,12 +19,10 @@ PAD = Morphology.random(2, knots=3, seed=5)  # of the recording
 def test_the_error_falls_while_a_press_is_read(
     calibrated: tuple[LocalizerModel, Evaluation], recording: Recording
 ) -> None:
-    """Rows are those of predictions until a moment, and the touch in focus is one of the test."""
+    """Rows are those of predictions until a moment, and the touch in focus is that of the median error."""
     model, evaluation = calibrated
-    rows, levels = evaluation.by_moment, len(evaluation.errors)
-    assert len(rows) == len(MOMENTS) * levels
+    rows = evaluation.by_moment
     intact = [row for row in rows if row["n_failed"] == 0]
-    assert [(row["since"], row["readings"]) for row in intact] == [(each.since, each.readings) for each in MOMENTS]
     means = [row["mean_mm"] for row in intact]
     assert means[0] > means[3] > evaluation.errors[0]["mean_mm"]
     assert abs(means[-1] / evaluation.errors[0]["mean_mm"] - 1) < 0.25

@@ -28,11 +28,8 @@ def windows_of(readings: np.ndarray, is_published: bool, until: int | None = Non
 
 
 def test_compute_features_takes_means_and_medians() -> None:
-    """Of noise; and of a ramp that counts itself, with a press from 5000 to 5020 and its rest 5.5 before it."""
+    """Medians of noise; and of a ramp that counts itself, with a press from 5000 to 5020 and its rest 5.5 before it."""
     readings = noise()
-    found, rest = windows_of(readings, False)[2], readings[90:100].mean(axis=0)
-    assert np.allclose(found[:, 7], readings[112:116].mean(axis=0) - rest)
-    assert np.allclose(found[:, 9 + 6], readings[129:134].mean(axis=0) - rest)
     expected = [np.median(readings[at - 7 : at + 8], axis=0) for at in (90, 110, 130)]
     assert np.allclose(windows_of(readings, True)[2], np.stack(expected, axis=1))
     ramp = np.arange(5100.0)[:, None]

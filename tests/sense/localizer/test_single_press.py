@@ -121,7 +121,6 @@ def test_presses_before_the_first_stage_and_without_fibres_are_not_judged(traine
         early = np.tile(np.arange(N_TIMED) < n_complete, (100, 1))
         assert not find_unlike(trained.tests, replace(two, complete=early)).any()
     assert not find_unlike(trained.tests, replace(two, fibre_mask=np.zeros_like(two.fibre_mask))).any()
-    assert not find_unlike((), two).any()
 
 
 def test_expected_responses_fit_and_two_of_them_do_not(trained: Trained) -> None:
@@ -149,7 +148,6 @@ def test_pads_cast_again_are_other_pads_unless_presses_are_few(trained: Trained,
     assert not trained.is_other_pad(presses[: MIN_PRESSES - 1])
     uncalibrated = tuple(replace(test, n_presses=np.zeros(1)) for test in trained.tests)
     assert not is_other_pad(uncalibrated, find_misfits(trained.tests, presses))
-    assert not is_other_pad((), find_misfits((), presses))
 
 
 def test_pads_that_drift_or_have_failed_fibres_are_no_other_pads(trained: Trained, pad: Recording) -> None:

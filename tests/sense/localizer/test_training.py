@@ -55,25 +55,19 @@ def test_fit_network_returns_the_average_of_the_last_weights() -> None:
     """Of a quadratic with noisy gradients, the average is nearer to the minimum than single weights are."""
     torch.manual_seed(0)
     reports: list[int] = []
-
-    def fit(averaged: bool) -> float:
-        w = torch.zeros(200, requires_grad=True)
-        weights = training.fit_network(
-            {"w": w},
-            lambda: ((w - 1 + 0.5 * torch.randn(200)) ** 2).mean(),
-            1000,
-            0.05,
-            weight_decay=0.0,
-            averaged=averaged,
-            on_progress=lambda done, total, what: reports.append(done),
-        )
-        return float(np.square(weights["w"] - 1).mean())
-
-    assert fit(averaged=True) < 0.05
+    w = torch.zeros(200, requires_grad=True)
+    weights = training.fit_network(
+        {"w": w},
+        lambda: ((w - 1 + 0.5 * torch.randn(200)) ** 2).mean(),
+        1000,
+        0.05,
+        weight_decay=0.0,
+        on_progress=lambda done, total, what: reports.append(done),
+    )
+    average, last = (np.square(each - 1).mean() for each in (weights["w"], w.detach().numpy()))
+    assert average < 0.8 * last < 0.05
     assert np.float64(5e-324) * 1.0 > 0  # denormal numbers are there again after a training
-    assert reports == sorted(reports)
-    assert (len(reports), reports[-1]) == (training.REPORTS, training.REPORTS)
-    assert fit(averaged=False) < 0.05
+    assert reports == list(range(1, training.REPORTS + 1))
     assert [training.one_cycle(share) for share in (0.0, 0.05, 0.1, 0.55, 1.0)] == pytest.approx([0, 0.5, 1, 0.5, 0])
 
 
