@@ -256,11 +256,7 @@ def errors_by_moment(
         until = moment.until(touched, frames.up_command)
         raw = compute_features(frames.readings, *commands, until, history=history)
         features = model.scaler.transform(raw[presses])
-        at = {
-            "since": moment.since,
-            "readings": moment.readings,
-            "time_s": round(moment.readings / frames.rate_hz, 3),
-        }
+        at = {"since": moment.since, "readings": moment.readings, "time_s": round(moment.readings / frames.rate_hz, 3)}
         intact.append((at, model.predict_features(features)))
         for n_failed in levels:
             subsets = failure_subsets(model.fibres, n_failed, MOMENT_SETS)

@@ -4,7 +4,7 @@ A localizer trained on presses of several depths also predicts depth, and force 
 """
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
@@ -87,27 +87,24 @@ def write_localization(localization: Localization, path: str | Path) -> None:
     """Write predictions as CSV of `COLUMNS` and `MEASURE_COLUMNS`, one line a press, atomically."""
     estimates = [column for measure in localization.measures.values() for column in (measure.values, measure.r90)]
     columns = [localization.positions_mm, localization.std_mm, localization.r50_mm, localization.r90_mm, *estimates]
-    names = (*COLUMNS, *(name for measure in localization.measures for name in MEASURE_COLUMNS[measure]))
-    texts = [[f"{value:.4f}" for value in row] for row in np.column_stack(columns).tolist()]
-    is_unlike = np.zeros(len(texts), bool) if localization.unlike is None else localization.unlike
-    for row, unlike in zip(texts, is_unlike.tolist(), strict=True):
-        row.insert(COLUMNS.index("unlike") - 1, str(int(unlike)))
-    lines = [",".join([str(press), *row]) for press, row in enumerate(texts)]
+    rows = np.column_stack(columns)
+    unlike = np.zeros(len(rows), bool) if localization.unlike is None else localization.unlike
+    lines = [",".join([*COLUMNS, *(name for measure in localization.measures for name in MEASURE_COLUMNS[measure])])]
+    for press, (row, is_unlike) in enumerate(zip(rows.tolist(), unlike.tolist(), strict=True)):
+        position, measures = ([f"{value:.4f}" for value in part] for part in (row[:6], row[6:]))
+        lines.append(",".join([str(press), *position, str(int(is_unlike)), *measures]))
     with reraise_write_error(Path(path)):
-        write_text(Path(path), "\n".join([",".join(names), *lines]) + "\n")
+        write_text(Path(path), "\n".join(lines) + "\n")
 
 
 def concatenate(parts: Sequence[Localization]) -> Localization:
     """Concatenate one or more predictions of the same measures, without `unlike`."""
-
-    def stack(estimates: Sequence[Any], *names: str) -> Iterator[Array]:
-        return (np.concatenate([getattr(estimate, name) for estimate in estimates]) for name in names)
-
-    measures = {
-        name: MeasureEstimate(*stack([part.measures[name] for part in parts], "values", "r90"))
-        for name in parts[0].measures
-    }
-    return Localization(*stack(parts, "positions_mm", "std_mm", "r50_mm", "r90_mm"), measures)
+    columns = [(part.positions_mm, part.std_mm, part.r50_mm, part.r90_mm) for part in parts]
+    measures = {}
+    for name in parts[0].measures:
+        estimates = [(part.measures[name].values, part.measures[name].r90) for part in parts]
+        measures[name] = MeasureEstimate(*map(np.concatenate, zip(*estimates, strict=True)))
+    return Localization(*map(np.concatenate, zip(*columns, strict=True)), measures)
 
 
 @dataclass(frozen=True, kw_only=True)

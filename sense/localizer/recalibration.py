@@ -333,10 +333,7 @@ class CrossValidation:
     """Cross-validation of changes on new presses in folds, for subsets of failed fibres, by their size from 0."""
 
     def __init__(
-        self,
-        presses: tuple[PressFeatures, Array, Measures],
-        n_folds: int,
-        subsets: Sequence[Sequence[tuple[int, ...]]],
+        self, presses: tuple[PressFeatures, Array, Measures], n_folds: int, subsets: Sequence[Sequence[tuple[int, ...]]]
     ) -> None:
         self.presses = presses
         self._folds, self._subsets = np.array_split(np.arange(len(presses[1])), n_folds), subsets

@@ -61,13 +61,9 @@ def plan_prior(pad: Morphology, contact: Contact, origin_mm: Array, scale_mm: fl
     smooth, with_gain = (np.linalg.cholesky(covariance + gain + 1e-6 * np.eye(N_NODES)) for gain in (0.0, 1.0))
     parts = []
     for width in WIDTHS:
-        hats = [
-            signals(
-                pad, grid, widened(contact, width), precision=LAYER_PRECISION, sensitivity=np.tile(hat, (fibres, 1))
-            )
-            for hat in np.eye(N_NODES)
-        ]
-        maps = np.stack(hats, axis=2).reshape(side, side, fibres, N_NODES)
+        pressed, hats = widened(contact, width), [np.tile(hat, (fibres, 1)) for hat in np.eye(N_NODES)]
+        maps = [signals(pad, grid, pressed, precision=LAYER_PRECISION, sensitivity=hat) for hat in hats]
+        maps = np.stack(maps, axis=2).reshape(side, side, fibres, N_NODES)
         maps /= np.linalg.norm(maps @ with_gain, axis=3).max(axis=(0, 1))[:, None]
         step = 2 / GRID_CELLS
         offsets = [OFFSET_MM / scale_mm * slope @ smooth for slope in np.gradient(maps, step, axis=(0, 1))]

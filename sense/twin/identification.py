@@ -11,15 +11,7 @@ from padforge.common.validation import InputError
 from padforge.design import Morphology
 from padforge.design.paths.curves import lengths
 from padforge.design.settings import Contact, sensed_rectangle
-from padforge.design.twin import (
-    PARTS,
-    Twin,
-    TwinChannel,
-    TwinPart,
-    TwinReadings,
-    TwinResidual,
-    TwinScatter,
-)
+from padforge.design.twin import PARTS, Twin, TwinChannel, TwinPart, TwinReadings, TwinResidual, TwinScatter
 from padforge.sense.arrays import Array, Indices, Mask
 from padforge.sense.recording.frames import framed
 from padforge.sense.recording.recording import Recording

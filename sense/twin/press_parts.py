@@ -51,12 +51,8 @@ class SplitPresses:
 
 def split_presses(recording: Recording, training: Mask, hysteresis_s: float) -> SplitPresses:
     """Split the presses of known position of a recording; maps of their parts are fitted to those in `training`."""
-    positioned = recording.has_position
-    down, up, positions_mm = (
-        recording.down_command[positioned],
-        recording.up_command[positioned],
-        recording.presses_mm[positioned],
-    )
+    presses = recording.down_command, recording.up_command, recording.presses_mm
+    down, up, positions_mm = (part[recording.has_position] for part in presses)
     inputs = compute_features(recording.readings, down, up)
     timed = inputs.windows[:, :, :N_TIMED]
     valid, positions = inputs.fibre_mask, normalize(positions_mm)[0]

@@ -72,11 +72,10 @@ def select_one_depth(recording: Recording) -> Recording:
 
 def compute_responses(recording: Recording, training: Mask) -> Responses:
     """Compute the responses to all Q presses of known position; history is fitted to those in the mask `training`."""
-    positioned = recording.has_position
-    down, up = recording.down_command[positioned], recording.up_command[positioned]
+    presses = recording.down_command, recording.up_command, recording.presses_mm
+    down, up, positions_mm = (part[recording.has_position] for part in presses)
     inputs = compute_features(recording.readings, down, up, until=up)
     pressed = inputs.windows[:, :, : len(PRESS_WINDOWS)]
-    positions_mm = recording.presses_mm[positioned]
     normalized, *_ = normalize(positions_mm)
     model = ResponseModel.fit(
         normalized[training],

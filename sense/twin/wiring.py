@@ -84,10 +84,7 @@ def assign_fibres(correlations: Array) -> tuple[float, tuple[int, ...]]:
 
 
 def find_wirings(
-    plan: PadPlan,
-    responses: Responses,
-    rng: np.random.Generator,
-    on_progress: OnProgress = ignore_progress,
+    plan: PadPlan, responses: Responses, rng: np.random.Generator, on_progress: OnProgress = ignore_progress
 ) -> list[Wiring]:
     """Search for wirings of the channels of `responses`, best first, each with its best transform.
 

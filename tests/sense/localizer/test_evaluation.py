@@ -8,13 +8,7 @@ from scipy.special import gammaincinv
 
 from padforge.sense import Recording
 from padforge.sense.localizer.calibration import RELEASE, TOUCH, adapt_ratios
-from padforge.sense.localizer.evaluation import (
-    PRIOR_PRESSES,
-    RATIO_SHAPE,
-    conformal,
-    error_row,
-    find_doubts,
-)
+from padforge.sense.localizer.evaluation import PRIOR_PRESSES, RATIO_SHAPE, conformal, error_row, find_doubts
 from padforge.sense.localizer.model import Localization, LocalizerModel, MeasureEstimate
 
 PLACES = np.array([[0.0, 0.0], [10.0, 0.0], [0.0, 10.0], [10.0, 10.0]])
@@ -24,6 +18,12 @@ def off_by(*amounts: float, r50: float = 1.0, r90: float = 2.0, sd: float = 1.0)
     """The four presses found to the side by so many mm."""
     away = np.column_stack([amounts, np.zeros(4)])
     return Localization(PLACES + away, np.full((4, 2), sd), np.full(4, r50), np.full(4, r90))
+
+
+def make_localization(ratios: np.ndarray) -> Localization:
+    """Presses at (0, 0) that are off by shares of a radius of 2 mm."""
+    size, radii = len(ratios), np.full(len(ratios), 2.0)
+    return Localization(np.column_stack([2 * ratios, 0 * ratios]), np.full((size, 2), 2**0.5), radii, radii)
 
 
 def test_error_row_summarizes_sets_and_known_measures() -> None:
@@ -67,14 +67,6 @@ def test_conformal_covers_of_few_presses_and_several_sets(presses: int) -> None:
     half, most = np.mean(shares, axis=0)
     assert 0.48 < half < 0.52 + 1 / presses
     assert 0.885 < most < 0.915 + 1 / presses
-
-
-def make_localization(ratios: np.ndarray) -> Localization:
-    """Presses at (0, 0) that are off by shares of a radius of 2 mm."""
-    size = len(ratios)
-    return Localization(
-        np.column_stack([2 * ratios, 0 * ratios]), np.full((size, 2), 2**0.5), np.full(size, 2.0), np.full(size, 2.0)
-    )
 
 
 @pytest.mark.parametrize("presses", [15, 30, 1000])

@@ -156,15 +156,6 @@ def test_detect_presses_in_disturbed_readings(recording: Recording, kind: str) -
     assert false <= 0.02
 
 
-@pytest.mark.parametrize("cut", [25, 30])
-def test_detect_presses_recovers_from_a_start_under_a_press(recording: Recording, cut: int) -> None:
-    presses = recording.presses_mm[1:], recording.down_command[1:] - cut, recording.up_command[1:] - cut
-    later = Recording(recording.readings[cut:], recording.times_s[cut:], *presses)
-    recall, false, *_ = evaluate(detect_presses(later.readings, later.times_s), later)
-    assert recall >= 0.95
-    assert false <= 0.05
-
-
 @settings(max_examples=10)
 @given(cuts=st.lists(st.integers(0, 2000), max_size=20))
 def test_update_does_not_depend_on_the_size_of_blocks(recording: Recording, cuts: list[int]) -> None:

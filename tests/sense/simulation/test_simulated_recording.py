@@ -181,7 +181,5 @@ def test_measure_rig_settings_ignores_incomplete_channels_and_few_presses() -> N
     recording = simulate(PAD, RigSettings(presses=200))
     readings = np.column_stack([recording.readings, np.full(len(recording.readings), 1.5), recording.readings[:, 0]])
     readings[1000, 5] = np.nan
-    presses = {name: getattr(recording, name) for name in ("presses_mm", "down_command", "up_command")}
-    with_bad = Recording(readings, recording.times_s, **presses)
-    assert measure_rig_settings(with_bad) == measure_rig_settings(recording)
-    assert measure_rig_settings(Recording(readings[:, 4:], recording.times_s, **presses)) == {}
+    assert measure_rig_settings(replace(recording, readings=readings)) == measure_rig_settings(recording)
+    assert measure_rig_settings(replace(recording, readings=readings[:, 4:])) == {}
