@@ -8,7 +8,14 @@ from scipy.special import gammaincinv
 
 from padforge.sense import Recording
 from padforge.sense.localizer.calibration import RELEASE, TOUCH, adapt_ratios
-from padforge.sense.localizer.evaluation import PRIOR_PRESSES, RATIO_SHAPE, conformal, error_row, find_doubts
+from padforge.sense.localizer.evaluation import (
+    PRIOR_PRESSES,
+    RATIO_SHAPE,
+    conformal,
+    error_row,
+    find_doubts,
+    idle_share,
+)
 from padforge.sense.localizer.model import Localization, LocalizerModel, MeasureEstimate
 
 PLACES = np.array([[0.0, 0.0], [10.0, 0.0], [0.0, 10.0], [10.0, 10.0]])
@@ -67,6 +74,15 @@ def test_conformal_covers_of_few_presses_and_several_sets(presses: int) -> None:
     half, most = np.mean(shares, axis=0)
     assert 0.48 < half < 0.52 + 1 / presses
     assert 0.885 < most < 0.915 + 1 / presses
+
+
+def test_idle_share_is_that_of_changes_below_a_share_of_their_range() -> None:
+    """Of five presses of 20 readings, fibre 1 changes by 0 to 1 V, fibre 2 by far less than its 2 V in one."""
+    steps = np.array([[0.0, 1.0], [0.015, -1.0], [0.025, 0.03], [1.0, 0.05], [0.5, 0.5]])
+    readings = np.kron(steps, np.repeat([0.0, 1.0, 0.0], [15, 21, 4])[:, None])
+    down_command = np.arange(5) * 40 + 15
+    recording = Recording(readings, np.arange(200) / 13, np.zeros((5, 2)), down_command, down_command + 21)
+    np.testing.assert_allclose(idle_share(recording), [2 / 5, 1 / 5])
 
 
 @pytest.mark.parametrize("presses", [15, 30, 1000])

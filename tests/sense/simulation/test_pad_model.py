@@ -132,6 +132,16 @@ def test_held_presses_follow_the_relative_stretch() -> None:
     np.testing.assert_allclose(cycles[:, 35], held, atol=1.6 * 3.3 / 4095)
 
 
+def test_presses_have_the_published_delays_and_travel() -> None:
+    fast = simulate(PAD, quiet_rig(presses=100, rate_hz=1000.0, readings_per_press=2000))
+    fibre = np.abs(fast.readings - fast.readings[0]).reshape(100, 2000, 8).max(axis=2)
+    strong = fibre.max(axis=1) > 0.03
+    touched = np.argmax(fibre[strong, 1000:] > 0, axis=1)
+    arrived = np.argmax(fibre[strong, 1000:] >= fibre[strong, 1900:1901], axis=1)
+    assert (touched.min() / 1000, touched.max() / 1000) == pytest.approx((0.04, 0.22), abs=0.012)
+    assert np.median(arrived - touched) / 1000 == pytest.approx(0.1, abs=0.01)
+
+
 def test_live_pad_responds_in_proportion_to_depth() -> None:
     pad = Morphology.straight(2)
     model = LivePad(pad, PUBLISHED_CONTACT, quiet_rig(), 1000.0, np.random.default_rng(0))
