@@ -104,7 +104,7 @@ def test_prior_counts_as_so_many_presses() -> None:
     spread, r50, r90 = conformal([far], np.zeros((PRIOR_PRESSES, 2)), None, 1.0)
     assert r90 == pytest.approx(10.0)
     assert 2.0 < r50 < 10.0
-    assert spread == pytest.approx(np.sqrt((100 + 1 + 1 / RATIO_SHAPE) / 2), rel=0.01)
+    assert spread == pytest.approx(np.sqrt((100 + 1 + 1 / RATIO_SHAPE) / 2), rel=1e-3)
 
 
 @pytest.mark.parametrize(("presses", "factor", "low", "high"), [(5000, 1.2, 1.18, 1.22), (10, 1.2, 1.0, 1.15)])

@@ -301,3 +301,10 @@ def test_align_to_detected_moves_presses_by_a_few_readings_and_keeps_those_not_d
     down_command, up_command = align(int(up[20]) - 2, int(down[21]) + 10)  # two presses look like one
     assert (down_command[20], up_command[20]) == (down[20], up[20])
     np.testing.assert_array_equal(align(1, len(recording.readings)), (down, up))
+    readings, late = recording.readings.copy(), int(up[30]) + 2  # it is felt once the probe has been sent up
+    readings[down[30] - 2 : late] = readings[down[30] - 3]
+    readings[late : late + 10] = recording.readings[up[30] - 10 : up[30]]
+    touched, _ = detect_presses(readings, recording.times_s)
+    assert ((touched >= up[30]) & (touched < down[31] - MAX_LEAD)).any()
+    down_command, up_command = align_to_detected(readings, recording.times_s, down, up)
+    assert (down_command[30], up_command[30]) == (down[30], up[30])

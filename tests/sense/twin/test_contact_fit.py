@@ -58,3 +58,17 @@ def test_fit_contact_states_shares_of_the_sum_that_was_stated() -> None:
     small = fit_contact(pad, halved, responses, responses, noise_v)
     assert small.scale == pytest.approx(2 * double.scale, rel=1e-3)
     assert small.scale_std == pytest.approx(2 * double.scale_std, rel=0.05)
+
+
+def test_elements_of_a_pad_sum_to_its_lengths_and_follow_its_offsets() -> None:
+    plan = PadPlan.from_morphology(PLAN)
+    pad = AsBuiltPad.from_plan(plan, (2, 0), PlanTransform(), 0.5)
+    middles, lengths, tangents = pad.elements(0)
+    assert lengths == pytest.approx(plan.lengths[2])
+    assert tangents == pytest.approx(plan.tangents[2])
+    pad = pad.with_values(pad.values + 0.05 * np.random.default_rng(0).standard_normal(pad.values.size))
+    middles, weighted, tangents = pad.elements(0)
+    steps = np.gradient(middles, axis=0)[1:-1]
+    lengths = np.hypot(*steps.T)
+    assert tangents[1:-1] == pytest.approx(steps / lengths[:, None], abs=0.1)
+    assert weighted[1:-1] == pytest.approx(lengths * pad.path(0)[1][1:-1], rel=0.1)

@@ -8,9 +8,25 @@ import pytest
 from padforge.design import Contact, Morphology, signals
 from padforge.design.twin import PlanTransform
 from padforge.sense.twin.as_built import PadPlan
-from padforge.sense.twin.wiring import Wiring, as_stated, images, planned_paths_mm
+from padforge.sense.twin.responses import Responses
+from padforge.sense.twin.wiring import Wiring, as_stated, find_wirings, images, planned_paths_mm
+from tests.sense.conftest import few_candidates
 
 from .conftest import PLAN
+
+
+@pytest.mark.slow  # the quick tests of `identify` find wirings, too
+@few_candidates()
+def test_find_wirings_puts_the_true_one_first(printed, responses) -> None:
+    """Though readings are missing, and what stands in their place is nonsense."""
+    volts, valid = responses.volts.copy(), responses.valid.copy()
+    volts[::3, 0], valid[::3, 0] = 5.0, False
+    responses = Responses(responses.positions_mm, volts, valid)
+    best = find_wirings(PadPlan.from_morphology(PLAN), responses, np.random.default_rng(0))[0]
+    assert best.fibres == tuple(channel.fibre for channel in printed.channels if channel.fibre is not None)
+    assert best.transform.mirrored
+    assert np.hypot(*np.subtract(best.transform.shift_mm, printed.frame.shift_mm)) < 1.0
+    assert best.match > 0.9
 
 
 @pytest.mark.parametrize(
