@@ -152,12 +152,9 @@ def _train_masked(presses: TrainingPresses, table: Floats, steps: int) -> Predic
 
     def positions(x: Array) -> Array:
         features = x.reshape(len(x), *presses.inputs.shape[1:]).astype(np.float32)
-        fibre_mask, complete = (
-            np.ones((len(x), each.shape[1]), bool) for each in (presses.fibre_mask, presses.complete)
-        )
-        return predict(trained.networks, features, fibre_mask, complete, trained.bayes, trained.residual_network)[
-            0
-        ].astype(np.float64)
+        masks = (np.ones((len(x), each.shape[1]), bool) for each in (presses.fibre_mask, presses.complete))
+        new = ScaledFeatures(features, *masks)
+        return predict(trained.networks, new, trained.bayes, trained.residual_network)[0].astype(np.float64)
 
     return positions
 

@@ -18,9 +18,9 @@ from .localizer.calibration import calibrate as calibrate
 from .localizer.evaluation import Evaluation as Evaluation
 from .localizer.evaluation import evaluate as evaluate
 from .localizer.localizer import Localizer as Localizer
+from .localizer.localizer import PressWindows as PressWindows
 from .localizer.model import Localization as Localization
 from .localizer.model import LocalizerModel as LocalizerModel
-from .localizer.press_windows import PressWindows as PressWindows
 from .localizer.recalibration import Recalibration as Recalibration
 from .localizer.recalibration import recalibrate as recalibrate
 from .recording.recording import Recording as Recording

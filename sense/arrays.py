@@ -21,6 +21,11 @@ MAX_INDEX = 2**53  # largest index that float64 holds exactly
 MIN_SCALE_V = 1e-9  # least standard deviation that an input is divided by: what varies less is constant
 
 
+def masked_mean(values: Array, mask: Mask) -> Array:
+    """Return the means over the first axis of the values in a mask; 0 where it has none."""
+    return np.where(mask, values, 0.0).sum(axis=0) / np.maximum(mask.sum(axis=0), 1)
+
+
 def check_numbers(values: ArrayLike, kind: type[np.generic], name: str, copy: bool = True) -> NDArray[Any]:
     """Convert values to an array of float64 or int64; raise InputError if they are anything else, or too many."""
     allowed = "real numbers" if kind is np.float64 else f"whole numbers up to {MAX_INDEX}"

@@ -161,8 +161,8 @@ def locate(
     Lines on stderr name fibres that are faulty, and those that differ from the calibration, so that radii may fail.
     Exit 1 if the presses are of another pad: then no fibre is masked.
     """
-    from padforge.sense.localizer.doubts import OTHER_PAD
     from padforge.sense.localizer.model import write_localization
+    from padforge.sense.localizer.single_press import OTHER_PAD
 
     file = out or common.pad_folder(recording) / "places.csv"
     opened = read_recording(recording)
@@ -196,7 +196,7 @@ def health(model: Path, recording: Path, as_json: bool) -> int:
     from dataclasses import asdict
 
     from padforge.sense.health.fault_detector import FaultDetector, fault_lines
-    from padforge.sense.localizer.doubts import OTHER_PAD
+    from padforge.sense.localizer.single_press import OTHER_PAD
 
     opened, dead = read_recording(recording), FaultDetector.load(model).model_.dead
     _, findings, shifts, _, is_other_pad = predict_despite_faults(model, opened)

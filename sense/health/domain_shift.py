@@ -110,10 +110,10 @@ def _compare(localizer: LocalizerModel, presses: ScaledFeatures, failed: tuple[i
     Responses are expected at the positions and depths that the localizer predicts without the failed fibres; they are 0
     if no other fibre is valid.
     """
-    scaler, side = localizer.scaler, len(localizer.table)
+    scaler = localizer.scaler
     localization = localizer.predict_features(presses, failed)
     positions = (localization.positions_mm - scaler.origin_mm) / scaler.scale_mm
-    expected = interpolate_grid(localizer.table.reshape(side, side, -1), positions).reshape(presses.inputs.shape)
+    expected = interpolate_grid(localizer.table, positions)
     if scaler.measures:
         expected = expected * (localization.measures["depth_mm"].values / scaler.measures[0].origin)[:, None, None]
     expected_v, response_v = (part * scaler.scale_v + scaler.mean_v for part in (expected, presses.inputs))

@@ -25,14 +25,7 @@ from padforge.sense.health.health_model import (
     HealthModel,
     fit_health_model,
 )
-from padforge.sense.health.trace_model import (
-    RELEASED,
-    REST,
-    TraceHistory,
-    bound_presses,
-    extract_trace,
-    predict_fibres,
-)
+from padforge.sense.health.trace_model import RELEASED, REST, TraceHistory, bound_presses, extract_trace, predict_fibres
 from padforge.sense.localizer.features import MIN_PRESENT
 from padforge.sense.localizer.model_files import check_same_pad, files_of
 from padforge.sense.recording.frames import framed

@@ -22,7 +22,7 @@ from padforge.sense.health.trace_model import (
     predict_fibres,
     train_networks,
 )
-from padforge.sense.localizer.model_files import files_of
+from padforge.sense.localizer.model_files import files_of, select_arrays
 
 FORMAT = "padforge-health/1"
 COMMANDED, DETECTED = "health", "health_live"
@@ -110,15 +110,11 @@ class HealthModel:
         files = files_of(folder, name)
         document = validate(HealthDocument, read_json(files.document, FORMAT), f"{files.document}:")
         arrays = files.read_arrays(document.weights_sha256)
-
-        def part(name: str) -> dict[str, Any]:
-            return {key.removeprefix(f"{name}."): arrays[key] for key in arrays if key.startswith(f"{name}.")}
-
         return cls(
-            TracePCA(**part("pca")),
-            part("weights"),
-            FaultLikelihoods(**part("likelihoods")),
-            ExceedanceModel(**part("exceedance")),
+            TracePCA(**select_arrays(arrays, "pca.")),
+            select_arrays(arrays, "weights."),
+            FaultLikelihoods(**select_arrays(arrays, "likelihoods.")),
+            ExceedanceModel(**select_arrays(arrays, "exceedance.")),
             arrays["rest_range_v"],
             dead=tuple(document.dead),
             **document.model_dump(exclude={"format", "dead", "weights_sha256"}),

@@ -21,7 +21,7 @@ from padforge.sense.arrays import Array
 from padforge.sense.formats.ros_messages import FRAME, HEALTH, PRESSED, READINGS, TOPICS, TOUCHES, UNKNOWN_VARIANCE, Z90
 from padforge.sense.health.fault_detector import FibreFault
 from padforge.sense.live.pipeline import Estimate, Event, Live, OtherPad
-from padforge.sense.localizer.doubts import OTHER_PAD
+from padforge.sense.localizer.single_press import OTHER_PAD
 
 FORMAT = "padforge-live/1"
 MAX_QUEUED = 4096  # lines queued for a subscriber, which is disconnected if it falls further behind

@@ -19,7 +19,6 @@ from padforge.sense.arrays import Array, Indices, Mask, check_stream
 from padforge.sense.health.fault_detector import FaultMonitor, FibreFault
 from padforge.sense.health.health_model import HealthModel
 from padforge.sense.health.trace_model import RELEASED
-from padforge.sense.localizer.doubts import OTHER_PAD
 from padforge.sense.localizer.features import (
     MEDIAN_OFFSET,
     MEDIAN_WIDTH,
@@ -44,7 +43,7 @@ from padforge.sense.localizer.moments import (
     complete_windows,
 )
 from padforge.sense.localizer.press_course import PressCourse
-from padforge.sense.localizer.single_press import MIN_PRESSES, find_misfits, is_other_pad
+from padforge.sense.localizer.single_press import MIN_PRESSES, OTHER_PAD, find_misfits, is_other_pad
 from padforge.sense.recording.frames import FrameStream
 from padforge.sense.rig.streams import HISTORY, SLACK, RingBuffer
 from padforge.sense.signals.press_detection import RELEASE_DELAY_S, TOUCH_DELAY_S, PressDetector

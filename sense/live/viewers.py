@@ -14,7 +14,7 @@ from padforge.common.server import HOST
 from padforge.common.validation import InputError, short_repr
 from padforge.sense.formats.ros_messages import FRAME, HEALTH, PRESSED, READINGS, TOPICS, TOUCHES
 from padforge.sense.live.outputs import Message
-from padforge.sense.localizer.doubts import OTHER_PAD
+from padforge.sense.localizer.single_press import OTHER_PAD
 
 SCENE = "/pad/scene"
 THICKNESS_MM = 1.0  # thickness of the disc

@@ -6,7 +6,7 @@ variances. A few Gauss-Newton steps from that mean, with the posterior of the gr
 posteriori position (the steps of an iterated Kalman filter: M. S. Grewal and A. P. Andrews, Kalman filtering, 2015).
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
@@ -57,17 +57,13 @@ class BayesianLocalizer:
     def fit(
         cls, table: Any, inputs: Any, fibre_mask: Mask, positions: Any, earlier: "BayesianLocalizer | None" = None
     ) -> "BayesianLocalizer":
-        """Fit the likelihood to scaled presses.
+        """Fit the likelihood to scaled presses (Q, C, F + G) at positions (Q, 2).
 
-        Args:
-            table: scaled response by position, over [-1, 1] in x and y; shape (S, S, C, F + G).
-            inputs: scaled features; shape (Q, C, F + G).
-            fibre_mask: valid fibres; shape (Q, C).
-            positions: scaled; shape (Q, 2).
-            earlier: localizer whose discriminants and pressed area are kept. The correlation of the windows of a fibre
-                depends on the silicone more than on the pad, and cannot be estimated from few presses.
+        The table (S, S, C, F + G) is the scaled response over [-1, 1] in x and y. Discriminants and pressed area of an
+        earlier localizer are kept: the correlation of the windows of a fibre depends on the silicone more than on the
+        pad, and cannot be estimated from few presses.
         """
-        side, _, fibres, size = table.shape
+        side, _, fibres, _ = table.shape
         table, inputs, positions = (part.astype(np.float64) for part in (table, inputs, positions))
         low, high = positions.min(axis=0), positions.max(axis=0)
         if earlier is not None:
@@ -81,12 +77,10 @@ class BayesianLocalizer:
         inside = ((coarse >= low - cell) & (coarse <= high + cell)).all(axis=2)
 
         # 2. Discriminants, and the covariance of their residuals on the coarse grid
-        residual = inputs - interpolate_grid(table.reshape(side, side, -1), positions).reshape(inputs.shape)
-        earlier_projection = np.zeros((fibres, size, COMPONENTS)) if earlier is None else earlier.projection
-        projection = fit_projection(table, residual, fibre_mask, earlier_projection)
+        residual = inputs - interpolate_grid(table, positions)
+        projection = fit_projection(table, residual, fibre_mask, COMPONENTS, earlier and earlier.projection)
         residual = np.einsum("qcf,cfd->qcd", residual, projection) * fibre_mask[:, :, None]
-        width = max(cell, SCATTER_WIDTH * mean_distance(positions))
-        scatter = local_scatter(coarse.reshape(-1, 2), positions, residual, fibre_mask, width)
+        scatter = local_scatter(coarse.reshape(-1, 2), positions, residual, fibre_mask, cell)
         scatter = scatter.reshape(*coarse.shape[:2], fibres, -1)
 
         # 3. Linearization and coefficients of the log likelihood, fibre by fibre
@@ -114,12 +108,7 @@ class BayesianLocalizer:
         return cls(*map(_rounded, (*arrays, np.eye(2), np.zeros(2))))
 
     def predict(self, inputs: Any, fibre_mask: Any, xp: Any = np) -> tuple[Any, Any]:
-        """Predict positions and posterior summaries.
-
-        Args:
-            inputs: scaled features; shape (Q, C, F + G).
-            fibre_mask: valid fibres; shape (Q, C).
-            xp: module of all arrays, numpy or torch.
+        """Predict positions and posterior summaries from scaled features (Q, C, F + G); `xp` is numpy or torch.
 
         Returns:
             Maximum a posteriori positions (Q, 2), scaled; and summaries (Q, N_SUMMARY): position, its log variances,
@@ -186,12 +175,6 @@ class BayesianLocalizer:
         prefix = f"{PREFIX}{number}."
         return {prefix + field.name: getattr(self, field.name).astype(np.float32) for field in fields(self)}
 
-    @classmethod
-    def from_arrays(cls, arrays: Mapping[str, Any], number: int) -> "BayesianLocalizer":
-        """Read what `to_arrays` returned."""
-        names = [field.name for field in fields(cls)]
-        return cls(**{name: arrays[f"{PREFIX}{number}.{name}"].astype(np.float64) for name in names})
-
 
 def fit_stages(
     table: Any,
@@ -218,20 +201,19 @@ def fit_stages(
     return tuple(stages)
 
 
-def fit_projection(table: Array, residual: Array, fibre_mask: Mask, earlier: Array) -> Array:
+def fit_projection(
+    table: Array, residual: Array, fibre_mask: Mask, components: int, earlier: Array | None = None
+) -> Array:
     """Return the whitened linear discriminants of each fibre (C, F, D), fitted unless the fibre has `earlier` ones.
 
-    Args:
-        table: response by position, 0 where a feature is not used; shape (S, S, C, F).
-        residual: of presses; shape (Q, C, F).
-        fibre_mask: whether a fibre is valid in a press; shape (Q, C).
-        earlier: discriminants of the earlier pad, 0 for a fibre without; shape (C, F, D).
+    Those of an earlier pad are 0 for a fibre that had none. The response table (S, S, C, F) is 0 where a feature is not
+    used; residuals of presses are (Q, C, F).
     """
-    projection = earlier.copy()
-    for fibre in np.flatnonzero(~earlier.any(axis=(1, 2))):
+    projection = np.zeros((*table.shape[2:], components)) if earlier is None else earlier.copy()
+    for fibre in np.flatnonzero(~projection.any(axis=(1, 2))):
         used, valid = table[:, :, fibre].any(axis=(0, 1)), fibre_mask[:, fibre]
         expected = table[:, :, fibre, used].reshape(len(table) ** 2, -1)
-        projection[fibre, used] = _fit_lda(expected, residual[valid, fibre][:, used], earlier.shape[2])
+        projection[fibre, used] = _fit_lda(expected, residual[valid, fibre][:, used], components)
     return projection
 
 
@@ -264,21 +246,13 @@ def _rounded(part: Array) -> Array:
     return part.astype(np.float32).astype(np.float64)
 
 
-def mean_distance(positions: Array) -> float:
-    """Return the distance between neighbours of (Q, 2) positions, as if they formed a square grid."""
-    return float(np.sqrt(np.ptp(positions, axis=0).prod() / len(np.unique(positions, axis=0))))
+def local_scatter(centres: Array, positions: Array, residual: Array, fibre_mask: Mask, cell: float) -> Any:
+    """Return covariances (P, C, D, D) of whitened residuals (Q, C, D) at centres (P, 2), Gaussian weighted by distance.
 
-
-def local_scatter(centres: Array, positions: Array, residual: Array, fibre_mask: Mask, width: float) -> Any:
-    """Return local covariances (P, C, D, D) of residuals, with Gaussian weights by distance.
-
-    Args:
-        centres: positions of the covariances; shape (P, 2).
-        positions: of the presses; shape (Q, 2).
-        residual: whitened; shape (Q, C, D).
-        fibre_mask: whether a fibre is valid in a press; shape (Q, C).
-        width: standard deviation of the weights.
+    The weights are as wide as some distances between presses, which are taken for a square grid, or as a cell.
     """
+    distance = float(np.sqrt(np.ptp(positions, axis=0).prod() / len(np.unique(positions, axis=0))))
+    width = max(cell, SCATTER_WIDTH * distance)
     fibres, size = residual.shape[1:]
     sums, weights = np.zeros((len(centres), fibres * size * size)), np.zeros((len(centres), fibres))
     step = max(1, _CHUNK // fibres)

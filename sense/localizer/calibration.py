@@ -19,7 +19,6 @@ from padforge.common.validation import InputError, check_float, check_type
 from padforge.design import Contact, Morphology
 from padforge.design.objectives.fibre_loss import failure_subsets
 from padforge.sense.arrays import Array, Indices
-from padforge.sense.localizer.bayes import N_SUMMARY
 from padforge.sense.localizer.evaluation import (
     PRIOR_PRESSES,
     RATIO_SHAPE,
@@ -257,7 +256,7 @@ def fit_model(
     else:
         held_back = scaler.training_presses(data.features[early_stop], data.positions_mm[early_stop])
         networks = {"press": train_published(presses, held_back, rng)}
-    check_trained(networks, residual_network, scaler, options, n_timed)
+    check_trained(networks, residual_network, options)
     model = LocalizerModel(
         networks=networks,
         scaler=scaler,
@@ -396,9 +395,7 @@ def _calibrate_scales(
         rows = np.flatnonzero(count_complete(features.complete) == n_complete)  # the next press may cut off some
         names = active_networks(model.networks, n_complete, features.complete.shape[1], bool(model.bayes))
         for failed in subsets if len(rows) else ():
-            fibre_mask = features.fibre_mask[rows] & ~np.isin(np.arange(model.fibres), failed)
-            inputs = features.inputs[rows], fibre_mask, features.complete[rows]
-            outputs = predict_members(model.networks, *inputs, *model.corrected)
+            outputs = predict_members(model.networks, features[rows].without(failed), *model.corrected)
             predicted, log_error = (half[:, :, :2] for half in np.split(outputs, 2, axis=2))
             error = np.abs(predicted - positions[rows]).mean(axis=2)
             expected_error = np.exp(np.clip(log_error, MIN_LOG_ERROR, MAX_LOG_ERROR)).mean(axis=2)
@@ -426,16 +423,11 @@ def _calibrate_scales(
     return replace(model, networks=networks, residual_network=scaled(RESIDUAL, model.residual_network))
 
 
-def check_trained(
-    networks: Networks, residual_network: Weights, scaler: FeatureScaler, options: LocalizerSettings, n_timed: int
-) -> None:
+def check_trained(networks: Networks, residual_network: Weights, options: LocalizerSettings) -> None:
     """Raise InputError if a training diverged."""
-    n_inputs = scaler.n_inputs(options.method, n_timed)
     try:
-        for weights in networks.values():
-            check_weights(weights, n_inputs, options.method, len(scaler.measures))
-        if residual_network:
-            check_weights(residual_network, n_inputs + N_SUMMARY, options.method)
+        for weights in (*networks.values(), residual_network):
+            check_weights(weights)
     except InputError as error:
         raise InputError(
             f"training diverged at [localizer] learning_rate {options.learning_rate:g}, try a lower one: {error}"

@@ -12,10 +12,11 @@ from padforge.common.progress import OnProgress, ignore_progress
 from padforge.common.validation import InputError, check_int, check_type
 from padforge.design.objectives.fibre_loss import failure_subsets
 from padforge.sense.arrays import Array, Indices
-from padforge.sense.localizer.doubts import find_doubts
 from padforge.sense.localizer.features import PRESS_WINDOWS, compute_features, interpolate_gaps, window_means
 from padforge.sense.localizer.model import Localization, LocalizerModel
 from padforge.sense.localizer.moments import MOMENTS
+from padforge.sense.localizer.single_press import OTHER_PAD
+from padforge.sense.recording import doubts
 from padforge.sense.recording.frames import framed
 from padforge.sense.recording.recording import Recording
 
@@ -35,6 +36,11 @@ RATIO_SHAPE = 2.1
 pad, the moment or the failed fibres."""
 N_PRIOR = 200  # quantiles that represent this distribution
 UNSURE = 0.043  # uncertainty of the share within r90 above which it is reported
+MAX_RADII = 4.0
+"""Maximum distance of the predicted from the stated position, in radii of 90 %: on the published recording it is up to
+2.5, and 5 or more if the sign of a coordinate is lost."""
+MIN_WITHIN_R90 = 0.5  # minimum share of presses within their radii; on a pad that drifted for hours it is larger
+MIN_PRESSES = 20  # minimum number of presses for that share
 ACTIVE = 0.02  # share of its range that a fibre must change by to be active in a press (paper, table III)
 Measures = Mapping[str, Array]
 _NO_PRIOR = np.empty(0)
@@ -138,9 +144,7 @@ def evaluate(
     )
     prediction = model.predict_features(features)
     within_r90 = float((distances(prediction.positions_mm, positions_mm) <= prediction.r90_mm).mean())
-    doubts = find_doubts(
-        recording, model.predict_features(presses), within_r90, len(test), model.is_other_pad(features)
-    )
+    localization, is_other_pad = model.predict_features(presses), model.is_other_pad(features)
     return Evaluation(
         errors=rows,
         split="none" if held_back is None else model.split,
@@ -166,22 +170,36 @@ def evaluate(
         provenance={**model.provenance, "recording_kind": recording.source.get("kind")},
         trained_share=model.trained_share,
         radii_presses=model.radii_presses,
-        doubts=doubts,
+        doubts=find_doubts(recording, localization, within_r90, len(test), is_other_pad),
     )
 
 
+def find_doubts(
+    recording: Recording, localization: Localization, within_r90: float, n_presses: int, is_other_pad: bool = False
+) -> list[str]:
+    """Return reasons to doubt an evaluation, one a line: another pad, and improbable positions.
+
+    The localization is of all presses of the recording, `within_r90` the share of `n_presses` test presses.
+    """
+    lines = doubts.find_doubts(recording)
+    distance = distances(localization.positions_mm, recording.presses_mm)
+    is_misplaced = distance > MAX_RADII * localization.r90_mm  # false where the position is unknown
+    if is_other_pad:
+        lines.append(OTHER_PAD)
+    elif within_r90 < MIN_WITHIN_R90 and n_presses >= MIN_PRESSES:
+        lines.append(f"{within_r90:.0%} of {n_presses} presses lie within r90: is it the recording of this pad?")
+    elif is_misplaced.any():
+        named = doubts.name_presses(recording, is_misplaced)
+        lines.append(f"more than {MAX_RADII:g} r90 from where the fibres say: {named}")
+    return lines
+
+
 def held_back_presses(model: LocalizerModel, recording: Recording) -> Indices | None:
-    """Return the test presses of a model in its training recording, checked; None for any other recording."""
+    """Return the test presses of a model in its training recording; None for any other recording."""
     if recording.digest in model.recalibrated_by:
         raise InputError("recording is one that the localizer was recalibrated by, expected one it has not seen")
     if recording.digest != model.training_recording_sha256:
         return None
-    presses = len(recording.presses_mm)
-    for press in model.test:
-        if press >= presses or not recording.has_position[press]:
-            raise InputError(
-                f"test press {press} of the localizer: no such press, allowed are 0 to {presses - 1} of known position"
-            )
     return np.array(model.test, dtype=np.int64)
 
 
@@ -193,15 +211,10 @@ def errors_by_loss(
     measures: Measures | None = None,
     on_progress: OnProgress = ignore_progress,
 ) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
-    """Return `errors` and `by_subset` of an evaluation.
+    """Return `errors` and `by_subset` of an evaluation, for numbers of failed fibres.
 
-    Args:
-        fibres: their number.
-        levels: numbers of failed fibres.
-        predict: predicts the presses without the fibres of the given indices.
-        positions_mm: true positions; shape (Q, 2).
-        measures: true depths and forces, NaN where unknown; shape (Q,) each.
-        on_progress: called with (sets done, total, "sets of failed fibres").
+    `predict` predicts the presses without the fibres of the given indices. Positions (Q, 2) and measures, the depth and
+    force (Q,), are the true ones, NaN where unknown.
     """
     rows, by_subset = [], []
     by_level = [failure_subsets(fibres, check_int("n_failed", level, 0, fibres - 1)) for level in levels]
@@ -224,10 +237,9 @@ def errors_by_moment(
 ) -> dict[str, Any]:
     """Return the errors of presses at `MOMENTS`, while they are read, for up to `MOMENT_SETS` sets of failed fibres.
 
-    Returns:
-        "by_moment": rows of `error_row`, with "since" touch or lift, "readings" since then, and "time_s"; and "focus":
-        the press of the median error, with "press", "pressed_mm", and "moments" of "since", "time_s", "predicted_mm"
-        and "r90_mm". Both are empty for a localizer without moments.
+    They are "by_moment": rows of `error_row`, with "since" touch or lift, "readings" since then, and "time_s"; and
+    "focus": the press of the median error, with "press", "pressed_mm", and "moments" of "since", "time_s",
+    "predicted_mm" and "r90_mm". Both are empty for a localizer without moments.
     """
     if model.features != "windows":
         return NO_MOMENTS
@@ -244,11 +256,7 @@ def errors_by_moment(
         until = moment.until(touched, frames.up_command)
         raw = compute_features(frames.readings, *commands, until, history=history)
         features = model.scaler.transform(raw[presses])
-        at = {
-            "since": moment.since,
-            "readings": moment.readings,
-            "time_s": round(moment.readings / frames.rate_hz, 3),
-        }
+        at = {"since": moment.since, "readings": moment.readings, "time_s": round(moment.readings / frames.rate_hz, 3)}
         intact.append((at, model.predict_features(features)))
         for n_failed in levels:
             subsets = failure_subsets(model.fibres, n_failed, MOMENT_SETS)
@@ -334,13 +342,14 @@ def conformal(
         Factors (3 + T,) on the standard deviation, the radii of 50 and 90 %, and the r90 of T measures (1 if no true
         value is known).
     """
-    prior = _NO_PRIOR
+    squares = np.square([(each.positions_mm - positions_mm) / each.std_mm for each in predictions])
+    variance, presses, prior = squares.mean(), len(positions_mm), _NO_PRIOR
     if prior_ratio is not None:
         prior = prior_ratio / RATIO_SHAPE * gammaincinv(RATIO_SHAPE, (np.arange(N_PRIOR) + 0.5) / N_PRIOR)
-    standardized = [(each.positions_mm - positions_mm) / each.std_mm for each in predictions]
+        variance = (presses * variance + PRIOR_PRESSES * (prior**2).mean()) / (presses + PRIOR_PRESSES)
     errors = np.array([distances(each.positions_mm, positions_mm) for each in predictions])
     factors = [
-        float(np.sqrt(_joint_mean(np.square(standardized), len(positions_mm), prior**2))),
+        float(np.sqrt(variance)),
         _conformal_quantile(0.5, errors / [each.r50_mm for each in predictions], prior),
         _conformal_quantile(0.9, errors / [each.r90_mm for each in predictions], prior),
     ]
@@ -349,13 +358,6 @@ def conformal(
         ratios = ratios[:, np.isfinite(ratios).all(axis=0)]
         factors.append(_conformal_quantile(0.9, ratios) if ratios.shape[1] else 1.0)
     return np.array(factors)
-
-
-def _joint_mean(values: Array, presses: int, prior: Array) -> float:
-    """Mean of the values of `presses` presses and of those of the prior, if any, weighted by PRIOR_PRESSES."""
-    if not len(prior):
-        return float(values.mean())
-    return float((presses * values.mean() + PRIOR_PRESSES * prior.mean()) / (presses + PRIOR_PRESSES))
 
 
 def _conformal_quantile(share: float, ratios: Array, prior: Array = _NO_PRIOR) -> float:
@@ -427,18 +429,13 @@ def calibration_lines(document: Mapping[str, Any]) -> list[str]:
 
 def reserve_lines(document: Mapping[str, Any]) -> list[str]:
     """Say in lines with what reserve a calibration document is to be read: training, radii, and what is doubtful."""
-    share = document.get("trained_share", 1.0)
-    untrained = [f"not trained out: {share:.0%} of the usual steps; errors fall with more time"]
-    doubts = [f"doubtful: {doubt}" for doubt in document.get("doubts", ())]
-    return [*(untrained if share < TRAINED_OUT else ()), *sureness_lines(document), *doubts]
-
-
-def sureness_lines(document: Mapping[str, Any]) -> list[str]:
-    """Return a line on the uncertainty of the radii of a calibration document if few presses calibrated them."""
-    presses = document.get("radii_presses", 0)
-    slack = 2 * math.sqrt(0.9 * 0.1 / presses) if presses else 0.0
-    line = f"radii rest on few presses: of many others {0.9 - slack:.0%} to {min(0.9 + slack, 1):.0%} may lie in r90"
-    return [line] * (slack > UNSURE)
+    share, presses, lines = document.get("trained_share", 1.0), document.get("radii_presses", 0), []
+    if share < TRAINED_OUT:
+        lines.append(f"not trained out: {share:.0%} of the usual steps; errors fall with more time")
+    if presses and (slack := 2 * math.sqrt(0.9 * 0.1 / presses)) > UNSURE:
+        many = f"{0.9 - slack:.0%} to {min(0.9 + slack, 1):.0%}"
+        lines.append(f"radii rest on few presses: of many others {many} may lie in r90")
+    return [*lines, *(f"doubtful: {doubt}" for doubt in document.get("doubts", ()))]
 
 
 def moment_lines(rows: Sequence[Mapping[str, Any]]) -> list[str]:

@@ -1,14 +1,10 @@
 """Features of presses: means of each fibre's readings over windows of the press, and its history before it.
 
-Both are relative to the baseline of the fibre, its mean at rest just before the press (`REST` of `moments`):
-
-- The windows are those of `moments`: they show the response to the press. Where a window would reach into a
-  neighbouring press, the nearest reading of its own press is repeated.
-- The history is the mean over each of `HISTORY_WINDOWS` and the median over each of `SLOW`, which end before the press,
-  whatever happened in them. It shows how far the fibre has crept after earlier presses, and so how it still creeps.
-
-Each feature depends on one fibre alone, so that a failed fibre can be masked and affects no other.
-Short gaps (NaN) are interpolated; a fibre with too few readings in a press is masked in it.
+Both are relative to the baseline of the fibre, its mean at rest just before the press. Where a window of `moments`
+would reach into a neighbouring press, the nearest reading of its own press is repeated. The history shows how far the
+fibre has crept after earlier presses, and so how it still creeps. Each feature depends on one fibre alone, so that a
+failed fibre can be masked and affects no other. Short gaps (NaN) are interpolated; a fibre with too few readings in a
+press is masked in it.
 """
 
 from dataclasses import dataclass
@@ -72,15 +68,11 @@ def compute_features(
     is_published: bool = False,
     history: Array | None = None,
 ) -> PressFeatures:
-    """Compute the features of every press.
+    """Compute the features of every press from readings (R, C), V, NaN where missing.
 
-    Args:
-        readings: NaN where missing; shape (R, C), V.
-        down_command: first readings after the probe was sent down; shape (Q,).
-        up_command: first readings after it was sent up; shape (Q,).
-        until: first readings that are not used; shape (Q,). None for all readings up to the next press.
-        is_published: whether to compute the published running medians, which do not depend on `until`.
-        history: of the presses, if computed before, since it takes longest; shape (Q, C, J).
+    Commands (Q,) are the first readings after the probe was sent down and up, `until` (Q,) the first readings that are
+    not used, None for all up to the next press. The published running medians do not depend on it. The history
+    (Q, C, J) of the presses takes longest, and is given if it was computed before.
     """
     filled = interpolate_gaps(readings)
     _, next_begin = _neighbours(down_command, up_command, len(readings))

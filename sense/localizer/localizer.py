@@ -1,28 +1,50 @@
-"""The estimator: a localizer with `fit`, `predict`, `score`, `evaluate`, `save` and `load`, as in scikit-learn."""
+"""Estimators as in scikit-learn: the localizer, and features of presses for any regressor."""
 
 import hashlib
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from padforge.common.progress import OnProgress, ignore_progress
 from padforge.common.settings import validate
-from padforge.common.validation import InputError, check_float
+from padforge.common.validation import InputError, check_float, check_type
 from padforge.sense.arrays import MAX_MM, MAX_VOLTS, Array, Indices, check_magnitude, check_numbers
 from padforge.sense.localizer.calibration import MAX_TIME_BUDGET_S, CalibrationData, calibrate, fit_model, fit_recording
 from padforge.sense.localizer.evaluation import Evaluation, distances, evaluate
-from padforge.sense.localizer.features import PressFeatures, features_without_moments
+from padforge.sense.localizer.features import MODULATED, PressFeatures, compute_features, features_without_moments
 from padforge.sense.localizer.model import Localization, LocalizerModel
+from padforge.sense.localizer.scaler import FeatureScaler
+from padforge.sense.recording.frames import framed
 from padforge.sense.recording.recording import PressSelection, Recording
 from padforge.sense.settings import LocalizerSettings
 
 OPTIONS = tuple(name for name in LocalizerSettings.model_fields if name not in ("max_failures", "seed"))
 
 
-class Localizer:
+class _Estimator:
+    """Parameters and representation as scikit-learn asks for them."""
+
+    _names: ClassVar[tuple[str, ...]] = ()  # of the arguments of the constructor
+
+    def get_params(self, deep: bool = True) -> dict[str, Any]:
+        """Return the arguments of the constructor by name; `deep` has no effect."""
+        return {name: getattr(self, name) for name in self._names}
+
+    def set_params(self, **params: Any) -> Self:
+        """Set arguments of the constructor by name; the others stay."""
+        self.__init__(**{**self.get_params(), **params})
+        return self
+
+    def __repr__(self) -> str:
+        usual = type(self)().get_params()
+        changed = (f"{name}={value!r}" for name, value in self.get_params().items() if value != usual[name])
+        return f"{type(self).__name__}({', '.join(changed)})"
+
+
+class Localizer(_Estimator):
     """Localizer of presses, in the manner of scikit-learn's estimators.
 
     Args:
@@ -38,6 +60,7 @@ class Localizer:
         InputError: an option that `LocalizerSettings` has not.
     """
 
+    _names = ("max_failures", "random_state", *OPTIONS)
     model_: LocalizerModel
     calibration_: Evaluation
 
@@ -58,28 +81,6 @@ class Localizer:
         """
         options = settings.model_dump()
         return cls(random_state=options.pop("seed"), **options)
-
-    def get_params(self, deep: bool = True) -> dict[str, Any]:
-        """Return the arguments of the constructor by name.
-
-        Args:
-            deep: without effect; scikit-learn passes it.
-        """
-        return {name: getattr(self, name) for name in ("max_failures", "random_state", *OPTIONS)}
-
-    def set_params(self, **params: Any) -> "Localizer":
-        """Set arguments of the constructor.
-
-        Args:
-            **params: arguments by name; the others stay.
-        """
-        self.__init__(**{**self.get_params(), **params})
-        return self
-
-    def __repr__(self) -> str:
-        usual = Localizer().get_params()
-        changed = (f"{name}={value!r}" for name, value in self.get_params().items() if value != usual[name])
-        return f"Localizer({', '.join(changed)})"
 
     @property
     def test_presses_(self) -> Indices:
@@ -221,6 +222,73 @@ class Localizer:
         if not hasattr(self, "model_"):
             raise InputError("the localizer is not fitted, expected fit or load before")
         return self.model_
+
+
+class PressWindows(_Estimator):
+    """Transformer from presses of a recording to what the localizer's networks see of them.
+
+    That is, for each fibre, its windows without the effect of its history and the modulations of its sensitivity,
+    scaled to about 1; 0 for a fibre that gave too few readings. In a pipeline a regressor follows it::
+
+        make_pipeline(PressWindows(), KNeighborsRegressor()).fit(recording, recording.presses_mm)
+    """
+
+    scaler_: FeatureScaler
+
+    def fit(self, X: Recording | PressSelection, y: ArrayLike | None = None) -> "PressWindows":
+        """Learn the response to presses, what history does to it, and its scale.
+
+        Args:
+            X: a recording, or presses of one, `recording[presses]`.
+            y: (Q, 2) positions, mm; None for those of the recording.
+
+        Raises:
+            InputError: no recording, or positions that are missing or not as many.
+        """
+        positions_mm = np.asarray(X.presses_mm if y is None else y, dtype=np.float64)
+        if positions_mm.shape != (len(X), 2) or not np.isfinite(positions_mm).all():
+            raise InputError(f"y has shape {positions_mm.shape}, expected ({len(X)}, 2) numbers")
+        self.scaler_, _ = FeatureScaler.fit(_features(X), positions_mm, None, MODULATED)
+        return self
+
+    def transform(self, X: Recording | PressSelection) -> Array:
+        """Return the features; shape (Q, C * F).
+
+        Args:
+            X: a recording of the pad, or presses of one.
+
+        Raises:
+            InputError: not fitted.
+        """
+        if not hasattr(self, "scaler_"):
+            raise InputError("the transformer is not fitted, expected fit before")
+        scaled = self.scaler_.transform(_features(X))
+        return np.where(scaled.fibre_mask[:, :, None], scaled.inputs, 0.0).reshape(len(X), -1)
+
+    def fit_transform(self, X: Recording | PressSelection, y: ArrayLike | None = None) -> Array:
+        """Fit, and return the features of the same presses.
+
+        Args:
+            X: as of `fit`.
+            y: as of `fit`.
+        """
+        return self.fit(X, y).transform(X)
+
+    def __sklearn_tags__(self) -> Any:
+        from sklearn.utils import InputTags, Tags, TargetTags, TransformerTags  # only scikit-learn itself asks
+
+        return Tags(
+            estimator_type=None,
+            target_tags=TargetTags(required=False),
+            transformer_tags=TransformerTags(),
+            input_tags=InputTags(two_d_array=False),
+        )
+
+
+def _features(X: Recording | PressSelection) -> PressFeatures:
+    selection = X[:] if isinstance(X, Recording) else check_type("X", X, PressSelection)
+    frames = framed(selection.recording)
+    return compute_features(frames.readings, frames.down_command, frames.up_command)[selection.presses]
 
 
 def _array_features(X: ArrayLike) -> PressFeatures:

@@ -4,7 +4,7 @@ A localizer trained on presses of several depths also predicts depth, and force 
 """
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
@@ -20,7 +20,7 @@ from padforge.sense.formats.columns import join_names
 from padforge.sense.localizer.bayes import PREFIX as BAYES
 from padforge.sense.localizer.bayes import BayesianLocalizer
 from padforge.sense.localizer.features import FeatureSet, PressFeatures, compute_features
-from padforge.sense.localizer.model_files import check_same_pad, files_of
+from padforge.sense.localizer.model_files import check_same_pad, files_of, select_arrays
 from padforge.sense.localizer.moments import (
     BAYES_STAGES,
     N_PRESS_WINDOWS,
@@ -87,27 +87,24 @@ def write_localization(localization: Localization, path: str | Path) -> None:
     """Write predictions as CSV of `COLUMNS` and `MEASURE_COLUMNS`, one line a press, atomically."""
     estimates = [column for measure in localization.measures.values() for column in (measure.values, measure.r90)]
     columns = [localization.positions_mm, localization.std_mm, localization.r50_mm, localization.r90_mm, *estimates]
-    names = (*COLUMNS, *(name for measure in localization.measures for name in MEASURE_COLUMNS[measure]))
-    texts = [[f"{value:.4f}" for value in row] for row in np.column_stack(columns).tolist()]
-    is_unlike = np.zeros(len(texts), bool) if localization.unlike is None else localization.unlike
-    for row, unlike in zip(texts, is_unlike.tolist(), strict=True):
-        row.insert(COLUMNS.index("unlike") - 1, str(int(unlike)))
-    lines = [",".join([str(press), *row]) for press, row in enumerate(texts)]
+    rows = np.column_stack(columns)
+    unlike = np.zeros(len(rows), bool) if localization.unlike is None else localization.unlike
+    lines = [",".join([*COLUMNS, *(name for measure in localization.measures for name in MEASURE_COLUMNS[measure])])]
+    for press, (row, is_unlike) in enumerate(zip(rows.tolist(), unlike.tolist(), strict=True)):
+        position, measures = ([f"{value:.4f}" for value in part] for part in (row[:6], row[6:]))
+        lines.append(",".join([str(press), *position, str(int(is_unlike)), *measures]))
     with reraise_write_error(Path(path)):
-        write_text(Path(path), "\n".join([",".join(names), *lines]) + "\n")
+        write_text(Path(path), "\n".join(lines) + "\n")
 
 
 def concatenate(parts: Sequence[Localization]) -> Localization:
     """Concatenate one or more predictions of the same measures, without `unlike`."""
-
-    def stack(estimates: Sequence[Any], *names: str) -> Iterator[Array]:
-        return (np.concatenate([getattr(estimate, name) for estimate in estimates]) for name in names)
-
-    measures = {
-        name: MeasureEstimate(*stack([part.measures[name] for part in parts], "values", "r90"))
-        for name in parts[0].measures
-    }
-    return Localization(*stack(parts, "positions_mm", "std_mm", "r50_mm", "r90_mm"), measures)
+    columns = [(part.positions_mm, part.std_mm, part.r50_mm, part.r90_mm) for part in parts]
+    measures = {}
+    for name in parts[0].measures:
+        estimates = [(part.measures[name].values, part.measures[name].r90) for part in parts]
+        measures[name] = MeasureEstimate(*map(np.concatenate, zip(*estimates, strict=True)))
+    return Localization(*map(np.concatenate, zip(*columns, strict=True)), measures)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -151,9 +148,9 @@ class LocalizerModel(LocalizerDocument):
 
     networks: Networks
     table: Floats
+    single_press: tuple[SinglePressTest, ...]
     bayes: tuple[BayesianLocalizer, ...] = ()
     residual_network: Weights = field(default_factory=dict)
-    single_press: tuple[SinglePressTest, ...] = ()
 
     @property
     def fibres(self) -> int:
@@ -173,7 +170,8 @@ class LocalizerModel(LocalizerDocument):
     @property
     def sliding(self) -> Sliding | None:
         """Tracking of sliding fingers; None if the localizer does not track them."""
-        return Sliding(*self.scaler.latest_window_map(N_TIMED)) if SLIDE_NETWORK in self.networks else None
+        weights = self.networks.get(SLIDE_NETWORK)
+        return Sliding(weights, *self.scaler.latest_window_map(N_TIMED)) if weights else None
 
     def check_recording(self, recording: Recording) -> None:
         """Raise InputError unless a recording is of the pad of the training, with its fibres, their names and its rate.
@@ -285,13 +283,11 @@ class LocalizerModel(LocalizerDocument):
             InputError: as `predict_features`.
         """
         localization = self.predict_features(presses, failed)
-        presses = replace(presses, fibre_mask=np.logical_and(presses.fibre_mask, self._working(failed)))
+        presses = presses.without(self._check_failed(failed))
         unlike = find_unlike(self.single_press, presses)
         rows = np.flatnonzero(unlike)
         if self.sliding is not None and len(rows):  # a sliding finger responds like several presses
-            inputs = presses.inputs[rows], presses.fibre_mask[rows], presses.complete[rows]
-            tracked = self.sliding.follow(self.networks[SLIDE_NETWORK], *inputs)
-            unlike[rows] = tracked.distance <= POSSIBLE_SLIDE_THRESHOLD
+            unlike[rows] = self.sliding.follow(presses[rows]).distance <= POSSIBLE_SLIDE_THRESHOLD
         std_mm, r50_mm, r90_mm = np.array(UNIFORM) * self.scaler.scale_mm
         return replace(
             localization,
@@ -318,15 +314,15 @@ class LocalizerModel(LocalizerDocument):
         Raises:
             InputError: `failed` are no indices of fibres, or all of them, or any for method "published".
         """
-        fibre_mask: Mask = np.logical_and(presses.fibre_mask, self._working(failed))
+        presses = presses.without(self._check_failed(failed))
         chunk = max(1, _CHUNK // self.fibres)
-        parts = []
-        for first in range(0, max(len(presses), 1), chunk):
-            rows = slice(first, first + chunk)
-            inputs = presses.inputs[rows], fibre_mask[rows], presses.complete[rows]
-            parts.append(predict(self.networks, *inputs, *self.corrected, self.sliding))
+        starts = range(0, max(len(presses), 1), chunk)
+        parts = [
+            predict(self.networks, presses[first : first + chunk], *self.corrected, self.sliding) for first in starts
+        ]
         targets, std, slid = (np.concatenate(part) for part in zip(*parts, strict=True))
-        n_complete, level = count_complete(presses.complete), np.minimum((~fibre_mask).sum(axis=1), self.max_failures)
+        fibre_mask, n_complete = presses.fibre_mask, count_complete(presses.complete)
+        level = np.minimum((~fibre_mask).sum(axis=1), self.max_failures)
         factors = self.interval_factors[np.where(slid, N_PRESS_WINDOWS - 1, n_complete), level]
         to_std, to_r50, to_r90 = factors[:, :3].T * self.scaler.scale_mm
         radius = np.hypot(*std[:, :2].T)
@@ -347,8 +343,8 @@ class LocalizerModel(LocalizerDocument):
             measures,
         )
 
-    def _working(self, failed: ArrayLike) -> Mask:
-        """(C,) false for failed fibres."""
+    def _check_failed(self, failed: ArrayLike) -> Indices:
+        """Return indices of failed fibres, checked."""
         indices = np.asarray(failed).ravel()
         if indices.size and not (indices.dtype.kind in "iu" and ((indices >= 0) & (indices < self.fibres)).all()):
             raise InputError(f"failed is {short_repr(failed)}, expected indices of fibres, 0 to {self.fibres - 1}")
@@ -356,10 +352,9 @@ class LocalizerModel(LocalizerDocument):
             raise InputError(
                 "failed is given: method published knows no fibre loss, expected a model of method ensemble"
             )
-        working = ~np.isin(np.arange(self.fibres), indices)
-        if not working.any():
+        if len(np.unique(indices)) == self.fibres:
             raise InputError(f"all {self.fibres} fibres are failed, expected at least one that works")
-        return working
+        return indices
 
     def save(self, folder: str | Path) -> None:
         """Write `localizer.json` and `localizer.safetensors` atomically; `load` restores every bit.
@@ -401,17 +396,18 @@ class LocalizerModel(LocalizerDocument):
         document, digest = _read_document(content, str(files.document))
         n_timed = len(document.interval_factors) - 1
         arrays = files.read_arrays(digest)
-        table = arrays.pop(TABLE)
-        networks: dict[str, dict[str, Any]] = {name: {} for name in (*PHASES[n_timed], RESIDUAL)}
-        for name in [name for name in arrays if not name.startswith((BAYES, SINGLE_PRESS))]:
-            phase, _, part = name.partition(".")
-            networks[phase][part] = arrays.pop(name)
-        residual_network = networks.pop(RESIDUAL)
+        residual_network = select_arrays(arrays, f"{RESIDUAL}.")
         n_stages = (len(BAYES_STAGES) if n_timed else 1) if residual_network else 0
-        bayes = tuple(BayesianLocalizer.from_arrays(arrays, number) for number in range(n_stages))
-        tests = tuple(SinglePressTest.from_arrays(arrays, number) for number in range(len(stages(n_timed))))
-        parts: dict[str, Any] = {"networks": networks, "table": table, "bayes": bayes, "single_press": tests}
-        return cls(**vars(document), **parts, residual_network=residual_network)
+        bayes = [select_arrays(arrays, f"{BAYES}{number}.") for number in range(n_stages)]
+        tests = [select_arrays(arrays, f"{SINGLE_PRESS}{number}.") for number in range(len(stages(n_timed)))]
+        return cls(
+            **vars(document),
+            networks={name: select_arrays(arrays, f"{name}.") for name in PHASES[n_timed]},
+            table=arrays[TABLE],
+            bayes=tuple(BayesianLocalizer(**stage).map_arrays(np.float64) for stage in bayes),
+            residual_network=residual_network,
+            single_press=tuple(SinglePressTest(**test) for test in tests),
+        )
 
 
 def _read_document(document: Mapping[str, Any], where: str) -> tuple[LocalizerDocument, str]:

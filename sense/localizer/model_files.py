@@ -48,18 +48,9 @@ def files_of(folder: str | Path, name: str) -> ModelFiles:
     return ModelFiles(folder / f"{name}.json", folder / f"{name}.safetensors")
 
 
-def check_arrays(
-    arrays: Mapping[str, NDArray[Any]], expected: Mapping[str, tuple[tuple[int, ...], type]], limit: float
-) -> None:
-    """Raise InputError unless arrays have the expected shapes and types, and entries up to a limit."""
-    actual = {name: (array.shape, array.dtype.type) for name, array in arrays.items()}
-    if actual != expected:
-        wrong = min(name for name in actual.keys() | expected if actual.get(name) != expected.get(name))
-        raise InputError(f"{wrong} is {actual.get(wrong)}, expected {expected.get(wrong)}")
-    for name, array in arrays.items():
-        largest = np.abs(array).max(initial=0)
-        if not largest <= limit:
-            raise InputError(f"{name} is up to {largest:g}, allowed is up to {limit:g}")
+def select_arrays(arrays: Mapping[str, NDArray[Any]], prefix: str) -> dict[str, NDArray[Any]]:
+    """Return the arrays whose names begin with a prefix, by their names without it."""
+    return {name.removeprefix(prefix): array for name, array in arrays.items() if name.startswith(prefix)}
 
 
 def check_same_pad(model: Any, what: str, fibres: int, rate_hz: float) -> None:

@@ -16,18 +16,17 @@ import numpy as np
 from padforge.common.validation import InputError
 from padforge.sense.arrays import Floats, Mask
 from padforge.sense.localizer.bayes import BayesianLocalizer
-from padforge.sense.localizer.model_files import check_arrays
 from padforge.sense.localizer.moments import (
     EARLY_WINDOWS,
     LATEST_WINDOWS,
     N_PRESS_WINDOWS,
     RESIDUAL,
-    SLIDE_NETWORK,
     SLIDE_THRESHOLD,
     active_networks,
     bayes_stage,
     count_complete,
 )
+from padforge.sense.localizer.scaler import ScaledFeatures
 
 Weights = Mapping[str, Floats]
 """`first.w` (E, I, H), `first.b` (E, 1, H), `hidden.w` (layers, E, H, H), `hidden.b` (layers, E, 1, H), `last.w`
@@ -43,23 +42,12 @@ MAX_LOG_ERROR = 2.0  # more than the pad
 MAX_WEIGHT = 1e4  # far above the weights of any training; sums of smaller ones do not overflow
 
 
-def check_weights(weights: Weights, n_inputs: int, method: str, n_measures: int = 0) -> None:
-    """Raise InputError unless weights have the shapes and values of a network of I inputs and T measures."""
-    shapes = {name: weight.shape for name, weight in weights.items()}
-    first, layers = shapes.get("first.w", ()), shapes.get("hidden.w", (0,))[:1]
-    if len(first) != 3 or len(layers) != 1 or 0 in first:
-        raise InputError(f"weights have shapes {shapes}, expected first.w (E, I, H) and others")
-    members, _, hidden = first
-    outputs = N_OUTPUTS + 2 * n_measures if method == "ensemble" else 2
-    expected = {
-        "first.w": (members, n_inputs, hidden),
-        "first.b": (members, 1, hidden),
-        "last.w": (members, hidden, outputs),
-        "last.b": (members, 1, outputs),
-    }
-    if method == "ensemble":
-        expected |= {"hidden.w": (*layers, members, hidden, hidden), "hidden.b": (*layers, members, 1, hidden)}
-    check_arrays(weights, {name: (shape, np.float32) for name, shape in expected.items()}, MAX_WEIGHT)
+def check_weights(weights: Weights) -> None:
+    """Raise InputError if a weight is NaN, or beyond those of any training."""
+    for name, array in weights.items():
+        largest = np.abs(array).max()
+        if not largest <= MAX_WEIGHT:
+            raise InputError(f"{name} is up to {largest:g}, allowed is up to {MAX_WEIGHT:g}")
 
 
 def network_inputs(features: Floats, fibre_mask: Mask, complete: Mask) -> Floats:
@@ -88,30 +76,26 @@ Networks = Mapping[str, Weights]
 
 def predict_members(
     networks: Networks,
-    features: Floats,
-    fibre_mask: Mask,
-    complete: Mask,
+    presses: ScaledFeatures,
     bayes: Sequence[BayesianLocalizer] = (),
     residual_network: Weights = MappingProxyType({}),
 ) -> Floats:
     """Return the outputs (E, Q, 2 N) of the members that answer for presses with equally many complete windows.
 
-    Args:
-        networks: by phase.
-        features: scaled; shape (Q, C, F + G).
-        fibre_mask: valid fibres; shape (Q, C).
-        complete: complete windows, the same number in each press; shape (Q, K).
-        bayes: Bayesian localizers by stage. With them, the one of the stage is the last member.
-        residual_network: corrects the Bayesian localizer.
+    With `bayes`, the last member is the Bayesian localizer of the stage, corrected by the residual network.
     """
-    n_complete, n_timed = int(complete[:1].sum()), complete.shape[1]
+    n_complete, n_timed = int(presses.complete[:1].sum()), presses.complete.shape[1]
     is_published = "hidden.w" not in next(iter(networks.values()))
-    x = features.reshape(len(features), -1) if is_published else network_inputs(features, fibre_mask, complete)
+    x = (
+        presses.inputs.reshape(len(presses), -1)
+        if is_published
+        else network_inputs(presses.inputs, presses.fibre_mask, presses.complete)
+    )
     names = active_networks(networks, n_complete, n_timed, bool(bayes))
     outputs = [forward(networks[name], x) for name in names if name != RESIDUAL]
     if RESIDUAL in names:
         localizer = bayes[bayes_stage(n_complete, n_timed) or 0]
-        position, summary = localizer.predict(features.astype(np.float64), fibre_mask)
+        position, summary = localizer.predict(presses.inputs.astype(np.float64), presses.fibre_mask)
         outputs.append(forward(residual_network, np.concatenate([x, summary.astype(np.float32)], axis=1)))
         outputs[-1][:, :, :2] += position
     return np.concatenate(outputs)
@@ -119,41 +103,31 @@ def predict_members(
 
 def predict(
     networks: Networks,
-    features: Floats,
-    fibre_mask: Mask,
-    complete: Mask,
+    presses: ScaledFeatures,
     bayes: Sequence[BayesianLocalizer] = (),
     residual_network: Weights = MappingProxyType({}),
     sliding: "Sliding | None" = None,
 ) -> tuple[Floats, Floats, Mask]:
     """Predict presses at any moments, those of sliding fingers by `SLIDE_NETWORK`.
 
-    Args:
-        networks: by phase.
-        features: as in `predict_members`.
-        fibre_mask: as there.
-        complete: complete windows, whose number may differ between presses; shape (Q, K).
-        bayes: as there.
-        residual_network: as there.
-        sliding: how sliding fingers are tracked; None if they are not.
-
     Returns:
         Scaled targets (Q, N) and their standard deviations, 0 where no window is complete; and whether a finger has
         slid (Q,).
     """
-    n_complete = count_complete(complete)
+    n_complete = count_complete(presses.complete)
     first = next(iter(networks.values()))
     n_targets = first["last.w"].shape[2] // (2 if "hidden.w" in first else 1)
-    targets, std = np.zeros((2, len(complete), n_targets), np.float32)
+    targets, std = np.zeros((2, len(presses), n_targets), np.float32)
     for count in np.unique(n_complete).tolist():
-        if count or not complete.shape[1]:
-            rows = n_complete == count
-            inputs = features[rows], fibre_mask[rows], complete[rows]
-            targets[rows], std[rows] = combine_members(predict_members(networks, *inputs, bayes, residual_network))
-    slid = np.zeros(len(complete), bool)
+        if count or not presses.complete.shape[1]:
+            rows = np.flatnonzero(n_complete == count)
+            targets[rows], std[rows] = combine_members(
+                predict_members(networks, presses[rows], bayes, residual_network)
+            )
+    slid = np.zeros(len(presses), bool)
     rows = np.flatnonzero(n_complete >= N_PRESS_WINDOWS)
     if sliding is not None and len(rows):
-        tracked = sliding.follow(networks[SLIDE_NETWORK], features[rows], fibre_mask[rows], complete[rows])
+        tracked = sliding.follow(presses[rows])
         slid[rows] = tracked.distance > SLIDE_THRESHOLD
         targets[slid], std[slid] = tracked.targets[slid[rows]], tracked.std[slid[rows]]
     return targets, std, slid
@@ -171,32 +145,27 @@ class TrackedFinger(NamedTuple):
 class Sliding:
     """Tracking of sliding fingers."""
 
+    weights: Weights  # of `SLIDE_NETWORK`
     # (C, len(LATEST_WINDOWS), len(PRESS_WINDOWS)), see `FeatureScaler.latest_window_map`
     now_factor: Floats
     now_offset: Floats
 
-    def follow(self, weights: Weights, features: Floats, fibre_mask: Mask, complete: Mask) -> TrackedFinger:
-        """Track the finger of presses whose touch is complete.
-
-        Args:
-            weights: of `SLIDE_NETWORK`.
-            features: scaled; shape (Q, C, F + G).
-            fibre_mask: valid fibres; shape (Q, C).
-            complete: complete windows; shape (Q, K).
-        """
-        n_timed = complete.shape[1]
+    def follow(self, presses: ScaledFeatures) -> TrackedFinger:
+        """Track the finger of presses whose touch is complete."""
+        n_timed = presses.complete.shape[1]
 
         def predict_from(features: Floats, n_complete: int) -> tuple[Floats, Floats]:
-            inputs = network_inputs(features, fibre_mask, complete & (np.arange(n_timed) < n_complete))
-            return combine_members(forward(weights, inputs))
+            complete = presses.complete & (np.arange(n_timed) < n_complete)
+            return combine_members(forward(self.weights, network_inputs(features, presses.fibre_mask, complete)))
 
-        targets, std = predict_from(features, N_PRESS_WINDOWS)
+        targets, std = predict_from(presses.inputs, N_PRESS_WINDOWS)
         # At `EARLY_WINDOWS`, the latest windows were the last of these, which are single readings.
-        early = features.copy()
+        early = presses.inputs.copy()
         for k in range(len(LATEST_WINDOWS)):
             window = EARLY_WINDOWS - 1 - k
-            latest = features[:, :, window] * self.now_factor[:, k, window] + self.now_offset[:, k, window]
-            early[:, :, n_timed + k] = latest
+            early[:, :, n_timed + k] = (
+                early[:, :, window] * self.now_factor[:, k, window] + self.now_offset[:, k, window]
+            )
         early_targets, early_std = predict_from(early, EARLY_WINDOWS)
         distance = np.hypot(*(targets - early_targets)[:, :2].T)
         distance = distance / np.maximum(np.hypot(*early_std[:, :2].T), np.float32(1e-9))

@@ -30,17 +30,10 @@ class PressCourse:
 
     @classmethod
     def fit(cls, model: LocalizerModel, features: PressFeatures, position_mm: Array) -> "PressCourse":
-        """Fit the proportion.
-
-        Args:
-            model: localizer that was fitted to windows.
-            features: of one press.
-            position_mm: its position; shape (2,).
-        """
-        scaler, side = model.scaler, len(model.table)
+        """Fit the proportion to the features of one press at a position (2,); the localizer is of windows."""
+        scaler = model.scaler
         position = (position_mm - scaler.origin_mm)[None] / scaler.scale_mm
-        table = interpolate_grid(model.table.reshape(side, side, -1), position).reshape(scaler.mean_v.shape)
-        scaled = np.stack([table, scaler.transform(features).inputs[0]])
+        scaled = np.stack([interpolate_grid(model.table, position)[0], scaler.transform(features).inputs[0]])
         expected, measured = (scaler.uncentre(scaled) * scaler.scale_v).swapaxes(1, 2)
         latest, mask = max(int(features.complete[0, :N_PRESS_WINDOWS].sum()) - 1, 0), features.fibre_mask[0]
         expected *= _proportion(measured[latest], expected[latest], mask)

@@ -1,14 +1,7 @@
 """Recalibration: adapt a localizer to its pad, or to another one of the same plan, with a few new presses.
 
-Three models are compared by cross-validation over these presses:
-
-1. The localizer as it is.
-2. Corrected: a gain for every fibre, and the position, angle and scale of the pad, which are folded into the scaling of
-   the features and the last layer of the networks.
-3. Refitted: the response of each fibre is fitted again. Its prior is the plan of the pad and the present maps,
-   corrected if that is more probable, so that an unchanged fibre keeps its map and a new one gets another. The Bayesian
-   localizers are fitted to this response, and the networks are fine-tuned on it. This serves a pad that has drifted,
-   that was cast again, or that has a new fibre.
+The localizer as it is, a corrected and a refitted one (`fit_correction`, `refit`) are compared by cross-validation over
+these presses.
 """
 
 from collections.abc import Callable, Sequence
@@ -218,14 +211,10 @@ def refit(
 ) -> tuple[LocalizerModel, Mask]:
     """Refit response, Bayesian localizers and networks to new presses; return the localizer, and which fibres are new.
 
-    Args:
-        old: the localizer as it is.
-        features: of the new presses, V.
-        positions_mm: of these; shape (Q, 2).
-        measures: depths and forces of these, NaN where unknown; shape (Q,) each.
-        plan: prior from the plan of the pad; None without a plan.
-        seed: of the training.
-        only_last: whether to retrain only the networks that answer at the end of a press.
+    This serves a pad that has drifted, that was cast again, or that has a new fibre: an unchanged fibre keeps its map,
+    and a new one gets another. Positions are (Q, 2), measures the depth and force (Q,), NaN where unknown; `plan` is
+    the prior from the plan of the pad. With `only_last`, only the networks that answer at the end of a press are
+    retrained.
     """
     from padforge.sense.localizer.training import retrain  # torch takes long to import
 
@@ -278,7 +267,10 @@ def _fit_response(
 def fit_correction(
     model: LocalizerModel, features: PressFeatures, positions_mm: Array, measures: Measures = MappingProxyType({})
 ) -> LocalizerModel:
-    """Correct gains of fibres, rotation, scale and shift by robust least squares with a normal prior."""
+    """Correct gains of fibres, rotation, scale and shift by robust least squares with a normal prior.
+
+    They are folded into the scaling of the features and the last layer of the networks.
+    """
     from scipy.optimize import least_squares  # slow to import
 
     expected = model.predict_features(model.scaler.transform(features))
@@ -338,19 +330,10 @@ def _transformed_table(table: Floats, rotation: Array, shift: Array) -> Floats:
 
 
 class CrossValidation:
-    """Cross-validation of changes on new presses, for subsets of failed fibres.
-
-    Args:
-        presses: features, positions (Q, 2), mm, and measures.
-        n_folds: number of folds, each of which is left out in turn.
-        subsets: subsets of failed fibres, by their size from 0.
-    """
+    """Cross-validation of changes on new presses in folds, for subsets of failed fibres, by their size from 0."""
 
     def __init__(
-        self,
-        presses: tuple[PressFeatures, Array, Measures],
-        n_folds: int,
-        subsets: Sequence[Sequence[tuple[int, ...]]],
+        self, presses: tuple[PressFeatures, Array, Measures], n_folds: int, subsets: Sequence[Sequence[tuple[int, ...]]]
     ) -> None:
         self.presses = presses
         self._folds, self._subsets = np.array_split(np.arange(len(presses[1])), n_folds), subsets

@@ -49,14 +49,9 @@ class ResponseModel:
     ) -> "ResponseModel":
         """Fit the response, fibre by fibre, to the presses in which the fibre is valid.
 
-        Args:
-            positions: within [-1, 1]; shape (Q, 2).
-            windows: shape (Q, C, F), V.
-            history: shape (Q, C, J), V.
-            fibre_mask: valid fibres; shape (Q, C).
-            relative_depth: depth of each press over that of the table; shape (Q,). None for 1.
-            phases: G slices of windows; the sensitivity of each is modulated as one.
-            ridge_history: penalty on squared weights of the history.
+        Positions (Q, 2) are within [-1, 1], windows (Q, C, F) and history (Q, C, J) in V; relative depths (Q,) are over
+        that of the table, None for 1. The sensitivity of each of the G slices of windows in `phases` is modulated as
+        one. `ridge_history` is the penalty on squared weights of the history.
         """
         fibres, pasts = history.shape[1:]
         size, n_rbf = windows.shape[2], RBF_SIDE**2
@@ -109,9 +104,9 @@ def remove_history(windows: Array, history: Array, history_coef: Array, history_
 
 
 def interpolate_grid(table: Any, positions: Any, xp: Any = np) -> Any:
-    """Interpolate a (S, S, n) table over [-1, 1] bilinearly at (Q, 2) positions, clipped to its edge; return (Q, n).
+    """Interpolate a (S, S, ...) table over [-1, 1] bilinearly at (Q, 2) positions, clipped to its edge.
 
-    `xp` is the module of the arrays, numpy or torch.
+    Returned are the values (Q, ...); `xp` is the module of the arrays, numpy or torch.
     """
     side = table.shape[0]
     cell = xp.clip((positions + 1) * ((side - 1) / 2), 0, side - 1 - 1e-3)
@@ -120,7 +115,8 @@ def interpolate_grid(table: Any, positions: Any, xp: Any = np) -> Any:
     corner = xp.asarray(lower[:, 0] * side + lower[:, 1], dtype=xp.int64)
     flat = table.reshape(side * side, -1)
     near = (1 - y) * flat[corner] + y * flat[corner + 1]
-    return (1 - x) * near + x * ((1 - y) * flat[corner + side] + y * flat[corner + side + 1])
+    values = (1 - x) * near + x * ((1 - y) * flat[corner + side] + y * flat[corner + side + 1])
+    return values if table.ndim == 3 else values.reshape(-1, *table.shape[2:])
 
 
 def leverages(positions: Array, relative_depth: Array | None = None) -> Array:
@@ -130,8 +126,13 @@ def leverages(positions: Array, relative_depth: Array | None = None) -> Array:
     single = np.empty(len(positions))
     for rows, rbf in _scaled_rbf(positions, relative_depth):
         single[rows] = (rbf * np.linalg.solve(gram, rbf.T).T).sum(axis=1)
+    return sum_by_position(positions, single)
+
+
+def sum_by_position(positions: Array, values: Array) -> Array:
+    """Return for each press the sum of the values (Q,) of the presses at its position."""
     _, position = np.unique(positions, axis=0, return_inverse=True)
-    return np.bincount(position.ravel(), single).astype(np.float64)[position.ravel()]
+    return np.bincount(position.ravel(), values).astype(np.float64)[position.ravel()]
 
 
 def _scaled_rbf(positions: Array, relative_depth: Array | None) -> Any:

@@ -48,11 +48,7 @@ def stated_contact(recording: Recording) -> Contact:
 def plan_prior(pad: Morphology, contact: Contact, origin_mm: Array, scale_mm: float) -> ResponsePrior:
     """Return the prior of a pad from its plan: fibres with varying sensitivity and lateral offset.
 
-    Args:
-        pad: the plan, in the frame of the arm.
-        contact: of the presses.
-        origin_mm: position that is 0 when scaled, mm from the middle of the pad; shape (2,).
-        scale_mm: distance that is 1 when scaled, mm.
+    The plan is in the frame of the arm, whose position `origin_mm` (2,) is 0 when scaled; the distance `scale_mm` is 1.
     """
     # compiled kernels take long to import
     from padforge.design.contact import signals, widened
@@ -65,13 +61,9 @@ def plan_prior(pad: Morphology, contact: Contact, origin_mm: Array, scale_mm: fl
     smooth, with_gain = (np.linalg.cholesky(covariance + gain + 1e-6 * np.eye(N_NODES)) for gain in (0.0, 1.0))
     parts = []
     for width in WIDTHS:
-        hats = [
-            signals(
-                pad, grid, widened(contact, width), precision=LAYER_PRECISION, sensitivity=np.tile(hat, (fibres, 1))
-            )
-            for hat in np.eye(N_NODES)
-        ]
-        maps = np.stack(hats, axis=2).reshape(side, side, fibres, N_NODES)
+        pressed, hats = widened(contact, width), [np.tile(hat, (fibres, 1)) for hat in np.eye(N_NODES)]
+        maps = [signals(pad, grid, pressed, precision=LAYER_PRECISION, sensitivity=hat) for hat in hats]
+        maps = np.stack(maps, axis=2).reshape(side, side, fibres, N_NODES)
         maps /= np.linalg.norm(maps @ with_gain, axis=3).max(axis=(0, 1))[:, None]
         step = 2 / GRID_CELLS
         offsets = [OFFSET_MM / scale_mm * slope @ smooth for slope in np.gradient(maps, step, axis=(0, 1))]
@@ -80,11 +72,7 @@ def plan_prior(pad: Morphology, contact: Contact, origin_mm: Array, scale_mm: fl
 
 
 def map_prior(maps: Array) -> ResponsePrior:
-    """Return the prior of a pad from the responses of an earlier one, each fibre scaled smoothly.
-
-    Args:
-        maps: responses, not centred; shape (S, S, C, F).
-    """
+    """Return the prior of a pad from the responses (S, S, C, F) of an earlier one, each fibre scaled smoothly."""
     envelope = np.sqrt((maps**2 / np.maximum((maps**2).max(axis=(0, 1)), 1e-12)).mean(axis=3))
     centres = np.linspace(-1, 1, RBF_SIDE)
     weights = np.exp(-0.5 * ((np.linspace(-1, 1, len(maps))[:, None] - centres) / RBF_STD) ** 2)

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from padforge.sense.arrays import MIN_SCALE_V, Array, Mask
-from padforge.sense.localizer.response_model import GRID_CELLS, grid_positions, interpolate_grid
+from padforge.sense.localizer.response_model import GRID_CELLS, grid_positions, interpolate_grid, sum_by_position
 
 SNR_NEW = 10.0, 30.0, 100.0
 """Candidate variances of the deviations of a new fibre, relative to the variance of a press about its response."""
@@ -33,33 +33,23 @@ ROUNDS = 2  # fits of the process; the first one ignores that growth
 
 @dataclass(frozen=True)
 class ResponsePrior:
-    """Prior of the response of a pad.
+    """Prior of the response of a pad: maps on a grid over [-1, 1] in x and y.
 
-    Attributes:
-        deviations: maps on a grid over [-1, 1] in x and y; each window deviates from the mean by a sum of them with
-            independent standard normal weights, times an amplitude; shape (S, S, C, n).
-        mean: responses of an earlier pad, V or scaled as the windows; shape (S, S, C, F); None if there was none.
+    Each window deviates from the mean by a sum of maps with independent standard normal weights, times an amplitude.
     """
 
-    deviations: Array
-    mean: Array | None = None
+    deviations: Array  # (S, S, C, n)
+    mean: Array | None = None  # (S, S, C, F), responses of an earlier pad, V or scaled as the windows
 
 
 @dataclass(frozen=True)
 class ResponseFit:
-    """Fitted response of a pad.
+    """Fitted response of a pad."""
 
-    Attributes:
-        table: windows on the grid of the prior; shape (S, S, C, F).
-        leverage: of presses, 0 to 1, summed over the presses at one position; shape (Q, C).
-        is_new: fibres that are not those of the earlier pad; shape (C,).
-        log_evidence: of the scaled windows.
-    """
-
-    table: Array
-    leverage: Array
-    is_new: Mask
-    log_evidence: float
+    table: Array  # (S, S, C, F), windows on the grid of the prior
+    leverage: Array  # (Q, C), of presses, 0 to 1, summed over the presses at one position
+    is_new: Mask  # (C,), fibres that are not those of the earlier pad
+    log_evidence: float  # of the scaled windows
 
 
 def fit_response(
@@ -67,14 +57,8 @@ def fit_response(
 ) -> ResponseFit:
     """Fit the response, fibre by fibre, to the presses in which the fibre is valid, in a time of O(Q^3).
 
-    A fibre that is valid in no press keeps the mean of the prior, or 0.
-
-    Args:
-        positions: within [-1, 1]; shape (Q, 2).
-        windows: without history, and not centred: 0 is no response; shape (Q, C, F).
-        fibre_mask: whether a fibre is valid in a press; shape (Q, C).
-        prior: of the response.
-        relative_depth: depth of each press over that of the table; shape (Q,). None for 1.
+    Arguments are as in `ResponseModel.fit`; windows are without history, and not centred: 0 is no response. A fibre
+    that is valid in no press keeps the mean of the prior, or 0.
     """
     depth = np.ones(len(positions)) if relative_depth is None else relative_depth
     fibres = np.flatnonzero(fibre_mask.any(axis=0))
@@ -129,8 +113,7 @@ class _Process(NamedTuple):
 
     def leverages(self) -> Array:
         """Compute the leverages (Q,), summed over the presses at one position."""
-        _, position = np.unique(self.positions, axis=0, return_inverse=True)
-        return np.bincount(position.ravel(), 1 - self.noise * self.precision)[position.ravel()]
+        return sum_by_position(self.positions, 1 - self.noise * self.precision)
 
 
 def _fit_process(
@@ -142,8 +125,7 @@ def _fit_process(
     smooth_covariance = np.outer(depth, depth) * _smooth_covariance(positions, positions)
     residual = windows if mean is None else windows - depth[:, None] * interpolate_grid(mean, positions)
     # A press as commanded and as detected has one position twice: half the weight each.
-    _, position, count = np.unique(positions, axis=0, return_inverse=True, return_counts=True)
-    multiplicity = count[position.ravel()].astype(np.float64)
+    multiplicity = sum_by_position(positions, np.ones(len(positions)))
     best, noise = None, multiplicity
     for _ in range(ROUNDS):
         if best is not None:

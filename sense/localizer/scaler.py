@@ -4,7 +4,7 @@ Where depths vary, the networks also predict depth (and force), and features are
 proportional to the depth.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Annotated, ClassVar, Literal
 
@@ -12,7 +12,7 @@ import numpy as np
 from pydantic import ConfigDict, Field, PlainSerializer, PlainValidator
 from pydantic_core import PydanticCustomError
 
-from padforge.sense.arrays import MAX_MM, MAX_VOLTS, MIN_SCALE_V, Array, Floats, Indices, Mask
+from padforge.sense.arrays import MAX_MM, MAX_VOLTS, MIN_SCALE_V, Array, Floats, Indices, Mask, masked_mean
 from padforge.sense.localizer.features import PressFeatures
 from padforge.sense.localizer.moments import LATEST_WINDOWS, PRESS_WINDOWS
 from padforge.sense.localizer.response_model import ResponseModel, interpolate_grid, leverages, remove_history
@@ -52,6 +52,11 @@ class ScaledFeatures:
 
     def __len__(self) -> int:
         return len(self.inputs)
+
+    def without(self, failed: Iterable[int]) -> "ScaledFeatures":
+        """Return the features with fibres masked in every press, by their indices."""
+        working = ~np.isin(np.arange(self.fibre_mask.shape[1]), list(failed))
+        return replace(self, fibre_mask=self.fibre_mask & working)
 
 
 @dataclass(frozen=True)
@@ -102,16 +107,11 @@ class FeatureScaler:
         measures: Mapping[str, Array] | None = None,
         phases: Sequence[slice] = (),
     ) -> tuple["FeatureScaler", Floats]:
-        """Fit the response model of the pad and the scaling of its features.
+        """Fit the response model of the pad and the scaling of its features to presses at positions (Q, 2).
 
         A window is divided by the geometric mean of its own standard deviation and that of its fibre, so that small
-        windows stay smaller, and their noise with them.
-
-        Args:
-            features: of presses, V.
-            positions_mm: of the presses; shape (Q, 2).
-            measures: depth and force, to be predicted; shape (Q,) each.
-            phases: as in `ResponseModel.fit`.
+        windows stay smaller, and their noise with them. `measures` are the depth and force (Q,) that are to be
+        predicted, `phases` as in `ResponseModel.fit`.
 
         Returns:
             The scaler, and the scaled response by position (S, S, C, F + G), at the scaled depth 0 if depths vary.
@@ -125,8 +125,9 @@ class FeatureScaler:
         response = ResponseModel.fit(scaled_mm, *inputs, features.fibre_mask, relative_depth, phases)
         history = response.history_coef, response.history_mean_v
         windows = remove_history(*inputs, *history)[:, :, : features.windows.shape[2]]
-        mean = _masked_mean(windows, features.fibre_mask)
-        variance = _masked_mean((windows - mean) ** 2, features.fibre_mask)
+        mask = features.fibre_mask[:, :, None]
+        mean = masked_mean(windows, mask)
+        variance = masked_mean((windows - mean) ** 2, mask)
         scale = (variance * variance.mean(axis=1, keepdims=True)) ** 0.25
         scale = np.where(scale >= MIN_SCALE_V, scale, 1.0)  # constant windows are not scaled
         padding = ((0, 0), (0, len(phases)))
@@ -134,10 +135,6 @@ class FeatureScaler:
         scale = np.pad(scale, padding, constant_values=1.0)
         scaler = cls(mean, scale, *history, origin, scale_mm, (high - low) / 2, targets)
         return scaler, scaler.scale(response.table)
-
-    def n_inputs(self, method: str, n_timed: int) -> int:
-        """Return I, the inputs of a network: features and, for method "ensemble", masks of C fibres and K windows."""
-        return self.mean_v.size + (len(self.mean_v) + n_timed if method == "ensemble" else 0)
 
     def transform(self, features: PressFeatures) -> ScaledFeatures:
         """Remove the history from features in volts and scale them."""
@@ -200,12 +197,6 @@ class FeatureScaler:
         return factor.astype(np.float32), offset.astype(np.float32)
 
 
-def _masked_mean(windows: Array, fibre_mask: Mask) -> Array:
-    """(C, F) means over the presses in which a fibre is valid; 0 if it is in none."""
-    total = np.where(fibre_mask[:, :, None], windows, 0.0).sum(axis=0)
-    return total / np.maximum(fibre_mask.sum(axis=0), 1)[:, None]
-
-
 @dataclass(frozen=True)
 class TrainingPresses(ScaledFeatures):
     """Scaled presses and their targets, for training."""
@@ -221,17 +212,9 @@ class TrainingPresses(ScaledFeatures):
 def refit_response(
     scaler: FeatureScaler, presses: TrainingPresses, table: Floats, n_windows: int, prior: ResponsePrior
 ) -> tuple[Floats, ResponseFit]:
-    """Refit the windows of a response table to few presses, with a prior.
+    """Refit the F windows of a response table (S, S, C, F + G) to few presses; return the table, and the fit.
 
-    Args:
-        scaler: of the presses and the table.
-        presses: to fit to.
-        table: scaled response by position; shape (S, S, C, F + G).
-        n_windows: F.
-        prior: its mean, if any, is scaled and not centred, see `FeatureScaler.uncentre`.
-
-    Returns:
-        The refitted table, and the fit.
+    The mean of the prior, if any, is scaled and not centred, see `FeatureScaler.uncentre`.
     """
     relative_depth = 1 + presses.depth_gain * presses.targets[:, 2] if presses.depth_gain else None
     positions, windows = presses.targets[:, :2].astype(np.float64), scaler.uncentre(presses.inputs)[..., :n_windows]
@@ -244,19 +227,13 @@ def leave_one_out_residuals(presses: TrainingPresses, table: Floats, leverage: A
     """Enlarge the residuals of presses as if the response table had been fitted without their position.
 
     The leave-one-out residual of a linear fit is the residual over 1 - leverage; with some hundred presses it is larger
-    by a third.
-
-    Args:
-        presses: on which the table was fitted.
-        table: scaled response by position; shape (S, S, C, F + G).
-        leverage: of a fit with a prior; shape (Q, C). None for that of `ResponseModel`.
+    by a third. The leverage (Q, C) is that of a fit with a prior, None for that of `ResponseModel`.
     """
     targets = presses.targets.astype(np.float64)
     positions, relative_depth = targets[:, :2], np.ones(len(targets))
     if presses.depth_gain:
         relative_depth += presses.depth_gain * targets[:, 2]
-    expected = interpolate_grid(table.reshape(*table.shape[:2], -1), positions).reshape(presses.inputs.shape)
-    expected = relative_depth[:, None, None] * expected
+    expected = relative_depth[:, None, None] * interpolate_grid(table, positions)
     if leverage is None:
         leverage = leverages(positions, relative_depth)[:, None]
     leverage = np.minimum(leverage, MAX_LEVERAGE)[:, :, None]

@@ -6,19 +6,19 @@ presses on another pad. Two fingers are distinguished from one by the generalize
 one. The distributions of both quantities are calibrated on presses that were not used in training.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from itertools import combinations
 from math import sqrt
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from scipy.special import stdtrit
 
 from padforge.design.objectives.fibre_loss import failure_subsets
 from padforge.sense.arrays import Array, Floats, Indices, Mask
-from padforge.sense.localizer.bayes import SCATTER_WIDTH, fit_projection, local_scatter, mean_distance
+from padforge.sense.localizer.bayes import fit_projection, local_scatter
 from padforge.sense.localizer.moments import LATEST_WINDOWS, N_PRESS_WINDOWS, N_TIMED, count_complete
 from padforge.sense.localizer.response_model import grid_positions, interpolate_grid
 from padforge.sense.localizer.scaler import ScaledFeatures, TrainingPresses
@@ -47,6 +47,10 @@ MAX_PRESSES = 300  # presses of a pad that are used at most
 MIN_DET = 1e-3  # minimum determinant of the Gram matrix of two responses, relative to the product of their norms
 MIN_RELATIVE_MISFIT = 1e-6  # minimum misfit per component, since its logarithm is taken
 MIN_STD = 0.1  # minimum standard deviation of logarithms of misfits, which few presses underestimate
+OTHER_PAD = (
+    "these presses are unlike those of the calibration: another pad, or one cast again; radii do not hold; recalibrate"
+)
+"""What `is_other_pad` means, for people."""
 PREFIX = "single_press."  # of the names of the arrays in files
 _CHUNK = 256
 
@@ -75,14 +79,11 @@ class SinglePressTest:
         n_complete: int,
         earlier: "SinglePressTest | None" = None,
     ) -> "SinglePressTest":
-        """Fit the scatter of presses about the response at a stage of a press.
+        """Fit the scatter of presses, with leave-one-out residuals, about the response at a stage of a press.
 
-        Args:
-            table: scaled response by position, over [-1, 1] in x and y; shape (S, S, C, F + G).
-            presses: of the training, with leave-one-out residuals.
-            zero: scaled features of a pad without response, with a minus sign; shape (C, F + G).
-            n_complete: number of complete windows; 0 for features without moments.
-            earlier: test of the earlier pad, whose discriminants are kept, since few presses do not determine them.
+        The table (S, S, C, F + G) is the scaled response over [-1, 1] in x and y; `zero` (C, F + G) are the scaled
+        features of a pad without response, with a minus sign. Discriminants of an earlier pad are kept, since few
+        presses do not determine them.
         """
         n_timed, side = presses.complete.shape[1], len(table)
         usable = np.ones(table.shape[3], bool)
@@ -92,9 +93,7 @@ class SinglePressTest:
         relative_depth = 1 + presses.depth_gain * presses.targets[:, 2:3] if presses.depth_gain else np.ones((1, 1))
         at_presses = relative_depth * interpolate_grid(table.reshape(side, side, -1), positions)
         residual = presses.inputs - at_presses.reshape(presses.inputs.shape)
-        fibres = table.shape[2]
-        earlier_projection = np.zeros((fibres, len(usable), COMPONENTS)) if earlier is None else earlier.projection
-        projection = fit_projection(table, residual, presses.fibre_mask, earlier_projection)
+        projection = fit_projection(table, residual, presses.fibre_mask, COMPONENTS, earlier and earlier.projection)
         residual = np.einsum("qcf,cfd->qcd", residual, projection) * presses.fibre_mask[:, :, None]
         offset = np.einsum("cf,cfd->cd", zero * usable, projection)
         responses = np.einsum("xycf,cfd->xycd", table, projection) + offset
@@ -103,10 +102,9 @@ class SinglePressTest:
         step, cell = 2 / (side - 1), float(grid[1, 0, 0] - grid[0, 0, 0])
         inside = ((grid >= low - cell / 2) & (grid <= high + cell / 2)).all(axis=2)
         slopes = np.stack(np.gradient(responses, step, axis=(0, 1)), axis=-1)[::COARSENING, ::COARSENING][inside]
-        width = max(cell, SCATTER_WIDTH * mean_distance(positions))
-        scatter = local_scatter(grid[inside], positions, residual, presses.fibre_mask, width)
+        scatter = local_scatter(grid[inside], positions, residual, presses.fibre_mask, cell)
         # Each position of the grid stands for its cell, over which the response varies by its slope.
-        blurred = scatter.reshape(-1, fibres, COMPONENTS, COMPONENTS) + cell**2 / 12 * slopes @ slopes.swapaxes(2, 3)
+        blurred = scatter + cell**2 / 12 * slopes @ slopes.swapaxes(2, 3)
         response = relative_depth * interpolate_grid(responses.reshape(side, side, -1), positions)
         return cls(
             projection=projection,
@@ -223,11 +221,6 @@ class SinglePressTest:
         """Return the arrays of the `number`-th stage by their names in files."""
         return {f"{PREFIX}{number}.{field.name}": getattr(self, field.name) for field in fields(self)}
 
-    @classmethod
-    def from_arrays(cls, arrays: Mapping[str, Any], number: int) -> "SinglePressTest":
-        """Read what `to_arrays` returned."""
-        return cls(**{field.name: arrays[f"{PREFIX}{number}.{field.name}"] for field in fields(cls)})
-
 
 def find_unlike(tests: Sequence[SinglePressTest], presses: ScaledFeatures) -> Mask:
     """Return (Q,) whether two presses explain the features much better than one, by the test of the latest stage.
@@ -236,7 +229,7 @@ def find_unlike(tests: Sequence[SinglePressTest], presses: ScaledFeatures) -> Ma
     """
     n_complete, unlike = count_complete(presses.complete), np.zeros(len(presses), bool)
     numbers = stages(presses.complete.shape[1])
-    for test, first, end in zip(tests, numbers, [*numbers[1:], np.inf], strict=False):
+    for test, first, end in zip(tests, numbers, [*numbers[1:], np.inf], strict=True):
         rows = np.flatnonzero((n_complete >= first) & (n_complete < end))
         unlike[rows] = test.is_unlike(presses.inputs[rows], presses.fibre_mask[rows])
     return unlike
@@ -248,9 +241,7 @@ def stages(n_timed: int) -> tuple[int, ...]:
 
 
 def find_misfits(tests: Sequence[SinglePressTest], presses: ScaledFeatures) -> Array:
-    """Return (Q, M) `SinglePressTest.misfits` of up to MAX_PRESSES complete presses; none without tests."""
-    if not tests:
-        return np.empty((0, 1))
+    """Return (Q, M) `SinglePressTest.misfits` of up to MAX_PRESSES complete presses."""
     finished = np.flatnonzero(presses.complete.all(axis=1))
     rows = finished[np.linspace(0, len(finished) - 1, min(len(finished), MAX_PRESSES)).astype(np.int64)]
     return tests[-1].misfits(presses.inputs[rows], presses.fibre_mask[rows])

@@ -19,7 +19,6 @@ from padforge.design.contact import depth_terms
 from padforge.sense.arrays import Array
 from padforge.sense.settings import RigSettings
 from padforge.sense.simulation.built_pad import BuiltPad, PressParts, build_pad, press_contacts
-from padforge.sense.simulation.residual_indentation import MAX_LAG, RETURNED, replaced_residues
 
 SUPPLY_V, ADC_STEPS = 3.3, 2**12 - 1  # of the simulated board and its converter
 GAUGE_FACTOR = 0.65  # relative change of a fibre's resistance per strain in a layer
@@ -32,6 +31,8 @@ ONSET_S = 0.15  # time constant of the change from the onset response to the hel
 CREEP_S = 1.0  # time constant of creep
 DRIFT_S = 600.0  # correlation time of the drift
 SURFACE_MM, SURFACE_WAVES = 10.0, 8  # length over which the height of a pad changes, and number of waves in it
+MAX_LAG = 32  # number of earlier presses whose residues count
+RETURNED = 0.4  # fraction of a removed residue that returns when the press ends
 MIN_DEPTH_MM = 1e-3  # minimum depth for which a contact is solved
 REST_V = (1.7, 2.1)  # range of the voltages at rest; the divider is matched to half the supply only roughly
 
@@ -72,6 +73,29 @@ def resistance_changes(
         changes += WEIGHT_GAUGE_FACTOR / FULL_DEPTH_MM * depths_mm[:, None] * np.stack(stretch)
     held, onset, creep, after = changes
     return PressParts(held, onset, rig.creep * creep, rig.hysteresis * after)
+
+
+def replaced_residues(
+    positions_mm: Array, touch_s: Array, release_s: Array, residues: Array, held: Array, rig: RigSettings
+) -> Array:
+    """Compute the residues (Q, C) of earlier presses that each of successive presses removes.
+
+    After a release the surface stays indented for a while. If the pad is pressed there again, the probe fills the dent:
+    the fibres lose their residue and respond by as much more. When the press ends, a part of the dent returns.
+    At distance d a press removes the fraction `memory exp(-d^2 / 2 memory_mm^2)` of what remains of a residue. The
+    effect on a fibre is proportional to the geometric mean of that residue and of the response to the press itself.
+    Presses at positions (Q, 2) begin and end at times (Q,); residues at their end and held responses are (Q, C).
+    """
+    replaced, remaining = np.zeros_like(residues), np.ones(len(residues))
+    for q in range(1, len(residues) if rig.memory else 0):
+        recent = slice(max(q - MAX_LAG, 0), q)
+        squares = ((positions_mm[recent] - positions_mm[q]) ** 2).sum(axis=1)
+        replaced_share = rig.memory * np.exp(squares / (-2 * rig.memory_mm**2))
+        decayed = np.exp((release_s[recent] - touch_s[q]) / rig.hysteresis_s)
+        both = np.sqrt(np.maximum(residues[recent] * held[q], 0))
+        replaced[q] = np.sign(held[q]) * ((remaining[recent] * replaced_share * decayed) @ both)
+        remaining[recent] *= 1 - (1 - RETURNED) * replaced_share
+    return replaced
 
 
 class Gains:

@@ -35,13 +35,7 @@ from padforge.sense.recording.press_plan import (
 from padforge.sense.recording.recording import Recording
 from padforge.sense.settings import RigSettings
 from padforge.sense.simulation.built_pad import PressParts, build_pad
-from padforge.sense.simulation.pad_model import (
-    DRIFT_S,
-    FULL_DEPTH_MM,
-    Cycle,
-    resistance_changes,
-    simulate_readings,
-)
+from padforge.sense.simulation.pad_model import DRIFT_S, FULL_DEPTH_MM, Cycle, resistance_changes, simulate_readings
 
 MIN_SINGULAR = 0.3  # relative singular value; both sides of a pad that is turned by over 28 degrees count as equal
 JITTER = 0.1  # standard deviation of the interval between readings over its mean

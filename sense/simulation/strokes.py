@@ -26,12 +26,7 @@ class Strokes:
 
 
 def simulate_strokes(
-    pad: Morphology,
-    rig: RigSettings,
-    contact: Contact,
-    speed_mm_s: float,
-    strokes: int,
-    rng: np.random.Generator,
+    pad: Morphology, rig: RigSettings, contact: Contact, speed_mm_s: float, strokes: int, rng: np.random.Generator
 ) -> Strokes:
     """Simulate strokes as long as the presses of `[rig]`, on the pad that `simulate` presses with the same seed.
 

@@ -18,7 +18,7 @@ from padforge.design.contact import contact_law
 from padforge.design.kernels.element_signals import sum_elements
 from padforge.design.settings import Contact
 from padforge.design.twin import PlanTransform
-from padforge.sense.arrays import Array
+from padforge.sense.arrays import Array, masked_mean
 from padforge.sense.twin.as_built import AsBuiltPad
 from padforge.sense.twin.fitting import TRANSFORM_STD
 from padforge.sense.twin.responses import Responses
@@ -47,15 +47,10 @@ class ContactFit:
 def fit_contact(
     pad: AsBuiltPad, contact: Contact, training: Responses, held_out: Responses, noise_v: Array
 ) -> ContactFit:
-    """Fit a contact to a pad whose fibres stay where they are.
+    """Fit a contact to a pad whose fibres stay where they are, and whose profiles and gains do not count.
 
-    Args:
-        pad: wiring, first transform, fibres and sensitivities; its profiles and gains do not count.
-        contact: a layer; or a profile, of which `scale` alone is fitted.
-        training: responses that are fitted.
-        held_out: responses that `explained` is measured on.
-        noise_v: standard deviation of the residuals of each channel, inflated where neighbouring ones are correlated;
-            shape (C,), V.
+    Of a contact that is no layer but a profile, `scale` alone is fitted. `noise_v` (C,) is the standard deviation of
+    the residuals, inflated where neighbouring ones are correlated; `explained` is measured on the held-out responses.
     """
     total, signals = contact.squeeze + contact.stretch, _Signals(pad, contact)
     start = np.array([*pad.values[:4], math.log(contact.scale), contact.stretch / total])
@@ -126,8 +121,8 @@ class _Signals:
 
 def _fit_gains(signals: Array, responses: Responses) -> tuple[Array, Array]:
     """Fit gains (C,), V per grid unit, and rests (C,), V, to signals (Q, C) by least squares."""
-    valid, counts = responses.valid, np.maximum(responses.valid.sum(axis=0), 1)
-    mean, mean_v = (np.where(valid, values, 0).sum(axis=0) / counts for values in (signals, responses.volts))
+    valid = responses.valid
+    mean, mean_v = (masked_mean(values, valid) for values in (signals, responses.volts))
     centred = np.where(valid, signals - mean, 0.0)
     gains = (centred * np.where(valid, responses.volts - mean_v, 0.0)).sum(axis=0)
     gains /= np.maximum((centred**2).sum(axis=0), 1e-300)

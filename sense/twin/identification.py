@@ -1,13 +1,4 @@
-"""System identification of a printed pad from presses at known positions alone.
-
-1. The most common depth is kept, and a response computed for each press and channel.
-2. Channels that respond to the position at all are live: a Gaussian process explains them better than noise.
-3. Wirings and poses are searched for on the plan; each of the best is fitted as built, and the most probable one taken.
-4. It is fitted to all presses, with an angular term if held-out presses ask for one.
-5. Presses are split into their parts, and each is fitted on the same paths; so are the removal of the residues of
-   earlier presses, and the scatter of responses.
-6. The width of a press, and its share of stretch, are measured by fitting the layer that it is believed to be.
-"""
+"""System identification of a printed pad from presses at known positions alone, by the steps of `identify_pad`."""
 
 from dataclasses import dataclass, replace
 
@@ -20,15 +11,7 @@ from padforge.common.validation import InputError
 from padforge.design import Morphology
 from padforge.design.paths.curves import lengths
 from padforge.design.settings import Contact, sensed_rectangle
-from padforge.design.twin import (
-    PARTS,
-    Twin,
-    TwinChannel,
-    TwinPart,
-    TwinReadings,
-    TwinResidual,
-    TwinScatter,
-)
+from padforge.design.twin import PARTS, Twin, TwinChannel, TwinPart, TwinReadings, TwinResidual, TwinScatter
 from padforge.sense.arrays import Array, Indices, Mask
 from padforge.sense.recording.frames import framed
 from padforge.sense.recording.recording import Recording
@@ -219,14 +202,14 @@ def identify_pad(
     positions_mm = recording.presses_mm[recording.has_position]
     _check_positions(positions_mm, pad)
 
-    # 1. Responses
+    # 1. Responses to presses of the most common depth
     on_progress(0, 1, "responses")
     held_out_mask = np.zeros(len(positions_mm), bool)
     held_out_mask[rng.permutation(len(positions_mm))[: max(round(HELD_OUT * len(positions_mm)), 2)]] = True
     responses = compute_responses(recording, ~held_out_mask)
     rows = rng.permutation(np.flatnonzero(~held_out_mask))[:MAX_PRESSES]
 
-    # 2. Live channels
+    # 2. Live channels: a Gaussian process of the position explains them better than noise
     gps = fit_gps(responses.select(rows), pad.unit_mm)
     noise_v = np.array([gp.noise_v for gp in gps])
     live = np.flatnonzero([gp.log_bayes_factor > MIN_LOG_BAYES_FACTOR for gp in gps])
@@ -239,15 +222,15 @@ def identify_pad(
     training, held_out = responses.select(rows, live), responses.select(np.flatnonzero(held_out_mask), live)
     compared = training.select(np.arange(min(N_COMPARED, len(training))))
 
-    # 3. Wiring
+    # 3. Wiring and pose: the most probable of the best, each fitted as built
     candidates = _fit_candidates(PadPlan.from_morphology(pad, N_COARSE), training, compared, live, rng, on_progress)
     plan, best = PadPlan.from_morphology(pad), candidates[0]
 
-    # 4. All presses
+    # 4. Paths and profile, by all presses
     on_progress(0, 3, "paths")
     fit = _fit_all(replace(best.fit.pad, plan=plan), training, on_progress)
 
-    # 5. Parts of a press
+    # 5. Parts of a press, fitted on the same paths
     readings, parts, residual, pressed = None, {}, None, training
     if statistics := measure_rig_settings(recording):
         on_progress(0, 1, "parts of a press")
@@ -258,7 +241,7 @@ def identify_pad(
         wander = gain_wander(parts["held"].pad, split.pressed.select(np.arange(len(positions_mm)), live))
         readings = TwinReadings(**statistics | split.rig, gain_wander=wander)
 
-    # 6. Contact
+    # 6. Contact, by a fit of the layer that is believed to be pressed; and the scatter of responses
     on_plan = replace(best.on_plan.pad, plan=plan)
     measured = _measure_contact(contact, recording, fit.pad, on_plan, training, held_out)
     noise_v = np.nan_to_num(noise_v)

@@ -26,9 +26,9 @@ from padforge.sense.simulation.pad_model import (
     Motion,
     Viscoelasticity,
     probe_motion,
+    replaced_residues,
     superpose_strain,
 )
-from padforge.sense.simulation.residual_indentation import replaced_residues
 from padforge.sense.twin.responses import Responses, near_pairs, normalize
 
 N_ROUNDS = 3  # times that parts and removed residues are estimated in turn
@@ -51,12 +51,8 @@ class SplitPresses:
 
 def split_presses(recording: Recording, training: Mask, hysteresis_s: float) -> SplitPresses:
     """Split the presses of known position of a recording; maps of their parts are fitted to those in `training`."""
-    positioned = recording.has_position
-    down, up, positions_mm = (
-        recording.down_command[positioned],
-        recording.up_command[positioned],
-        recording.presses_mm[positioned],
-    )
+    presses = recording.down_command, recording.up_command, recording.presses_mm
+    down, up, positions_mm = (part[recording.has_position] for part in presses)
     inputs = compute_features(recording.readings, down, up)
     timed = inputs.windows[:, :, :N_TIMED]
     valid, positions = inputs.fibre_mask, normalize(positions_mm)[0]
@@ -64,8 +60,7 @@ def split_presses(recording: Recording, training: Mask, hysteresis_s: float) -> 
     cycle = Cycle(2 * int(np.median(up - down)), recording.rate_hz)
 
     def smoothed(windows: Array) -> Array:
-        maps = smooth_maps(positions[training], windows[training], valid[training])
-        return interpolate_grid(maps.reshape(*maps.shape[:2], -1), positions).reshape(windows.shape)
+        return interpolate_grid(smooth_maps(positions[training], windows[training], valid[training]), positions)
 
     rig = RigSettings(hysteresis_s=hysteresis_s, memory=0.7, memory_mm=9.0)  # where the fit of the memory starts
     kernels, replaced, parts = part_kernels(cycle, rig), np.zeros(valid.shape), np.empty((4, *valid.shape))

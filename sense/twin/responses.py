@@ -10,7 +10,7 @@ from functools import cache
 import numpy as np
 from scipy.spatial import KDTree
 
-from padforge.sense.arrays import Array, Indices, Mask
+from padforge.sense.arrays import Array, Indices, Mask, masked_mean
 from padforge.sense.localizer.features import compute_features
 from padforge.sense.localizer.moments import PRESS_WINDOWS
 from padforge.sense.localizer.response_model import ResponseModel, remove_history
@@ -46,16 +46,12 @@ class Responses:
     @property
     def variance(self) -> Array:
         """Variance of the responses of each channel; shape (C,); 1 for a channel without responses."""
-        counts = np.maximum(self.valid.sum(axis=0), 1)
-        mean = np.where(self.valid, self.volts, 0).sum(axis=0) / counts
-        variance = np.where(self.valid, (self.volts - mean) ** 2, 0).sum(axis=0) / counts
+        variance = masked_mean((self.volts - masked_mean(self.volts, self.valid)) ** 2, self.valid)
         return np.where(variance > 0, variance, 1.0)
 
     def explained_variance(self, predicted: Array) -> Array:
         """Return the share of each channel's variance (C,) that a prediction (Q, C) explains."""
-        counts = np.maximum(self.valid.sum(axis=0), 1)
-        unexplained = np.where(self.valid, (self.volts - predicted) ** 2, 0).sum(axis=0) / counts
-        return 1 - unexplained / self.variance
+        return 1 - masked_mean((self.volts - predicted) ** 2, self.valid) / self.variance
 
 
 def select_one_depth(recording: Recording) -> Recording:
@@ -76,11 +72,10 @@ def select_one_depth(recording: Recording) -> Recording:
 
 def compute_responses(recording: Recording, training: Mask) -> Responses:
     """Compute the responses to all Q presses of known position; history is fitted to those in the mask `training`."""
-    positioned = recording.has_position
-    down, up = recording.down_command[positioned], recording.up_command[positioned]
+    presses = recording.down_command, recording.up_command, recording.presses_mm
+    down, up, positions_mm = (part[recording.has_position] for part in presses)
     inputs = compute_features(recording.readings, down, up, until=up)
     pressed = inputs.windows[:, :, : len(PRESS_WINDOWS)]
-    positions_mm = recording.presses_mm[positioned]
     normalized, *_ = normalize(positions_mm)
     model = ResponseModel.fit(
         normalized[training],

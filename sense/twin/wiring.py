@@ -14,7 +14,7 @@ from scipy.optimize import linear_sum_assignment, minimize
 from padforge.common.progress import OnProgress, ignore_progress
 from padforge.design.settings import Layout
 from padforge.design.twin import PlanTransform
-from padforge.sense.arrays import Array, Indices, Mask
+from padforge.sense.arrays import Array, Indices, Mask, masked_mean
 from padforge.sense.twin.as_built import PadPlan
 from padforge.sense.twin.responses import Responses
 
@@ -66,8 +66,7 @@ class _Scorer:
 
 def _standardize(values: Array, valid: Mask) -> Array:
     """Centre the columns of values (Q, n) and scale them to unit length; 0 where invalid, or all the same."""
-    mean = np.where(valid, values, 0).sum(axis=0) / np.maximum(np.sum(valid, axis=0), 1)
-    values = np.where(valid, values - mean, 0.0)
+    values = np.where(valid, values - masked_mean(values, valid), 0.0)
     norms = np.linalg.norm(values, axis=0)
     return np.divide(values, norms, out=np.zeros_like(values), where=norms > 0)
 
@@ -85,10 +84,7 @@ def assign_fibres(correlations: Array) -> tuple[float, tuple[int, ...]]:
 
 
 def find_wirings(
-    plan: PadPlan,
-    responses: Responses,
-    rng: np.random.Generator,
-    on_progress: OnProgress = ignore_progress,
+    plan: PadPlan, responses: Responses, rng: np.random.Generator, on_progress: OnProgress = ignore_progress
 ) -> list[Wiring]:
     """Search for wirings of the channels of `responses`, best first, each with its best transform.
 

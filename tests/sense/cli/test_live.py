@@ -14,8 +14,8 @@ from padforge.sense.cli.live import EventPrinter
 from padforge.sense.live import outputs
 from padforge.sense.live.outputs import LivePage
 from padforge.sense.live.pipeline import Estimate
-from padforge.sense.localizer.doubts import OTHER_PAD
 from padforge.sense.localizer.model import LocalizerModel
+from padforge.sense.localizer.single_press import OTHER_PAD
 from padforge.sense.rig import simulated_board
 from padforge.sense.rig.devices import RigFault
 from padforge.sense.settings import RigSettings

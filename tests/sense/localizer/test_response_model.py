@@ -10,6 +10,7 @@ from padforge.sense.localizer.response_model import (
     RIDGE_HISTORY,
     RIDGE_MODULATION,
     ResponseModel,
+    grid_positions,
     interpolate_grid,
     remove_history,
 )
@@ -45,10 +46,8 @@ def test_fit_recovers_response_and_history(made: Made) -> None:
     assert np.abs((found.history_coef - kept * memory) * spread).max() < 0.02
     assert found.history_mean_v == pytest.approx(history.mean(axis=0))
     inner = slice(GRID_CELLS // 4, -GRID_CELLS // 4)
-    grid = np.linspace(-1, 1, GRID_CELLS + 1)[inner]
-    at = np.stack(np.meshgrid(grid, grid, indexing="ij"), axis=-1)
-    expected = answer(at.reshape(-1, 2)).reshape(len(grid), len(grid), FIBRES, WINDOWS)
-    assert np.abs(found.table[inner, inner] - expected).max() < 0.08
+    expected = answer(grid_positions(GRID_CELLS + 1).reshape(-1, 2)).reshape(found.table.shape)
+    assert np.abs(found.table - expected)[inner, inner].max() < 0.08
     # windows without history depend on the place only
     left = remove_history(windows, history, found.history_coef / kept, found.history_mean_v) - answer(places)
     assert left.std() < 0.06
@@ -105,12 +104,13 @@ def test_fit_ignores_masked_presses(made: Made) -> None:
 @settings(max_examples=20)
 @given(seed=st.integers(0, 999), x=st.floats(-1, 1), y=st.floats(-1, 1))
 def test_interpolate_grid_is_bilinear(seed: int, x: float, y: float) -> None:
-    """Against a bilinear function, which linear interpolation gives exactly."""
+    """Against a bilinear function, which linear interpolation gives exactly; of tables of any further axes."""
     a, b, c, d = np.random.default_rng(seed).standard_normal(4)
-    grid = np.linspace(-1, 1, 9)
-    u, v = np.meshgrid(grid, grid, indexing="ij")
-    found = interpolate_grid((a + b * u + c * v + d * u * v)[:, :, None], np.array([[x, y]]))
-    assert found.item() == pytest.approx(a + b * x + c * y + d * x * y, abs=2e-3)
+    u, v = np.moveaxis(grid_positions(9), 2, 0)
+    table = (a + b * u + c * v + d * u * v)[:, :, None, None] * np.array([[1.0], [2.0]])
+    found = interpolate_grid(table, np.array([[x, y], [-x, y]]))
+    assert found[0, :, 0] == pytest.approx((a + b * x + c * y + d * x * y) * np.array([1, 2]), abs=4e-3)
+    assert found.shape == (2, 2, 1)
 
 
 def pressed() -> tuple[np.ndarray, np.ndarray]:
@@ -131,12 +131,10 @@ def test_leave_one_out_residuals_are_those_of_fits_without_them() -> None:
     fibre_mask = np.ones((90, FIBRES), dtype=bool)
     table = table_of(places, windows)
     presses = training_presses(windows, fibre_mask, places)
-    flat = table.reshape(*table.shape[:2], -1)
-    rest = leave_one_out_residuals(presses, table).inputs - interpolate_grid(flat, places).reshape(windows.shape)
+    rest = leave_one_out_residuals(presses, table).inputs - interpolate_grid(table, places)
     for press in (0, 4, 17):
         others = (places != places[press]).any(axis=1)
-        without = table_of(places[others], windows[others])
-        expected = interpolate_grid(without.reshape(*table.shape[:2], -1), places[[press]]).reshape(FIBRES, 3)
+        expected = interpolate_grid(table_of(places[others], windows[others]), places[[press]])[0]
         same = (places == places[press]).all(axis=1)
         # Of several presses at one place, left out together, their mean stands to the table as each of them does here.
         np.testing.assert_allclose(rest[same].mean(axis=0), windows[same].mean(axis=0) - expected, atol=0.02, rtol=0.02)

@@ -17,10 +17,6 @@ def make_maps(n_maps: int, seed: int) -> np.ndarray:
     return np.cos(waves).reshape(SIDE, SIDE, FIBRES, n_maps)
 
 
-def interpolate(maps: np.ndarray, positions: np.ndarray) -> np.ndarray:
-    return interpolate_grid(maps.reshape(SIDE, SIDE, -1), positions).reshape(len(positions), *maps.shape[2:])
-
-
 @pytest.fixture
 def positions() -> np.ndarray:
     return np.random.default_rng(0).uniform(-1, 1, (PRESSES, 2))
@@ -37,7 +33,7 @@ def test_fit_response_finds_the_weights_of_its_maps(positions: np.ndarray) -> No
     """Of twelve maps and noise of a fiftieth, forty presses leave a tenth of the response unexplained at most."""
     rng, maps = np.random.default_rng(1), make_maps(12, seed=2)
     truth = np.einsum("xycj,cjf->xycf", maps, rng.standard_normal((FIBRES, 12, WINDOWS)))
-    windows = interpolate(truth, positions)
+    windows = interpolate_grid(truth, positions)
     windows += 0.02 * windows.std() * rng.standard_normal(windows.shape)
     fit = fit_response(positions, windows, np.ones((PRESSES, FIBRES), bool), ResponsePrior(maps))
     assert (fit.table - truth).std() < 0.1 * truth.std()
@@ -57,7 +53,7 @@ def test_fit_response_is_the_posterior_mean_and_its_leverages_leave_presses_out(
     prior = ResponsePrior(maps)
     fit = fit_response(positions, windows, valid, prior)
     # The conditional mean of a normal distribution, of fibre 0 at one node of the grid.
-    at, node = interpolate(maps, positions)[:, 0], maps[10, 20, 0]
+    at, node = interpolate_grid(maps, positions)[:, 0], maps[10, 20, 0]
     squares = (((other - positions) ** 2).sum(axis=-1) for other in (positions[:, None], grid_positions(SIDE)[10, 20]))
     smooth, to_node = (0.03 * np.exp(-0.5 * each / response_process.REMAINDER_STD**2) for each in squares)
     covariance, cross = 30 * (at @ at.T + smooth), 30 * (at @ node + to_node)
@@ -65,8 +61,8 @@ def test_fit_response_is_the_posterior_mean_and_its_leverages_leave_presses_out(
     np.testing.assert_allclose(fit.table[10, 20, 0], expected, atol=1e-9)
     # The residual over 1 - leverage is that of a fit without the press; its table is interpolated.
     without = fit_response(positions[1:], windows[1:], valid[1:], prior)
-    left_out = windows[0] - interpolate(without.table, positions[:1])[0]
-    residual = windows[0] - interpolate(fit.table, positions[:1])[0]
+    left_out = windows[0] - interpolate_grid(without.table, positions[:1])[0]
+    residual = windows[0] - interpolate_grid(fit.table, positions[:1])[0]
     np.testing.assert_allclose(residual / (1 - fit.leverage[0])[:, None], left_out, atol=0.02)
 
 
@@ -95,7 +91,7 @@ def test_fit_response_tells_fibres_of_the_earlier_pad_from_new_ones(positions: n
     for new in ([], [2], [0, 1, 3]):
         truth = 1.1 * old
         truth[:, :, new] = other[:, :, new]
-        windows = interpolate(truth, positions)
+        windows = interpolate_grid(truth, positions)
         windows = windows * (1 + 0.1 * rng.standard_normal(windows.shape))
         fit = fit_response(positions, windows, np.ones((PRESSES, FIBRES), bool), ResponsePrior(maps, old))
         assert np.flatnonzero(fit.is_new).tolist() == (new if len(new) < 2 else [0, 1, 2, 3])

@@ -62,10 +62,8 @@ def test_localizer_fits_evaluates_and_keeps_a_recording(brief: Recording, tmp_pa
     localizer.save(tmp_path)
     again = Localizer.load(tmp_path)
     assert np.array_equal(again.predict(brief, [0]).r90_mm, localizer.predict(brief, [0]).r90_mm)
-    params = again.get_params()
-    assert [params[name] for name in ("max_failures", "split")] == [2, "chronological"]
+    assert repr(again) == "Localizer(max_failures=2, split='chronological')"
     some = brief[10:40][[3, 5]]  # which are predicted as among all
-    np.testing.assert_array_equal(some.presses_mm, brief.presses_mm[[13, 15]])
     whole = localizer.predict(brief).positions_mm[[13, 15]]
     np.testing.assert_allclose(localizer.predict(some).positions_mm, whole, atol=1e-5)
 
@@ -73,9 +71,7 @@ def test_localizer_fits_evaluates_and_keeps_a_recording(brief: Recording, tmp_pa
 @few_moments()
 def test_localizer_and_any_regressor_are_cross_validated_on_a_recording(recording: Recording) -> None:
     localizer = Localizer(members=2, max_failures=1, **TINY | {"hidden": 8, "epochs": 1})
-    scores = cross_val_score(localizer, first_presses(recording, 120), cv=KFold(2))
-    assert scores.shape == (2,)
-    assert (scores > -4).all()
+    assert (cross_val_score(localizer, first_presses(recording, 120), cv=KFold(2)) > -4).all()
     pipeline = make_pipeline(PressWindows(), KNeighborsRegressor())
     predicted = cross_val_predict(pipeline, recording, recording.presses_mm, cv=KFold(2))
     guess = np.abs(recording.presses_mm - recording.presses_mm.mean(axis=0)).mean()

@@ -121,7 +121,6 @@ def test_presses_before_the_first_stage_and_without_fibres_are_not_judged(traine
         early = np.tile(np.arange(N_TIMED) < n_complete, (100, 1))
         assert not find_unlike(trained.tests, replace(two, complete=early)).any()
     assert not find_unlike(trained.tests, replace(two, fibre_mask=np.zeros_like(two.fibre_mask))).any()
-    assert not find_unlike((), two).any()
 
 
 def test_expected_responses_fit_and_two_of_them_do_not(trained: Trained) -> None:
@@ -149,21 +148,17 @@ def test_pads_cast_again_are_other_pads_unless_presses_are_few(trained: Trained,
     assert not trained.is_other_pad(presses[: MIN_PRESSES - 1])
     uncalibrated = tuple(replace(test, n_presses=np.zeros(1)) for test in trained.tests)
     assert not is_other_pad(uncalibrated, find_misfits(trained.tests, presses))
-    assert not is_other_pad((), find_misfits((), presses))
 
 
 def test_pads_that_drift_or_have_failed_fibres_are_no_other_pads(trained: Trained, pad: Recording) -> None:
     rng = np.random.default_rng(3)
     rest_v = np.median(pad.readings, axis=0)
-    gains = np.exp(0.1 * rng.standard_normal((3, pad.fibres)))
+    gains = np.exp(0.1 * rng.standard_normal((2, pad.fibres)))
     drifted = [rest_v + 0.1 * rng.standard_normal(pad.fibres) + gain * (pad.readings - rest_v) for gain in gains]
-    changed = [pad, fail(pad, [1]), fail(pad, [0, 4]), *(replace(pad, readings=readings) for readings in drifted)]
-    inverted = np.array(pad.readings)
-    inverted[:, 3] = 2 * rest_v[3] - inverted[:, 3]
-    swapped = np.array(pad.readings)
-    swapped[:, [1, 4]] = swapped[:, [4, 1]]
-    changed += [replace(pad, readings=inverted), replace(pad, readings=swapped)]
-    for recording in changed:
+    inverted = np.where(np.arange(pad.fibres) == 3, 2 * rest_v - pad.readings, pad.readings)
+    swapped = pad.readings[:, [0, 4, 2, 3, 1, 5]]
+    changed = (replace(pad, readings=readings) for readings in (*drifted, inverted, swapped))
+    for recording in (pad, fail(pad, [1]), fail(pad, [0, 4]), *changed):
         presses = trained.later(recording)
         for first in range(0, len(presses) - MIN_PRESSES, 90):
             assert not trained.is_other_pad(presses[first : first + MIN_PRESSES])

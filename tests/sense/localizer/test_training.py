@@ -13,10 +13,14 @@ from padforge.sense.localizer import network, torch_network, training
 from padforge.sense.localizer.features import N_FEATURES
 from padforge.sense.localizer.moments import N_PRESS_WINDOWS, N_TIMED, PHASES, RESIDUAL_PHASE
 from padforge.sense.localizer.press_sampler import PressSampler, sample_fibre_dropout
-from padforge.sense.localizer.response_model import interpolate_grid
+from padforge.sense.localizer.response_model import grid_positions, interpolate_grid
 from padforge.sense.localizer.torch_network import EnsembleMlp
 from padforge.sense.settings import LocalizerSettings as Options
 from tests.helpers.presses import training_presses
+
+
+def parameters(ensemble: EnsembleMlp) -> dict[str, np.ndarray]:
+    return {name: weight.detach().numpy() for name, weight in ensemble.named_parameters()}
 
 
 @settings(max_examples=5)
@@ -29,7 +33,7 @@ def test_forward_agrees_with_torch(seed: int, layers: int, n_timed: int) -> None
     seen = torch.rand(7, n_timed, generator=generator) < 0.6
     x = torch_network.network_inputs(features, fibre_mask, seen)
     expected = ensemble(x[None]).detach().numpy()
-    weights = EnsembleMlp.join({name: weight.detach().numpy() for name, weight in ensemble.named_parameters()})
+    weights = EnsembleMlp.join(parameters(ensemble))
     inputs = network.network_inputs(features.numpy(), fibre_mask.numpy(), seen.numpy())
     np.testing.assert_array_equal(inputs, x.numpy())
     outputs = network.forward(weights, inputs)
@@ -55,25 +59,19 @@ def test_fit_network_returns_the_average_of_the_last_weights() -> None:
     """Of a quadratic with noisy gradients, the average is nearer to the minimum than single weights are."""
     torch.manual_seed(0)
     reports: list[int] = []
-
-    def fit(averaged: bool) -> float:
-        w = torch.zeros(200, requires_grad=True)
-        weights = training.fit_network(
-            {"w": w},
-            lambda: ((w - 1 + 0.5 * torch.randn(200)) ** 2).mean(),
-            1000,
-            0.05,
-            weight_decay=0.0,
-            averaged=averaged,
-            on_progress=lambda done, total, what: reports.append(done),
-        )
-        return float(np.square(weights["w"] - 1).mean())
-
-    assert fit(averaged=True) < 0.05
+    w = torch.zeros(200, requires_grad=True)
+    weights = training.fit_network(
+        {"w": w},
+        lambda: ((w - 1 + 0.5 * torch.randn(200)) ** 2).mean(),
+        1000,
+        0.05,
+        weight_decay=0.0,
+        on_progress=lambda done, total, what: reports.append(done),
+    )
+    average, last = (np.square(each - 1).mean() for each in (weights["w"], w.detach().numpy()))
+    assert average < 0.8 * last < 0.05
     assert np.float64(5e-324) * 1.0 > 0  # denormal numbers are there again after a training
-    assert reports == sorted(reports)
-    assert (len(reports), reports[-1]) == (training.REPORTS, training.REPORTS)
-    assert fit(averaged=False) < 0.05
+    assert reports == list(range(1, training.REPORTS + 1))
     assert [training.one_cycle(share) for share in (0.0, 0.05, 0.1, 0.55, 1.0)] == pytest.approx([0, 0.5, 1, 0.5, 0])
 
 
@@ -159,7 +157,7 @@ def test_train_members_trains_a_network_for_each_phase(n_timed: int, members: in
     assert list(totals) == ["Bayesian localizer"] * (members > 1)
     assert list(trained.networks) == list(phases)
     for weights in trained.networks.values():
-        network.check_weights(weights, 2 * (N_FEATURES + 1) + n_timed, "ensemble")
+        assert weights["first.w"].shape == (max(1, members - 1), 2 * (N_FEATURES + 1) + n_timed, 8)
     assert bool(trained.bayes) == bool(trained.residual_network) == (members > 1)
 
 
@@ -177,7 +175,7 @@ def test_inputs_are_scaled_down_in_training_alone() -> None:
     assert squares[-1] < 1.1
     small = torch.linalg.eigvalsh(x[0].T @ x[0] / x.shape[1])[:50]
     torch.testing.assert_close(squares[:50], small / training.COMMON_SQUARE, rtol=1e-2, atol=1e-4)
-    weights = {name: weight.detach().numpy() for name, weight in trained.network.named_parameters()}
+    weights = parameters(trained.network)
     expected = trained.network(scaled).detach().numpy()
     np.testing.assert_allclose(network.forward(trained.weights(weights), x[0].numpy()), expected, atol=1e-4)
     # A training from these weights starts with a network that answers alike.
@@ -190,20 +188,14 @@ def test_inputs_are_scaled_down_in_training_alone() -> None:
 def test_retrain_follows_another_response_from_where_networks_are(monkeypatch: pytest.MonkeyPatch) -> None:
     """Networks are left out, or stay, as asked; one that is retrained errs less on the response of now."""
     rng = np.random.default_rng(0)
-    grid = np.stack(np.meshgrid(*[np.linspace(-1, 1, 21)] * 2, indexing="ij"), axis=-1)
-    table = np.tile((grid @ rng.normal(0, 1, (2, 3)))[..., None], N_FEATURES).astype(np.float32)
+    table = np.tile((grid_positions(21) @ rng.normal(0, 1, (2, 3)))[..., None], N_FEATURES).astype(np.float32)
     positions = rng.uniform(-1, 1, (60, 2))
-    inputs = interpolate_grid(table.reshape(21, 21, -1), positions).reshape(60, 3, N_FEATURES)
+    inputs = interpolate_grid(table, positions)
     presses = training_presses(inputs, np.ones((60, 3), bool), positions, N_TIMED)
     options = Options(hidden=16, layers=1, members=2)
     phase = PHASES[N_TIMED]["released"]
     members = [training.Training(presses, table, options, seed, phase) for seed in (0, 1)]
-    old = network.stack_members(
-        [
-            each.weights({name: part.detach().numpy() for name, part in each.network.named_parameters()})
-            for each in members
-        ]
-    )
+    old = network.stack_members([each.weights(parameters(each.network)) for each in members])
     assert len(network.unstack_members(old)) == 2
     for name, part in network.stack_members(network.unstack_members(old)).items():
         np.testing.assert_array_equal(part, old[name])

@@ -43,8 +43,8 @@ def test_any_contact_can_be_widened(contact: Contact) -> None:
 
 
 def test_paths_and_sensitivities_deviate_as_stated() -> None:
-    rigs = [RigSettings(seed=seed, path_mm=0.7, sensitivity=0.4, own_sensitivity=0.3) for seed in range(40)]
-    pads = [build_pad(PLAN, rig) for rig in rigs]
+    rig = RigSettings(path_mm=0.7, sensitivity=0.4, own_sensitivity=0.3)
+    pads = [build_pad(PLAN, rig.model_copy(update={"seed": seed})) for seed in range(40)]
     at = np.linspace(0.1, 0.9, 30)
     offsets = [_across(pad.paths, at) - _across(PLAN, at) for pad in pads]  # ends stay, so more between them
     assert PLAN.unit_mm * np.std(offsets) == pytest.approx(0.7, rel=0.15)
@@ -53,8 +53,6 @@ def test_paths_and_sensitivities_deviate_as_stated() -> None:
         rows = np.log(part)
         assert np.std(rows - rows.mean(axis=2, keepdims=True)) == pytest.approx(std, rel=0.1)
     assert np.mean(held) == pytest.approx(1.0)
-    again = build_pad(PLAN, rigs[3])
-    np.testing.assert_array_equal(again.paths.knots, pads[3].paths.knots)
 
 
 def _across(pad: Morphology, shares: np.ndarray) -> np.ndarray:

@@ -10,6 +10,7 @@ from padforge.sense import RigSettings, simulate
 from padforge.sense.simulation.built_pad import PressParts
 from padforge.sense.simulation.pad_model import (
     ADC_STEPS,
+    RETURNED,
     SUPPLY_V,
     Cycle,
     Drift,
@@ -20,10 +21,9 @@ from padforge.sense.simulation.pad_model import (
     adc_volts,
     divider_voltage,
     probe_motion,
-    simulate_readings,
+    replaced_residues,
     superpose_strain,
 )
-from padforge.sense.simulation.residual_indentation import RETURNED, replaced_residues
 from tests.helpers.rigs import quiet_rig
 
 PAD = Morphology.straight(4)
@@ -123,19 +123,13 @@ def test_streams_do_not_depend_on_the_size_of_blocks() -> None:
     np.testing.assert_allclose(np.vstack([drift(n) for n in pieces]), again(sum(pieces)))
 
 
-def test_held_presses_follow_the_relative_stretch_and_scatter() -> None:
-    """A fibre's resistance grows by 0.4 of its relative stretch at 5 mm; responses scatter by a sixth of that."""
+def test_held_presses_follow_the_relative_stretch() -> None:
+    """A fibre's resistance grows by 0.4 of its relative stretch at 5 mm."""
     recording = simulate(PAD, quiet_rig(presses=400), PUBLISHED_CONTACT)
     cycles = recording.readings.reshape(400, 40, 8)
     rest, stretch = cycles[:, 15], relative_stretch(PAD, PAD.to_grid(recording.presses_mm), PUBLISHED_CONTACT)
     held = 3.3 / (1 + (3.3 / rest - 1) * (1 + 0.4 * stretch))
     np.testing.assert_allclose(cycles[:, 35], held, atol=1.6 * 3.3 / 4095)
-    rests = [simulate(PAD, quiet_rig(presses=1, seed=seed)).readings[0] for seed in range(20)]
-    assert (np.min(rests), np.max(rests)) == pytest.approx((1.7, 2.1), abs=0.02)
-    scattered = simulate(PAD, quiet_rig(presses=400, scatter=0.16), PUBLISHED_CONTACT)
-    strong = rest - held > 0.05
-    gains = (scattered.readings.reshape(400, 40, 8)[:, 35] - rest)[strong] / (held - rest)[strong]
-    assert gains.std() == pytest.approx(0.16, rel=0.15)
 
 
 def test_presses_have_the_published_delays_and_travel() -> None:
@@ -158,17 +152,3 @@ def test_live_pad_responds_in_proportion_to_depth() -> None:
     assert touched.any()
     assert ((full < half) & (half < rest))[touched].all()
     assert np.array_equal(full[~touched], rest[~touched])
-
-
-def test_held_presses_scatter_by_the_floor_in_millivolts() -> None:
-    """Of fibres that rest near half of the supply; elsewhere a change of resistance shows less."""
-    rig = quiet_rig(floor_mv=20.0)
-    none, presses = np.zeros((400, 6)), 400
-    readings = simulate_readings(
-        PressParts(none, none, none, none), np.zeros((presses, 2)), CYCLE, rig, np.random.default_rng(0)
-    )
-    cycles = readings.reshape(presses, CYCLE.readings, 6)
-    rest_v, held_v = cycles[:, CYCLE.down_index - 1], cycles[:, -1]
-    middle = rest_v.mean(axis=0)
-    expected_v = 0.02 * 4 * middle * (SUPPLY_V - middle) / SUPPLY_V**2
-    np.testing.assert_allclose((held_v - rest_v).std(axis=0), expected_v, rtol=0.12)

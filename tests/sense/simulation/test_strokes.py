@@ -16,13 +16,6 @@ def pad() -> Morphology:
     return Morphology.random(3, knots=5, seed=0)
 
 
-@pytest.fixture(scope="module")
-def reach_mm(pad: Morphology) -> float:
-    """How far from the middle presses are."""
-    resting = simulate_strokes(pad, RigSettings(presses=8), Contact(), 0.0, 300, np.random.default_rng(2))
-    return float(np.abs(resting.positions_mm).max())
-
-
 def test_a_stroke_reads_as_a_press_where_the_finger_is(pad: Morphology) -> None:
     strokes = simulate_strokes(pad, QUIET, Contact(), 20.0, 3, np.random.default_rng(0))
     recording = strokes.recording
@@ -47,7 +40,7 @@ class _FixedStart:
 
 
 @pytest.mark.parametrize("speed", [0.0, 10.0, 50.0])
-def test_strokes_go_straight_at_their_speed_and_stay_on_the_pad(pad: Morphology, reach_mm: float, speed: float) -> None:
+def test_strokes_go_straight_at_their_speed_and_stay_on_the_pad(pad: Morphology, speed: float) -> None:
     rig = RigSettings(presses=8)
     strokes = simulate_strokes(pad, rig, Contact(), speed, 20, np.random.default_rng(1))
     steps = np.diff(strokes.positions_mm, axis=1)
@@ -55,7 +48,5 @@ def test_strokes_go_straight_at_their_speed_and_stay_on_the_pad(pad: Morphology,
     speeds = np.hypot(*steps[:, 0].T) * rig.rate_hz
     assert (speeds <= speed * (1 + 1e-9)).all()
     assert np.median(speeds) == pytest.approx(speed) or speed > 20
-    assert np.abs(strokes.positions_mm).max() <= reach_mm + 1
+    assert np.abs(strokes.positions_mm).max() <= 1.5 * pad.unit_mm  # from the middle of what is sensed
     np.testing.assert_array_equal(strokes.recording.presses_mm, strokes.positions_mm[:, -1])  # where they end
-    again = simulate_strokes(pad, rig, Contact(), speed, 20, np.random.default_rng(1))
-    assert np.array_equal(again.recording.readings, strokes.recording.readings)

@@ -68,8 +68,6 @@ def test_align_transform_moves_common_offsets_into_the_transform(pad):
     aligned = shifted.align_transform()
     assert np.abs(aligned.channel_values[:, OFFSET]).max() < 1e-6
     assert aligned.predict(POSITIONS_MM) == pytest.approx(shifted.predict(POSITIONS_MM), abs=1e-9)
-    shift_mm = [1.0 - 0.2 * PLAN.unit_mm, -2.0 + 0.1 * PLAN.unit_mm]
-    assert aligned.transform.shift_mm == pytest.approx(shift_mm, abs=0.5)
     volts = pad.predict(POSITIONS_MM)  # offsets that have a rotation in common
     assert pad.align_transform().predict(POSITIONS_MM) == pytest.approx(volts, abs=0.02 * np.ptp(volts))
 

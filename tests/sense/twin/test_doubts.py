@@ -22,14 +22,6 @@ def result(identification: Identification) -> Identification:
     return identification
 
 
-def moved(pad: Morphology, fibre: int, pitches: float) -> Morphology:
-    """Move the inner knots of a fibre across its axis, within the pad."""
-    knots, axis = pad.knots.copy(), 1 - pad.layout.family(fibre)
-    inner = knots[fibre, 1:-1, axis] + pitches
-    knots[fibre, 1:-1, axis] = np.clip(inner, 0.05, pad.layout.extent[axis] - 0.05)
-    return Morphology.from_layout(knots, pad.layout)
-
-
 def test_a_channel_that_a_smooth_function_of_the_position_explains_better_is_doubted(result: Identification) -> None:
     """And nothing of a pad that lies as planned; but a fibre far beside its plan."""
     assert result.fit.pad.fibres == (0, 1, 2, 3)
@@ -98,22 +90,3 @@ def test_another_pad_is_doubted_and_the_recorded_one_is_not() -> None:
     assert find_doubts(right) == []
     assert right.fit.pad.fibres == (0, 1, 2, 3)
     assert any("is it the recording of this pad?" in doubt for doubt in find_doubts(wrong))
-
-
-@pytest.mark.slow
-@few_candidates()
-@few_compared()
-def test_a_pad_of_straight_fibres_is_not_doubted() -> None:
-    pad = Morphology.straight(3)
-    result = identify_simulated(pad, pad, RigSettings(presses=160, seed=7))
-    assert find_doubts(result) == []
-    assert result.alternatives  # as good, and planned where the stated one is
-
-
-@pytest.mark.slow
-@few_candidates()
-@few_compared()
-def test_a_fibre_moved_by_a_pitch_is_doubted() -> None:
-    told = Morphology.random(2, knots=3, seed=1)
-    result = identify_simulated(moved(told, 2, 1.0), told, RigSettings(presses=160, seed=60))
-    assert any("channel 3 does not fit" in doubt for doubt in find_doubts(result))

@@ -58,13 +58,6 @@ def test_fit_recovers_lateral_offsets_unless_noise_is_inflated(printed, fitted, 
     assert inflated.offset_std(0).mean() > fitted.offset_std(0).mean()
 
 
-@pytest.mark.slow
-def test_evidence_prefers_the_true_wiring(start, responses, fitted):
-    swapped = AsBuiltPad.from_plan(start.plan, start.fibres[::-1], start.transform, 0.5)
-    other = fit_as_built(fit_as_built(swapped, responses, Priors()).pad, responses, FREE)
-    assert fitted.log_evidence > other.log_evidence + 50
-
-
 @pytest.mark.parametrize(("share", "common", "floor"), [(0.0, 0.0, 0.01), (0.18, 0.36, 0.01), (0.18, 0.9, 0.002)])
 def test_estimate_scatter_recovers_share_common_and_floor(printed, fitted, share, common, floor) -> None:
     noiseless = replace(printed, channels=tuple(replace(channel, noise_v=0.0) for channel in printed.channels))
