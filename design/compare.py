@@ -152,9 +152,8 @@ def _evaluate(variant: Variant, pad: Morphology, seed: int | None) -> dict[str, 
     contact = design_contact(variant.spec, search)
     with stage("compare"):
         contacts = served_contacts(contact, search)
-        results = errors_by_contact(beside_straight(pad), contacts, pad_settings, search)
-    errors_mm = {name: {r.pad: list(r.errors_mm) for r in results if r.contact == name} for name in contacts}
-    main, *others = errors_mm
+        errors_mm = errors_by_contact(beside_straight(pad), contacts, pad_settings, search)
+    main, *others = contacts
     straight = Morphology.straight(pad.layout)
     return {
         "name": variant.name,
@@ -165,10 +164,10 @@ def _evaluate(variant: Variant, pad: Morphology, seed: int | None) -> dict[str, 
         "crossings": len(crossings(pad)),
         "straight_length_mm": float(lengths(straight).sum() * pad.unit_mm),
         "straight_crossings": len(crossings(straight)),
-        "errors_mm": errors_mm[main]["designed"],
-        "straight_mm": errors_mm[main]["straight"],
+        "errors_mm": errors_mm[main, "designed"],
+        "straight_mm": errors_mm[main, "straight"],
         "others": {
-            name: {"errors_mm": errors_mm[name]["designed"], "straight_mm": errors_mm[name]["straight"]}
+            name: {"errors_mm": errors_mm[name, "designed"], "straight_mm": errors_mm[name, "straight"]}
             for name in others
         },
         "contact": contact.model_dump(mode="json"),

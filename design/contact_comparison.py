@@ -1,7 +1,6 @@
 """Sensitivity of expected errors to the contact model, written to `contacts.json`."""
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
 from functools import partial
 from itertools import product
 from pathlib import Path
@@ -23,24 +22,18 @@ if TYPE_CHECKING:
 FORMAT, NAME = "padforge-contacts/1", "contacts.json"
 
 
-@dataclass(frozen=True)
-class ContactErrors:
-    """Expected errors of one pad under one contact."""
-
-    contact: str  # name of the contact
-    pad: str  # name of the pad
-    errors_mm: tuple[float, ...]  # with 0, 1, ... fibres failed
-
-
 def errors_by_contact(
     pads: Mapping[str, Morphology], contacts: Mapping[str, Contact], pad_settings: PadSettings, search: SearchSettings
-) -> list[ContactErrors]:
-    """Compute the expected errors of pads of one layout under every contact, all by the same random numbers."""
+) -> dict[tuple[str, str], list[float]]:
+    """Compute the expected errors of pads of one layout under every contact, all by the same random numbers.
+
+    They are in mm, with 0, 1, ... fibres failed, by the names of contact and pad.
+    """
     names = list(product(contacts, pads))
     with threadpool_limits(1, "blas"):  # around those of the tasks, which would lift them for one another
         tasks = (((c, p), partial(expected_errors, pads[p], contacts[c], search, pad_settings)) for c, p in names)
         errors = dict(run_tasks(tasks))
-    return [ContactErrors(c, p, tuple(pads[p].unit_mm * error for error in errors[c, p])) for c, p in names]
+    return {(c, p): [pads[p].unit_mm * error for error in errors[c, p]] for c, p in names}
 
 
 def beside_straight(pad: Morphology) -> dict[str, Morphology]:
@@ -61,10 +54,11 @@ def compare_contacts(spec: "Spec", pad: Morphology, out: Path, seed: int | None 
     contacts = judged_contacts(design_contact(spec, settings), settings)
     with stage("contacts"):
         errors = errors_by_contact(beside_straight(pad), contacts, pad_settings, settings)
+    rows = [{"contact": contact, "pad": name, "errors_mm": values} for (contact, name), values in errors.items()]
     document = {
         "format": FORMAT,
         "scatter": settings.response_scatter._asdict(),
-        "rows": list(map(asdict, errors)),
+        "rows": rows,
         "provenance": provenance("padforge run", settings.seed, [out / "morphology.json"]),
     }
     write_json(out / NAME, document)

@@ -103,17 +103,12 @@ class TwinReadings:
 class TwinPart:
     """Part of a press, to which the fibres of the twin respond, without the residues of earlier presses it removes.
 
-    Attributes:
-        distance_mm: as of the twin; shape (n,).
-        weight: as of the twin; shape (n,).
-        gains_v: of each channel, V for a relative stretch of 1; shape (C,).
-        angular_weight: as of the twin; shape (n,).
-        sensitivity: as of the twin.
+    Its fields are as of the twin.
     """
 
     distance_mm: Array
     weight: Array
-    gains_v: Array
+    gains_v: Array  # of each channel, V for a relative stretch of 1; shape (C,)
     angular_weight: Array | None = None
     sensitivity: tuple[Array | None, ...] | None = None
 
@@ -128,17 +123,11 @@ class TwinPart:
 
 @dataclass(frozen=True)
 class TwinResidual:
-    """Smooth function of the position by which the measured parts of a press differ from the predicted ones.
+    """Smooth function of the position by which the measured parts of a press differ from the predicted ones."""
 
-    Attributes:
-        middle_mm: centre of the square on which it is sampled, in the arm's frame.
-        half_mm: half of its side.
-        volts: on a grid over the square, x before y; shape (parts, C, n, n), in the order of `PARTS`.
-    """
-
-    middle_mm: tuple[float, float]
-    half_mm: float
-    volts: Array
+    middle_mm: tuple[float, float]  # centre of the square on which it is sampled, in the arm's frame
+    half_mm: float  # half of its side
+    volts: Array  # on a grid over the square, x before y; shape (parts, C, n, n), in the order of `PARTS`
 
     def __post_init__(self) -> None:
         _convert(self, tuple, "middle_mm")

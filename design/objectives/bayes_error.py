@@ -62,31 +62,17 @@ Mask = NDArray[np.bool_]
 
 
 class Positions(NamedTuple):
-    """Positions that a press may have, each of which stands for a cell around it.
+    """Positions that a press may have, each of which stands for a cell around it."""
 
-    Attributes:
-        places: the positions; shape (P, 2), grid units.
-        log_prior: logarithms of the areas of the cells; shape (P,).
-        responses: responses of the fibres; shape (P, F), full scales.
-        blur: variances of the responses within the cells; shape (P, F).
-    """
-
-    places: Array
-    log_prior: Array
-    responses: Array
-    blur: Array
+    places: Array  # the positions; shape (P, 2), grid units
+    log_prior: Array  # logarithms of the areas of the cells; shape (P,)
+    responses: Array  # responses of the fibres; shape (P, F), full scales
+    blur: Array  # variances of the responses within the cells; shape (P, F)
 
 
 @threadpool_limits.wrap(limits=1, user_api="blas")  # several threads wait for each other, and other work goes on
 def expected_errors(pad: Morphology, contact: Contact, search: SearchSettings, size: PadSettings) -> list[float]:
-    """Compute the expected errors with 0, 1, ... fibres failed, grid units, always with the same random numbers.
-
-    Args:
-        pad: the fibres.
-        contact: contact model of the presses.
-        search: number of fibres that may fail, and scatter of the responses.
-        size: settings of the pad, with the rectangle that is pressed.
-    """
+    """Compute the expected errors with 0, 1, ... fibres failed, grid units, always with the same random numbers."""
     fibres, windows = len(pad.knots), evaluation_windows(size.sensed)
     levels = range(min(len(failure_shares(search.max_failures)), fibres))
     masks = [failure_masks(fibres, k, max(MAX_SETS // len(windows), MIN_SETS)) > 0 for k in levels]

@@ -92,7 +92,6 @@ VALUES: dict[str, Callable[[], object]] = {
     "failed fibres": lambda: design.localisation_error(PAD, n_failed=(-1,)),
     "an origin of other fibres": lambda: design.search(PadSettings(grid=2), origin=Morphology.straight(3)),
     "a population": lambda: design.search(settings=SearchSettings(method="genetic", population=100_000)),
-    "a time budget": lambda: design.SearchOptions(time_budget=-1),
 }
 
 

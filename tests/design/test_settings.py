@@ -63,7 +63,7 @@ REFUSED = {
         *({"weight": "cubic"}, {"model": "half-space"}, {"tool": "cone"}, {"depth_mm": 6}, {"thickness_mm": 4}),
         *({"fibre_depths_mm": [1, 6.5]}, {"fibre_depths_mm": [1, 0]}, {"squeeze": 0, "stretch": 0}),
         *({"length": "manhattan"}, {"model": "layer", "radius": 0.9}, {"radius": 0.9, "depth_mm": 2}),
-        *({"model": "profile", "scale": 2}, {"sensitivity_profile": [], "tool": "ball"}),
+        *({"model": "profile", "scale": 2}, {"model": "shape", "tool": "ball"}),
         *({"sensitivity_profile": [[0, 1], *rest]} for rest in ([[1, 0]], [[1, 0.5], [1, 0]], [[1, 0.5], [2, 0.1]])),
         # whose splines leave their points
         *({"sensitivity_profile": points} for points in ([[0, 10], [9, 10], [10, 0]], [[0, -1], [0.2, 1], [1, 0]])),
@@ -133,9 +133,6 @@ SHAPE = {"radius": 0.6, "sides": 30, "weight": "uniform"}
         ({"radius": 0.9}, "shape", "manhattan"),
         ({"sides": "circle"}, "shape", "manhattan"),
         ({"weight": "inverse", "length": "euclidean"}, "shape", "euclidean"),
-        # as written before there was a layer
-        ({"sensitivity_profile": []}, "shape", "manhattan"),
-        (SHAPE | {"length": "manhattan", "sensitivity_profile": []}, "shape", "manhattan"),
         (SHAPE | {"length": "euclidean", "sensitivity_profile": PROFILE}, "profile", "euclidean"),
     ],
     ids=str,
@@ -169,7 +166,7 @@ def test_unstated_lengths_of_contact_are_those_of_the_mould(tables, thickness_mm
 
 
 def test_other_contacts_do_not_depend_on_the_mould():
-    tables: list[dict[str, Any]] = [{"radius": 0.5}, {"model": "profile"}, {"sensitivity_profile": []}]
+    tables: list[dict[str, Any]] = [{"radius": 0.5}, {"model": "profile"}]
     for stated in tables:
         assert read_contact(Spec({"contact": stated, "mould": {"silicone_mm": 8.0}})) == Contact(**stated)
     with pytest.raises(InputError, match=r"^pad: \[contact\] .*depth_mm is 5, the pad is 4 mm thick"):

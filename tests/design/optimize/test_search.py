@@ -10,7 +10,6 @@ import pytest
 
 from padforge.benchmarks import search as benchmark
 from padforge.design import Contact, Morphology
-from padforge.design.contact_comparison import ContactErrors
 from padforge.design.objectives.expected_error import criterion_errors
 from padforge.design.objectives.rules import check_rules
 from padforge.design.objectives.score import describe_terms, score
@@ -223,11 +222,9 @@ def test_search_for_twin_hands_back_what_locates_best_and_can_be_built_if_any_ca
 
     def judged(pads, contacts, size, search):
         assert set(pads) == ({"default", "straight fibres", "twin", "from default"} if expected != "twin" else {"twin"})
-        for name in pads:
-            errors = (1.0, 1.0) if name == "straight fibres" else (2.0, 2.0)
-            yield ContactErrors("", name, errors)
+        return {("", name): [1.0, 1.0] if name == "straight fibres" else [2.0, 2.0] for name in pads}
 
-    monkeypatch.setattr("padforge.design.optimize.search.errors_by_contact", lambda *asked: list(judged(*asked)))
+    monkeypatch.setattr("padforge.design.optimize.search.errors_by_contact", judged)
     quick = SearchSettings(knots=3, starts=1, steps=2, max_failures=1)
     pad, contact = PadSettings(grid=1), Contact(sensitivity_profile=((0, 1), (5, 0.6), (9, 0.1), (12, 0)))
     steps = []
