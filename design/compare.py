@@ -27,8 +27,6 @@ from padforge.design.settings import Contact, PadSettings, RulesSettings, Search
 FORMAT, NAME = "padforge-comparison/1", "comparison.json"
 MAX_VARIANTS = 64
 MODELS = (PadSettings, Contact, SearchSettings, RulesSettings)  # settings of a design, which may be varied
-# names that no file can have on Windows
-WINDOWS_DEVICE = re.compile(r"(con|prn|aux|nul|com\d|lpt\d)(\.|$)", re.IGNORECASE)
 # makes the mould of a pad in a folder, and returns its costs by the keys of COSTS
 MakePad = Callable[[Morphology, Spec, Path], Mapping[str, Any]]
 # columns that not every pad has, with their units
@@ -53,8 +51,7 @@ class Variant:
     @property
     def folder(self) -> str:
         """Name of its folder, valid on every system."""
-        name = re.sub(r"[^\w.+-]+", "-", self.name).strip(".-") or "pad"
-        return f"pad-{name}" if WINDOWS_DEVICE.match(name) else name
+        return re.sub(r"[^\w.+-]+", "-", self.name).strip(".-") or "pad"
 
 
 def read_variants(

@@ -19,7 +19,6 @@ from padforge.common.plotting import (
     save_figure,
     style_axes,
 )
-from padforge.common.validation import InputError, check_array, check_type
 from padforge.design.contact import (
     FIBRE_BLUR_MM,
     contact_press,
@@ -59,32 +58,18 @@ def draw_plan(
 
     Returns:
         A matplotlib figure with axes in mm from the centre of the pad.
-
-    Raises:
-        InputError: an argument of the wrong type, or a polygon of the wrong shape.
     """
     from matplotlib.figure import Figure
     from matplotlib.patches import Polygon, Rectangle
 
-    from padforge.design.morphology import Morphology
-    from padforge.design.objectives.rules import Violation
     from padforge.design.paths.curves import crossings, flatten
-
-    check_type("pad", pad, Morphology)
-    check_type("contact", contact, Contact)
-    for violation in check_type("violations", violations, Sequence):
-        check_type("violations", violation, Violation)
-    polygons = [check_array("keep_out_mm", corners) for corners in check_type("keep_out_mm", keep_out_mm, Sequence)]
-    for polygon in polygons:
-        if polygon.ndim != 2 or polygon.shape[1] != 2 or not len(polygon):
-            raise InputError(f"keep_out_mm has a polygon of shape {polygon.shape}, expected (n, 2)")
 
     width, height = (side / 2 for side in pad.layout.size_mm)
     half, scale = max(width, height), 6.4 / max(width, height)
     figure = Figure(figsize=(max(scale * width, 4.8), max(scale * height, 2.4)), layout="constrained")
     axes = figure.add_subplot(aspect="equal")
     axes.add_patch(Rectangle((-width, -height), 2 * width, 2 * height, facecolor=PAPER, edgecolor=FAINT, gid="pad"))
-    for polygon in polygons:
+    for polygon in keep_out_mm:
         axes.add_patch(Polygon(polygon, facecolor="white", edgecolor=INK, hatch="///", linewidth=0.8))
     for fibre, points in enumerate(flatten(pad, TOLERANCE)):
         family = pad.layout.family(fibre)

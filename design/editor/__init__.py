@@ -114,12 +114,7 @@ class EditSession:
         Returns:
             The new view; InputError for an invalid edit, which changes nothing.
         """
-        try:
-            edit = json.loads(body)
-        except ValueError:
-            edit = None
-        if not isinstance(edit, dict):
-            raise InputError(f"got {short_repr(body)} as an edit, expected a JSON object")
+        edit = json.loads(body)
         with self._lock:
             history, gesture, kind = self._history, edit.get("gesture", ""), edit.get("do")
             if kind in ("undo", "redo"):
