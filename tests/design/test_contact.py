@@ -85,13 +85,6 @@ def test_indented_signals_are_those_of_solved_contacts():
     assert indented_signals(PAD, [], [], contact).shape == (0, 4)
 
 
-def test_indented_signals_of_a_flat_end_grow_in_proportion_to_the_depth():
-    contact, presses = Contact(tool="flat", tool_radius_mm=5.0), presses_on(PAD, 3)
-    depths_mm = np.array([0.0, 0.02, 4.9])
-    expected = depths_mm[:, None] / 5.0 * signals(PAD, presses, contact)
-    np.testing.assert_allclose(indented_signals(PAD, presses, depths_mm, contact), expected, rtol=1e-6, atol=1e-9)
-
-
 def test_press_forces_are_those_of_solved_contacts():
     contact, depths_mm = Contact(tool="ball", tool_radius_mm=6.0, base="slipping"), np.array([[0.0, 0.02], [1.3, 4.8]])
     solved = [

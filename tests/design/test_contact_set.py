@@ -1,7 +1,5 @@
 """Contacts that a search serves and that a pad is judged by."""
 
-import pytest
-
 from padforge.design import Contact, SearchSettings
 from padforge.design.contact import half_width_mm
 from padforge.design.contact_set import judged_contacts, served_contacts
@@ -9,18 +7,6 @@ from padforge.design.settings import PUBLISHED_CONTACT
 from tests.helpers.golden import Golden
 
 MEASURED = Contact(model="profile")
-
-
-def test_plausible_contacts_of_a_layer_are_isotropic_ones_about_as_wide():
-    """As wide as the profile measured under the default press, in proportion to the layer."""
-    gentle = Contact(tool="ball", tool_radius_mm=4.0, depth_mm=2.5, thickness_mm=4.0)
-    for assumed in (Contact(), gentle):
-        first, *others = served_contacts(assumed, SearchSettings()).values()
-        share = half_width_mm(assumed) / half_width_mm(Contact())
-        assert (first, {other.model for other in others}) == (assumed, {"profile"})
-        widths = [half_width_mm(other) / (share * half_width_mm(MEASURED)) for other in others]
-        assert widths == pytest.approx([0.75, 1.25], rel=0.01)
-    assert half_width_mm(gentle) < 0.8 * half_width_mm(Contact())
 
 
 ASSUMED = {"layer": Contact(), "no stretch": Contact(stretch=0.0), "profile": MEASURED, "shape": PUBLISHED_CONTACT}

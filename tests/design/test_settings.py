@@ -12,7 +12,6 @@ from padforge.design import Contact, Morphology, PadSettings, RulesSettings, Sea
 from padforge.design.published.objective import information
 from padforge.design.settings import (
     BUILT,
-    MEASURED_PROFILE,
     PUBLISHED,
     PUBLISHED_CONTACT,
     Layout,
@@ -22,7 +21,6 @@ from padforge.design.settings import (
 )
 from tests.helpers.golden import Golden
 from tests.helpers.json_text import json_text
-from tests.helpers.limits import require_ends
 
 MODELS = {model.section(): model for model in (PadSettings, Contact, SearchSettings, RulesSettings)}
 
@@ -39,11 +37,6 @@ def test_commented_toml_round_trip(stated, request, golden: Golden) -> None:
 
 def test_schema_states_defaults_and_limits(golden: Golden) -> None:
     golden("design/schema.json", json_text(settings_schema(MODELS)))
-
-
-def test_overrides_win_over_the_file() -> None:
-    found = Spec({"search": {"knots": 7, "seed": 3}}).section(SearchSettings, knots=2, seed=None)
-    assert (found.knots, found.seed) == (2, 3)
 
 
 REFUSED = {
@@ -95,16 +88,6 @@ def test_wrong_override_is_not_blamed_on_the_file():
         spec.section(PadSettings, horizontals=300, pitch_mm=8.0)
     with pytest.raises(InputError, match=r"^pad\.toml: \[pad\] pitch_mm: got 0"):
         spec.section(PadSettings, horizontals=3)
-
-
-def test_limits_of_settings():
-    for model, key, kept, refused in (
-        (PadSettings, "sensed_mm", [(56.25, 0.1)], ["all", (0.0, 1.0), (1.0, 56.3), (1.0,), 5.0]),
-        (SearchSettings, "max_failures", [0, (0.0, 1.0)], [-1, (-1.0, 2.0)]),
-        (SearchSettings, "weights", [(0.0, 1e6, 5e-324)], [(0.0, 0.0, 0.0), (-1.0, 1.0, 1.0), (1.0,)]),
-        (RulesSettings, "max_crossings", [0], [-1]),
-    ):
-        require_ends(model, key, kept, refused)
 
 
 def test_holes_of_a_pad_are_polygons_around_their_screws():
@@ -179,11 +162,6 @@ def test_gains_scatter_by_their_share_and_have_the_common_part_of_its_variance()
     assert gains.std(axis=0) == pytest.approx([0.2] * 3, rel=0.02)
     expected = 0.36 + 0.64 * np.eye(3)
     np.testing.assert_allclose(np.corrcoef(gains.T), expected, atol=0.02)
-
-
-def test_measured_profile_is_a_gaussian():
-    for d, weight in MEASURED_PROFILE:
-        assert weight == pytest.approx(np.exp(-(d**2) / (2 * 6.2**2)), abs=0.015)
 
 
 def test_settings_accept_numpy_numbers():

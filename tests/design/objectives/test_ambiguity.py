@@ -74,15 +74,6 @@ def test_ambiguity_map_has_the_ambiguity_as_mean(pad, contact):
     assert (np.diff(means) >= 0).all()
 
 
-def test_ambiguity_map_shows_where_presses_are_alike():
-    """One fibre along x tells how far off it a press is, but not on which side: its own line alone is certain."""
-    presses = np.stack([np.ones(9), np.linspace(0.2, 1.8, 9)], axis=1)
-    values = ambiguity_map(Morphology.straight((1, 0)), presses, Contact(), 0, 1e-3)[0]
-    assert values[4] == pytest.approx(0, abs=1e-9)
-    assert values[:4] == pytest.approx(np.linspace(0.8, 0.2, 4), rel=1e-6)  # half of the way to the other side
-    assert values[5:] == pytest.approx(values[:4][::-1])
-
-
 def test_ambiguity_map_has_the_full_scale_of_touched_fibres():
     """Presses beside the lowest of six fibres, of which it is the only one to respond."""
     pad, presses = Morphology.straight((6, 0)), np.stack([np.ones(5), np.linspace(0.8, 1.4, 5)], axis=1)

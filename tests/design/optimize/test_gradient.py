@@ -207,13 +207,3 @@ def test_what_fine_steps_do_not_repair_firm_ones_do():
     assert check_rules(run.morphology(), RulesSettings()) != []
     advance(run, REPAIR_STEPS)
     assert check_rules(run.morphology(), RulesSettings()) == []
-
-
-def test_steps_are_by_the_contact_unless_they_are_stated():
-    for contact, others, steps, expected in (
-        (Contact(), (), None, 1200),
-        (Contact(), (PUBLISHED_CONTACT,), None, 3000),
-        (PUBLISHED_CONTACT, (), 7, 7),
-    ):
-        search = SearchSettings(steps=steps, contacts=others)
-        assert begun(search, FREE, contact=contact).problem.steps == expected
