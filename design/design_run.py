@@ -141,17 +141,15 @@ def load_result(out: Path) -> SearchResult:
     """Load the result of a search from the folder of a pad; InputError if a file is damaged."""
     document = files.read_json(out / "design.json", FORMAT)
     with files.reraise_as_input_error(out / "design.json"):
-        violations = [Violation(**violation) for violation in document["violations"]]
-        list(map(str, violations))  # fails on values of the wrong type
         return SearchResult(
             Morphology.load(out / "morphology.json"),
-            {name: float(value) for name, value in document["terms"].items()},
-            violations,
-            str(document["candidate"]),
-            {name: float(value) for name, value in document["straight"].items()},
-            bool(document["provenance"]["settings"]["rules"]["enforce"]),
+            document["terms"],
+            [Violation(**violation) for violation in document["violations"]],
+            document["candidate"],
+            document["straight"],
+            document["provenance"]["settings"]["rules"]["enforce"],
             document["history"],
-            float(document["seconds"]),
+            document["seconds"],
             document["stopped"],
         )
 

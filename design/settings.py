@@ -35,18 +35,12 @@ class Layout:
     Horizontal fibre i runs along x at a height of i pitches along y, i = 1..H; vertical fibre i runs along y at i
     pitches along x, i = 1..V. The pad is V + 1 pitches wide and H + 1 high. Positions are in grid units, equally long
     in both directions: the pitch, or the geometric mean of two, so that a pad turned by 90 degrees responds alike.
-
-    Attributes:
-        horizontals: H, 0 to MAX_FIBRES; one fibre or more in all.
-        verticals: V, 0 to MAX_FIBRES.
-        pitch_x_mm: distance of the ends of neighbouring verticals, 0.1 to 1000 mm.
-        pitch_y_mm: distance of the ends of neighbouring horizontals, 0.1 to 1000 mm.
     """
 
-    horizontals: int
-    verticals: int
-    pitch_x_mm: float
-    pitch_y_mm: float
+    horizontals: int  # H, 0 to MAX_FIBRES; one fibre or more in all
+    verticals: int  # V, 0 to MAX_FIBRES
+    pitch_x_mm: float  # distance of the ends of neighbouring verticals, 0.1 to 1000 mm
+    pitch_y_mm: float  # distance of the ends of neighbouring horizontals, 0.1 to 1000 mm
 
     def __post_init__(self) -> None:
         for name in ("horizontals", "verticals"):
@@ -670,9 +664,6 @@ class PadSettings(Settings):
 
         Args:
             layout: positions of its fibre ends.
-
-        Raises:
-            InputError: a setting that does not fit that pad.
         """
         return type(self)(**{**self.model_dump(), **layout.settings})
 

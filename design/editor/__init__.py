@@ -64,11 +64,7 @@ class EditSession:
     def __init__(
         self, spec: "Spec", source: Path | None, out: Path, publish: Callable[[dict[str, Any]], None], force: bool
     ) -> None:
-        """Load the pad to edit, straight fibres without a `source`; `publish` sends a view to all pages.
-
-        Raises:
-            InputError: invalid settings, an unreadable pad, or other files were made from the pad at `out`.
-        """
+        """Load the pad to edit, straight fibres without a `source`; `publish` sends a view to all pages."""
         self.out, self._force, self._publish = out, force, publish
         self._provenance = provenance("padforge design edit", None, [] if source is None else [source])
         pad = Morphology.straight(spec.section(PadSettings).layout) if source is None else Morphology.load(source)
@@ -109,10 +105,8 @@ class EditSession:
         """Apply an edit, such as {"do": "move", "fibre": 1, "knot": 2, "x_mm": 3.0, "y_mm": 4.0, "gesture": "a"}.
 
         "add" takes a fibre and optionally a position, "remove" a fibre and a knot, "undo" and "redo" nothing. Fibres
-        and inner knots count from 1. Edits of one gesture are undone together.
-
-        Returns:
-            The new view; InputError for an invalid edit, which changes nothing.
+        and inner knots count from 1. Edits of one gesture are undone together; an invalid one changes nothing. Returned
+        is the new view.
         """
         edit = json.loads(body)
         with self._lock:

@@ -32,11 +32,7 @@ MAX_EXPONENT = 300.0
 
 
 def free_presses(size: PadSettings) -> Array:
-    """Return the positions (Q, 2), grid units, of a 20 x 20 grid over the pressed rectangle that are outside keep-outs.
-
-    Raises:
-        InputError: there are none.
-    """
+    """Return the positions (Q, 2), grid units, of a 20 x 20 grid over the pressed rectangle that no keep-out covers."""
     presses = grid_positions(size.sensed, side=20)
     presses = presses[is_outside(presses, size)]
     if not len(presses):

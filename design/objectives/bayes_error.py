@@ -23,11 +23,7 @@ from threadpoolctl import threadpool_limits
 
 from padforge.design.contact import relative_stretch
 from padforge.design.morphology import Array, Morphology
-from padforge.design.objectives.expected_error import (
-    evaluation_windows,
-    scatter_of_full_scale,
-    straight_full_scale,
-)
+from padforge.design.objectives.expected_error import evaluation_windows, scatter_of_full_scale, straight_full_scale
 from padforge.design.objectives.fibre_loss import failure_masks, failure_shares
 from padforge.design.paths.keep_outs import is_outside
 from padforge.design.settings import Contact, PadSettings, Rectangle, Scatter, SearchSettings

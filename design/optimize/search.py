@@ -354,12 +354,8 @@ def _name(problem: SearchProblem, start: int) -> str:
 def settings_for_twin(spec: "Spec", path: Path, pad: Morphology | None = None) -> "Spec":
     """Return the settings of `spec` with the sensitivity profile, the noise and the sensed rectangle of a twin.
 
-    On a pad of another pitch, profile and rectangle keep their size in mm, and the rectangle is cut to the pad.
-
-    Args:
-        spec: the settings.
-        path: file of the twin.
-        pad: fibres whose number and pitch are taken; by default those that `spec` states, or else the twin's.
+    On a pad of another pitch, profile and rectangle keep their size in mm, and the rectangle is cut to the pad. The
+    number and the pitch of the fibres are those of `pad`, by default those that `spec` states, or else the twin's.
 
     Raises:
         InputError: no valid twin; `spec` states another contact, or other fibres than the twin's.
@@ -409,19 +405,10 @@ def search_for_twin(
     Three searches run: for the default contact, which needs no measurement; for the measured contact from random
     starts; and for the measured contact from the default pad. Among their pads and straight fibres, the one with the
     least expected error under the measured contact is returned, but never one that locates less well than the default
-    pad or straight fibres.
+    pad or straight fibres; its `candidate` is "twin", "from default", "default" or "straight fibres".
 
-    Args:
-        pad: settings of the pad.
-        contact: the measured contact.
-        settings: settings of the searches for it.
-        rules: limits of the design rules.
-        default_settings: settings of the search for the default contact.
-        origin: morphology from which the second search starts; random if None.
-        run: options of all three searches together.
-
-    Returns:
-        The result, whose `candidate` is "twin", "from default", "default" or "straight fibres".
+    `settings` are those of the searches for the measured contact, the second of which starts from `origin` if that is
+    stated. The options `run` are those of all three searches together.
     """
     run = run or SearchOptions()
     default = search(pad, None, default_settings, rules, run=_part_options(run, "default"))

@@ -103,10 +103,9 @@ def test_design(run, golden: Golden) -> None:
     read = load_result(Path("out/pad"))
     assert summary_lines(read, Path("out/pad")) == printed.splitlines()[1:-1]
     assert (read.terms, read.straight, read.history) == tuple(document[x] for x in ("terms", "straight", "history"))
-    for change in ({"terms": {"a": {}}}, {"terms": []}, {"straight": {"a": "b"}}, {"violations": [{"rule": 1}]}):
-        Path("out/pad/design.json").write_text(json.dumps(document | change))
-        with pytest.raises(InputError, match="not as padforge writes it"):
-            load_result(Path("out/pad"))
+    Path("out/pad/design.json").write_text(json.dumps(document | {"violations": [{"rule": 1}]}))
+    with pytest.raises(InputError, match="not as padforge writes it"):
+        load_result(Path("out/pad"))
 
 
 def test_summaries_of_searches(golden: Golden) -> None:
