@@ -9,7 +9,6 @@ import pytest
 from padforge import InputError, Spec, design
 from padforge.common.settings import commented_toml, settings_schema
 from padforge.design import Contact, Morphology, PadSettings, RulesSettings, SearchSettings, signals
-from padforge.design.published.objective import information
 from padforge.design.settings import (
     BUILT,
     PUBLISHED,
@@ -177,11 +176,7 @@ def test_settings_accept_numpy_numbers():
 def test_default_contact_is_a_layer_or_published():
     pad, presses = Morphology.random(1, 3, seed=0), [[1.2, 0.7], [0.5, 0.8]]
     np.testing.assert_array_equal(signals(pad, presses), signals(pad, presses, Contact()))
-    np.testing.assert_array_equal(design.signals_sparse(pad, presses).toarray(), signals(pad, presses))
-    sampled = design.signals_quantized(pad, presses, PUBLISHED_CONTACT)
-    np.testing.assert_array_equal(design.signals_quantized(pad, presses), sampled)
     assert design.published_objective(pad) == design.published_objective(pad, PUBLISHED_CONTACT)
-    assert information(pad) == information(pad, Contact())
     assert SearchSettings().default_contact == Contact()
     assert SearchSettings(method="genetic").default_contact == PUBLISHED_CONTACT
 

@@ -32,8 +32,6 @@ def test_ambiguities_of_presses_are_those_of_the_formula(seed, fibres, noise):
 
 def test_failure_shares_are_equal_or_as_weighted():
     assert failure_shares(3) == (1 / 4,) * 4
-    assert failure_shares(1) == (1 / 2, 1 / 2)
-    assert failure_shares(0) == (1.0,)
     assert failure_shares((1.0, 0.0, 3.0)) == (0.25, 0.0, 0.75)
 
 

@@ -193,8 +193,3 @@ def test_expected_error_counts_distant_presses_with_equal_responses():
     confused, apart = (expected_error(np.hstack([signals, far]), *given)[0][0] for far in (alike, other))
     assert apart == pytest.approx(error(signals), rel=0.2)
     assert confused > 5 * apart
-
-
-def test_averages_are_means_over_the_sets_of_each_size():
-    kept = np.array([[1.0, 1.0, 1.0], [0.0, 1.0, 1.0], [1.0, 1.0, 0.0]])
-    assert averages(kept, 3) @ [0.1, 0.2, 0.4] == pytest.approx([0.1, 0.3, 0.0])
