@@ -61,8 +61,7 @@ DEPTH_STEPS = 16
 """Number of depths for which the contact is solved, to interpolate signals and forces. Fewer would err by more than
 0.5 % of full scale, since signals bend when the edge of the contact passes a fibre.
 """
-PressShape = tuple[tuple[Array, Array], Array, geometry.WeightLaw]
-"""Chains, extents and weight law of a press."""
+PressShape = tuple[tuple[Array, Array], Array, geometry.WeightLaw]  # chains, extents and weight law of a press
 
 
 def signals(

@@ -4,20 +4,18 @@ from collections.abc import Mapping
 from functools import partial
 from itertools import product
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from threadpoolctl import threadpool_limits
 
 from padforge.common.files import provenance, write_json
 from padforge.common.parallel import run_tasks
 from padforge.common.profiling import stage
+from padforge.common.settings import Spec
 from padforge.design.contact_set import judged_contacts
 from padforge.design.morphology import Morphology
 from padforge.design.objectives.bayes_error import expected_errors
 from padforge.design.settings import Contact, PadSettings, SearchSettings, read_contact
-
-if TYPE_CHECKING:
-    from padforge.common.settings import Spec
 
 FORMAT, NAME = "padforge-contacts/1", "contacts.json"
 
@@ -41,13 +39,13 @@ def beside_straight(pad: Morphology) -> dict[str, Morphology]:
     return {"designed": pad, "straight": Morphology.straight(pad.layout)}
 
 
-def design_contact(spec: "Spec", settings: SearchSettings) -> Contact:
+def design_contact(spec: Spec, settings: SearchSettings) -> Contact:
     """Return the contact to design for: the one that `spec` states, or the default of the search method."""
     is_default = settings.method == "genetic" and not spec.stated(Contact)
     return settings.default_contact if is_default else read_contact(spec)
 
 
-def compare_contacts(spec: "Spec", pad: Morphology, out: Path, seed: int | None = None) -> dict[str, Any]:
+def compare_contacts(spec: Spec, pad: Morphology, out: Path, seed: int | None = None) -> dict[str, Any]:
     """Write and return the errors of a pad and of straight fibres under the contact of `spec` and others."""
     settings = spec.section(SearchSettings, seed=seed)
     pad_settings = spec.section(PadSettings, **pad.layout.settings)

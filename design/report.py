@@ -28,13 +28,14 @@ from padforge.design.contact import (
     profile_weights,
 )
 from padforge.design.layer import LayerPress, reduced_modulus_kpa
+from padforge.design.morphology import Array, Morphology
+from padforge.design.paths.curves import crossings, flatten
 from padforge.design.settings import Contact, Corners, PadSettings, RulesSettings
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from matplotlib.patches import Circle, Polygon
 
-    from padforge.design.morphology import Array, Morphology
     from padforge.design.objectives.rules import Violation
 
 FAMILIES = (("horizontal", HORIZONTAL), ("vertical", VERTICAL))
@@ -43,7 +44,7 @@ TOLERANCE = 1e-3  # deviation of drawn curves from exact ones, grid units
 
 
 def draw_plan(
-    pad: "Morphology", contact: Contact, violations: "Sequence[Violation]" = (), keep_out_mm: Sequence[Corners] = ()
+    pad: Morphology, contact: Contact, violations: "Sequence[Violation]" = (), keep_out_mm: Sequence[Corners] = ()
 ) -> "Figure":
     """Draw the plan of a pad.
 
@@ -61,8 +62,6 @@ def draw_plan(
     """
     from matplotlib.figure import Figure
     from matplotlib.patches import Polygon, Rectangle
-
-    from padforge.design.paths.curves import crossings, flatten
 
     width, height = (side / 2 for side in pad.layout.size_mm)
     half, scale = max(width, height), 6.4 / max(width, height)
@@ -226,7 +225,7 @@ def draw_press(contact: Contact, pitch_mm: float) -> "Figure":
     return figure
 
 
-def _tool_surface(contact: Contact, x: "Array") -> "Array":
+def _tool_surface(contact: Contact, x: Array) -> Array:
     """Return the height of the undeformed tool over the base; infinite beside it."""
     radius, tip = contact.tool_radius_mm, contact.thickness_mm - contact.depth_mm
     if contact.tool == "flat":
@@ -236,7 +235,7 @@ def _tool_surface(contact: Contact, x: "Array") -> "Array":
     return tip + x**2 / (2 * radius)
 
 
-def _sink(press: LayerPress, r: "Array", height_mm: float) -> "Array":
+def _sink(press: LayerPress, r: Array, height_mm: float) -> Array:
     """Return how far the silicone at a height is down, mm: the integral of its vertical strain from the base."""
     heights = (np.arange(6) + 0.5) / 6 * height_mm
     return np.sum([press.strains(r, z, FIBRE_BLUR_MM).compressive for z in heights], axis=0) * height_mm / 6

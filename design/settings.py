@@ -559,8 +559,7 @@ _StatedKeepOut = Annotated[
     BeforeValidator(_as_tuples),
 ]
 BentRadius = Annotated[Annotated[float, Field(ge=1, le=1e6)] | None, *null_as("flat")]
-_HOLE_SIDES = 64
-"""Sides of the polygon that stands for a round hole where paths and presses avoid it."""
+_HOLE_SIDES = 64  # sides of the polygon that stands for a round hole where paths and presses avoid it
 Count = Annotated[Annotated[int, Field(ge=0, le=256)] | None, *null_as("grid")]
 PitchMm = Annotated[float, Field(ge=0.1, le=1000)]
 
@@ -762,8 +761,7 @@ def _layout(fields: Mapping[str, Any]) -> Layout:
     return _create_layout((horizontals, verticals), fields["pitch_mm"])
 
 
-_create_layout = lru_cache(Layout.create)
-"""A search asks for the layout of its pad many times a step."""
+_create_layout = lru_cache(Layout.create)  # a search asks for the layout of its pad many times a step
 
 
 def _validated_layout(fields: Mapping[str, Any]) -> Layout | None:

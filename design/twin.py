@@ -22,8 +22,7 @@ from padforge.design.paths.curves import lengths
 from padforge.design.settings import Contact
 
 FORMAT = "padforge-twin/1"
-PARTS = "held", "onset", "creep", "after"
-"""Parts of a press."""
+PARTS = "held", "onset", "creep", "after"  # parts of a press
 MAX_ELEMENT_LENGTH = 0.02  # length of the elements that an as-built fibre is summed over, grid units
 UNIFORM_SENSITIVITY_STD = 0.02  # of the log-sensitivity along a fibre: up to there it counts as uniform
 

@@ -25,8 +25,7 @@ from padforge.design.settings import Contact, PadSettings
 
 AMBIGUITY_NOISE = 0.05
 """Noise of signals, relative to full scale, for comparing pads: with less, no good pad confuses any presses."""
-MAX_NEG_LOG_LIKELIHOOD = 20.0
-"""Presses are not confused if their likelihood ratio is below exp(-20) = 2e-9."""
+MAX_NEG_LOG_LIKELIHOOD = 20.0  # presses are not confused if their likelihood ratio is below exp(-20) = 2e-9
 MAX_EXPONENT = 300.0
 """Up to this sum of squares, a likelihood may be computed as a product of exponentials without overflow."""
 

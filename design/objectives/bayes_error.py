@@ -34,24 +34,16 @@ STEP = 0.1
 """Step of the fine grid of positions, over a window and its surroundings, grid units. It is about the standard
 deviation of a posterior, which is fine enough for a sum over Gaussians.
 """
-MARGIN = 1.0
-"""Width of these surroundings, grid units."""
-FAR_STEP = 0.7
-"""Minimum step of the coarse grid over the remaining pad, grid units."""
-MAX_FAR = 2048
-"""Maximum number of positions of the coarse grid."""
+MARGIN = 1.0  # width of these surroundings, grid units
+FAR_STEP = 0.7  # minimum step of the coarse grid over the remaining pad, grid units
+MAX_FAR = 2048  # maximum number of positions of the coarse grid
 PRESSES = 8192
 """Presses that are localized for each number of failed fibres, over all windows and sets of failed fibres."""
-MIN_PRESSES = 64
-"""Minimum number of presses for each set of failed fibres."""
-MAX_SETS = 64
-"""Maximum number of sets of failed fibres of each size, divided among the windows."""
-MIN_SETS = 8
-"""Number of such sets for a window even if there are many windows."""
-MIN_NOISE = 5e-3
-"""Minimum floor of the scatter, full scales: below, the grid would not resolve the posterior."""
-BLOCK = 128
-"""Readings whose posteriors are computed together, so that these stay in the cache of a core."""
+MIN_PRESSES = 64  # minimum number of presses for each set of failed fibres
+MAX_SETS = 64  # maximum number of sets of failed fibres of each size, divided among the windows
+MIN_SETS = 8  # number of such sets for a window even if there are many windows
+MIN_NOISE = 5e-3  # minimum floor of the scatter, full scales: below, the grid would not resolve the posterior
+BLOCK = 128  # readings whose posteriors are computed together, so that these stay in the cache of a core
 MIN_EXPONENT = np.float32(-60)
 """Exponents are clipped to it: smaller ones are negligible, and several times slower to exponentiate."""
 Mask = NDArray[np.bool_]

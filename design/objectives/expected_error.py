@@ -50,40 +50,27 @@ SEARCH_SIDE = 12
 """Presses along a side of a window's grid in a search. With 10 a search errs more under a small contact; 14 take a
 seventh to a third more time for an improvement of 1 to 2 %.
 """
-EVALUATION_SIDE = 14
-"""Presses along a side of a window's grid in an evaluation."""
-WINDOW = 5.0
-"""Maximum side of a window, grid units."""
-COARSE_STEP = 0.7
-"""Step of the coarse grid over the remaining pad, grid units."""
-WINDOW_MARGIN = 1.0
-"""Minimum distance of the coarse grid to the window, grid units."""
-MAX_FAR = 2048
-"""Maximum number of presses of the coarse grid."""
-MAX_WINDOWS = 16
-"""Maximum number of windows by which a pad is evaluated; of more, a sample is taken."""
-MAX_PARTNERS = 36
-"""Maximum number of presses of the coarse grid that join the regression."""
+EVALUATION_SIDE = 14  # presses along a side of a window's grid in an evaluation
+WINDOW = 5.0  # maximum side of a window, grid units
+COARSE_STEP = 0.7  # step of the coarse grid over the remaining pad, grid units
+WINDOW_MARGIN = 1.0  # minimum distance of the coarse grid to the window, grid units
+MAX_FAR = 2048  # maximum number of presses of the coarse grid
+MAX_WINDOWS = 16  # maximum number of windows by which a pad is evaluated; of more, a sample is taken
+MAX_PARTNERS = 36  # maximum number of presses of the coarse grid that join the regression
 MAX_PARTNER_DISTANCE = 1.0
 """Maximum response distance of such presses to a press of the window, kernel widths. Fibres along a strip respond
 equally to many presses; a network distinguishes these by the other fibres.
 """
-MAX_SETS = 32
-"""Maximum number of sets of failed fibres of each size in an evaluation, divided among the windows."""
-MIN_SETS = 8
-"""Number of such sets for a window even if there are many windows."""
-WIDTH = 0.8
-"""Width of the kernel, full scales."""
-RIDGE = 1e-2
-"""Ridge of the regression."""
+MAX_SETS = 32  # maximum number of sets of failed fibres of each size in an evaluation, divided among the windows
+MIN_SETS = 8  # number of such sets for a window even if there are many windows
+WIDTH = 0.8  # width of the kernel, full scales
+RIDGE = 1e-2  # ridge of the regression
 BOUND_WEIGHT = 0.85
 """Weight of the Cramer-Rao bound. With both weights the criterion agrees with errors of trained networks within 7 %
 over straight, gently and strongly curved pads. This one is below 1 since a mean error is below the root of a variance.
 """
-REGRESSION_WEIGHT = 0.47
-"""Weight of the regression error, below 1 since a network learns better than ridge regression."""
-POWER = 12
-"""Exponent of the power mean of relative errors over contacts and numbers of failed fibres."""
+REGRESSION_WEIGHT = 0.47  # weight of the regression error, below 1 since a network learns better than ridge regression
+POWER = 12  # exponent of the power mean of relative errors over contacts and numbers of failed fibres
 DEFAULT_FULL_SCALE = 0.182
 """Full scale of straight fibres of the default pad under the default press, a relative stretch."""
 

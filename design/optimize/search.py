@@ -23,7 +23,7 @@ import numpy as np
 from padforge.common import profiling
 from padforge.common.parallel import Checkpoints, State, run_tasks
 from padforge.common.progress import OnProgress, ignore_progress
-from padforge.common.settings import or_default
+from padforge.common.settings import Spec, or_default
 from padforge.common.validation import InputError
 from padforge.design.contact_comparison import errors_by_contact
 from padforge.design.morphology import Array, Morphology
@@ -37,15 +37,11 @@ from padforge.design.settings import Contact, Layout, PadSettings, RulesSettings
 from padforge.design.twin import Twin
 
 if TYPE_CHECKING:
-    from padforge.common.settings import Spec
     from padforge.design.optimize.genetic import GeneticSearch
 
-SLICE_STEPS = {"descent": 20, "genetic": 2}
-"""Steps or generations of a slice, by method: about a third of a second."""
-SLICE_S = 1.0
-"""Time after which a slice ends early, so that a time budget is kept even if steps are slow."""
-MIN_STARTS = 2
-"""Minimum number of starts that are continued after half of the steps."""
+SLICE_STEPS = {"descent": 20, "genetic": 2}  # steps or generations of a slice, by method: about a third of a second
+SLICE_S = 1.0  # time after which a slice ends early, so that a time budget is kept even if steps are slow
+MIN_STARTS = 2  # minimum number of starts that are continued after half of the steps
 GRACE_S = 10.0
 """Time after a deadline for running slices to end. One takes a second or so, but an executor may hang."""
 LAYOUT_KEYS = ("grid", "horizontals", "verticals", "pitch_mm", "size_mm")
@@ -351,7 +347,7 @@ def _name(problem: SearchProblem, start: int) -> str:
     return "genetic" if problem.search.method == "genetic" else f"start {start + 1}"
 
 
-def settings_for_twin(spec: "Spec", path: Path, pad: Morphology | None = None) -> "Spec":
+def settings_for_twin(spec: Spec, path: Path, pad: Morphology | None = None) -> Spec:
     """Return the settings of `spec` with the sensitivity profile, the noise and the sensed rectangle of a twin.
 
     On a pad of another pitch, profile and rectangle keep their size in mm, and the rectangle is cut to the pad. The

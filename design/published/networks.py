@@ -27,8 +27,7 @@ BATCH = 14  # networks trained at once by a core, which gains nothing from more;
 _FIRST_CALL = Lock()
 """Torch loads the linear algebra of a GPU at its first call, which fails where two threads make it at once."""
 
-FailureSet = tuple[int, ...]
-"""Indices of failed fibres."""
+FailureSet = tuple[int, ...]  # indices of failed fibres
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,6 @@ from padforge.design.layer import solve_press
 from padforge.design.objectives.ambiguity import free_presses
 from padforge.design.paths.import_plan import import_plan
 from padforge.design.paths.keep_outs import check_fibre_ends
-from padforge.design.published.objective import published_terms
 from padforge.design.settings import Layout
 from tests.helpers.golden import Golden
 from tests.helpers.refusals import refusal_table
@@ -87,7 +86,6 @@ VALUES: dict[str, Callable[[], object]] = {
     "a sensed area": lambda: design.score(Morphology.straight(3), size=PadSettings(sensed_mm=(46, 20))),
     "too many fibres to compare": lambda: design.score(Morphology.random(16, 3000, seed=0), max_failures=0),
     "no noise": lambda: design.score(PAD, noise=0.0),
-    "an entropy": lambda: published_terms(PAD, entropy="all"),  # pyright: ignore[reportArgumentType]
     "training presses": lambda: design.localisation_error(PAD, presses=1000),
     "failed fibres": lambda: design.localisation_error(PAD, n_failed=(-1,)),
     "an origin of other fibres": lambda: design.search(PadSettings(grid=2), origin=Morphology.straight(3)),

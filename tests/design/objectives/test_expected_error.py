@@ -26,8 +26,7 @@ SIDE, SIZE = 14, np.array([4.0, 4.0])
 PAD = PadSettings(grid=4, sensed_mm=(45.0, 45.0))
 PLACES, STEPS, FREE, _ = window_presses(PAD, PAD.sensed, SIDE, np.random.default_rng(0))
 PLACES = PLACES - PAD.sensed[0]
-SILENT = Scatter(1e-9)
-"""Noise that adds nothing where signals tell the place."""
+SILENT = Scatter(1e-9)  # noise that adds nothing where signals tell the place
 
 
 def errors(signals: np.ndarray, masks, scatter=SILENT, free=FREE) -> list[float]:
