@@ -1,4 +1,4 @@
-"""Signals of rectangles as they are turned and of presses of known depth, forces, and contacts beside an assumed one."""
+"""Signals of rectangles as they are turned and of presses of known depth, forces, and further contacts."""
 
 import numpy as np
 import pytest

@@ -56,11 +56,7 @@ def test_weighted_signals_of_a_straight_fibre_have_closed_forms(offset):
     root = np.sqrt(radius + offset**2)
     near = np.sqrt(max((radius / 100) ** 2 - offset**2, 0))  # where the weight is that of a hundredth of the radius
     inverse = np.arcsinh(half / offset) if offset else np.log(half / near) + 1
-    for weight, integral in (
-        ("uniform", half),
-        ("inverse_square", np.arctan(half / root) / root),
-        ("inverse", inverse),
-    ):
+    for weight, integral in zip(wild.WEIGHTS, (half, np.arctan(half / root) / root, inverse), strict=True):
         contact = Contact(radius=radius, sides=None, weight=weight, length="euclidean")
         found = signals(Morphology.straight(2), [[1.5, 1 + offset]], contact)[0, 0]
         assert found == pytest.approx(2 * integral, rel=1e-10)
