@@ -78,15 +78,10 @@ def test_score_rules_and_plan_of_wild_pads_are_finite(kind, little_scored):
     assert np.isfinite([[finding.measured, finding.limit] for finding in findings]).all()
     draw_plan(pad, contact, findings).draw_without_rendering()
     assert pad.tiled(2).grid == 2 * pad.grid
-
-
-@pytest.mark.parametrize("kind", KINDS)
-def test_penalties_and_gradients_of_wild_pads_are_finite(kind):
-    pad = wild_pad(kind, 0)
-    for rules in RULES:
+    if pad.knots.shape[1] > 2:
         fibres = Parametrization.from_knots(pad.knots, pad.layout, 0.01)
         assert np.isfinite(fibres.knots()).all()
-        along, across = fibres.axes()
-        values, *gradient = penalties(along, across, PadSettings(grid=pad.grid, pitch_mm=pad.pitch_mm), rules)
+        size = PadSettings(grid=pad.grid, pitch_mm=pad.pitch_mm)
+        values, *gradient = penalties(*fibres.axes(), size, rules)
         assert all(np.isfinite(value) and value >= 0 for value in values.values())
         assert np.isfinite(gradient).all()
