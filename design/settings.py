@@ -189,7 +189,8 @@ class Contact(Settings, frozen=True):
     the strain that presses it flat and the strain along it, with phi the angle between the fibre and the direction to
     the press. In "profile" the weight is a measured function of the distance d to the press centre. In "shape" it is
     `weight` inside a regular polygon or circle (paper, formulas (1) and (2)), in grid units, as published: there, and
-    only there, the press grows with the pitch. Stating keys of one model selects it.
+    only there, the press grows with the pitch. Stating keys of one model selects it; `sensitivity_profile = []` is a
+    shape as well.
 
     Attributes:
         model: "layer" if no key of another model is stated.
@@ -242,6 +243,8 @@ class Contact(Settings, frozen=True):
         if not isinstance(stated, Mapping):
             return stated
         model = _stated_model(stated)
+        if stated.get("sensitivity_profile") in ([], ()):
+            stated = {name: value for name, value in stated.items() if name != "sensitivity_profile"}
         return {"model": model, "length": "manhattan" if model == "shape" else "euclidean", **stated}
 
     @model_validator(mode="after")
@@ -277,8 +280,12 @@ class Contact(Settings, frozen=True):
 
 def _stated_model(stated: Mapping[str, Any]) -> Any:
     """Return the model of the contact with the keys that are stated."""
-    inferred = next((model for model in ("profile", "shape") if not stated.keys().isdisjoint(_KEYS[model])), "layer")
-    return stated.get("model", inferred)
+    profile = to_builtins(stated.get("sensitivity_profile"))  # the truth value of an array is ambiguous
+    if profile is not None and profile not in ([], ()):
+        model = "profile"
+    else:
+        model = "shape" if profile is not None or stated.keys() & set(_KEYS["shape"]) else "layer"
+    return stated.get("model", model)
 
 
 def read_contact(spec: Spec) -> Contact:
@@ -663,6 +670,9 @@ class PadSettings(Settings):
 
         Args:
             layout: positions of its fibre ends.
+
+        Raises:
+            InputError: a setting that does not fit that pad.
         """
         return type(self)(**{**self.model_dump(), **layout.settings})
 

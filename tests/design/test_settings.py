@@ -115,6 +115,7 @@ SHAPE = {"radius": 0.6, "sides": 30, "weight": "uniform"}
         ({"radius": 0.9}, "shape", "manhattan"),
         ({"sides": "circle"}, "shape", "manhattan"),
         ({"weight": "inverse", "length": "euclidean"}, "shape", "euclidean"),
+        ({"sensitivity_profile": []}, "shape", "manhattan"),
         (SHAPE | {"length": "euclidean", "sensitivity_profile": PROFILE}, "profile", "euclidean"),
     ],
     ids=str,
