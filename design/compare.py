@@ -27,8 +27,6 @@ from padforge.design.settings import Contact, PadSettings, RulesSettings, Search
 FORMAT, NAME = "padforge-comparison/1", "comparison.json"
 MAX_VARIANTS = 64
 MODELS = (PadSettings, Contact, SearchSettings, RulesSettings)  # settings of a design, which may be varied
-# names that no file can have on Windows
-WINDOWS_DEVICE = re.compile(r"(con|prn|aux|nul|com\d|lpt\d)(\.|$)", re.IGNORECASE)
 # makes the mould of a pad in a folder, and returns its costs by the keys of COSTS
 MakePad = Callable[[Morphology, Spec, Path], Mapping[str, Any]]
 # columns that not every pad has, with their units
@@ -53,8 +51,7 @@ class Variant:
     @property
     def folder(self) -> str:
         """Name of its folder, valid on every system."""
-        name = re.sub(r"[^\w.+-]+", "-", self.name).strip(".-") or "pad"
-        return f"pad-{name}" if WINDOWS_DEVICE.match(name) else name
+        return re.sub(r"[^\w.+-]+", "-", self.name).strip(".-") or "pad"
 
 
 def read_variants(
@@ -152,9 +149,8 @@ def _evaluate(variant: Variant, pad: Morphology, seed: int | None) -> dict[str, 
     contact = design_contact(variant.spec, search)
     with stage("compare"):
         contacts = served_contacts(contact, search)
-        results = errors_by_contact(beside_straight(pad), contacts, pad_settings, search)
-    errors_mm = {name: {r.pad: list(r.errors_mm) for r in results if r.contact == name} for name in contacts}
-    main, *others = errors_mm
+        errors_mm = errors_by_contact(beside_straight(pad), contacts, pad_settings, search)
+    main, *others = contacts
     straight = Morphology.straight(pad.layout)
     return {
         "name": variant.name,
@@ -165,10 +161,10 @@ def _evaluate(variant: Variant, pad: Morphology, seed: int | None) -> dict[str, 
         "crossings": len(crossings(pad)),
         "straight_length_mm": float(lengths(straight).sum() * pad.unit_mm),
         "straight_crossings": len(crossings(straight)),
-        "errors_mm": errors_mm[main]["designed"],
-        "straight_mm": errors_mm[main]["straight"],
+        "errors_mm": errors_mm[main, "designed"],
+        "straight_mm": errors_mm[main, "straight"],
         "others": {
-            name: {"errors_mm": errors_mm[name]["designed"], "straight_mm": errors_mm[name]["straight"]}
+            name: {"errors_mm": errors_mm[name, "designed"], "straight_mm": errors_mm[name, "straight"]}
             for name in others
         },
         "contact": contact.model_dump(mode="json"),

@@ -61,8 +61,7 @@ DEPTH_STEPS = 16
 """Number of depths for which the contact is solved, to interpolate signals and forces. Fewer would err by more than
 0.5 % of full scale, since signals bend when the edge of the contact passes a fibre.
 """
-PressShape = tuple[tuple[Array, Array], Array, geometry.WeightLaw]
-"""Chains, extents and weight law of a press."""
+PressShape = tuple[tuple[Array, Array], Array, geometry.WeightLaw]  # chains, extents and weight law of a press
 
 
 def signals(
@@ -115,8 +114,7 @@ def signals(
                 element_signals.weigh_elements(elements, t, sensitivity)
             table = weight_table(contact, unit_mm)
             visited = element_signals.element_signals(t, v, elements, centres, law, table, pad_signals)
-            if profiling.is_profiling():
-                record_visits(t[None], geometry.max_offsets(v[None], ends), ends, centres, extents, visited)
+            record_visits(t[None], v[None], ends, centres, extents, visited)
     return _sum_simultaneous(out, (*batch, *press_counts, fibres))
 
 
@@ -286,15 +284,17 @@ def _run_exact(
         return exact_signals(curves, max_offsets, ends, presses, shape, begin, end, sparse, out)
 
     visited = sum(map_chunks(compute, len(along) * len(presses), min_chunk=2000))
-    if profiling.is_profiling():
-        record_visits(along, max_offsets, ends, presses, shape[1], visited)
+    record_visits(along, across, ends, presses, shape[1], visited)
 
 
 def record_visits(
-    along: Array, max_offsets: Array, ends: geometry.Ends, presses: Array, extents: Array, visited: int
+    along: Array, across: Array, ends: geometry.Ends, presses: Array, extents: Array, visited: int
 ) -> None:
-    """Count visited fibres and spans for profiling; arguments are those of the kernels."""
+    """Count visited fibres and spans if the program is profiled; arguments are those of the kernels."""
+    if not profiling.is_profiling():
+        return
     pads, fibres, knots = along.shape
+    max_offsets = geometry.max_offsets(across, ends)
     touched = sum(int(geometry.count_touched(offsets, presses, extents, ends)[-1]) for offsets in max_offsets)
     profiling.add_count("fibres, press by press", touched, pads * len(presses) * fibres)
     profiling.add_count("spans, press by press", visited, pads * len(presses) * fibres * (knots - 1))
@@ -309,14 +309,10 @@ def _sum_simultaneous(signals: Array, shape: tuple[int, ...]) -> Array:
 def fibre_axes(
     pad: Morphology | Array, layout: Layout | None = None
 ) -> tuple[Array, Array, geometry.Ends, tuple[int, ...]]:
-    """Split a pad or a population into coordinates along and across each fibre's axis.
+    """Split a pad, or knots (..., F, N + 2, 2) of a population, into coordinates along and across each fibre's axis.
 
-    Args:
-        pad: a morphology, or knots; shape (..., F, N + 2, 2), grid units.
-        layout: layout of the knots; that of a square pad if None.
-
-    Returns:
-        Coordinates along and across, both (P, F, N + 2); positions of the fibre ends; and the population's shape.
+    Knots are in grid units; their layout is that of a square pad if None. Returned are the coordinates along and
+    across, both (P, F, N + 2), the positions of the fibre ends, and the population's shape.
 
     Raises:
         InputError: knots of another shape, beyond MAX_COORDINATE, or not ascending along the axis.

@@ -3,12 +3,13 @@
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from padforge.common import files
 from padforge.common.parallel import Checkpoints
 from padforge.common.plotting import save_figure
 from padforge.common.profiling import stage
+from padforge.common.settings import Spec
 from padforge.common.validation import InputError
 from padforge.design.contact_comparison import design_contact
 from padforge.design.morphology import Morphology
@@ -26,15 +27,12 @@ from padforge.design.paths.curves import crossings, lengths
 from padforge.design.report import FORMAT, draw_plan
 from padforge.design.settings import Contact, PadSettings, RulesSettings, SearchSettings
 
-if TYPE_CHECKING:
-    from padforge.common.settings import Spec
-
 SIGNIFICANT = 0.05  # relative difference of expected errors from which trained networks agree which pad is better
 MAX_VIOLATIONS = 10  # violations that the summary lists
 
 
 def run_design(
-    spec: "Spec",
+    spec: Spec,
     out: Path,
     overrides: Mapping[str, Any],
     start_from: str | None = None,
@@ -106,7 +104,7 @@ def run_design(
 
 
 def check_design(
-    spec: "Spec", out: Path, overrides: Mapping[str, Any], regenerated: Collection[str] = (), force: bool = False
+    spec: Spec, out: Path, overrides: Mapping[str, Any], regenerated: Collection[str] = (), force: bool = False
 ) -> None:
     """Check the arguments of `run_design` without searching."""
     origin = _read_request(spec, overrides)[-1]
@@ -114,7 +112,7 @@ def check_design(
 
 
 def _read_request(
-    spec: "Spec", overrides: Mapping[str, Any], start_from: str | None = None, twin: Path | None = None
+    spec: Spec, overrides: Mapping[str, Any], start_from: str | None = None, twin: Path | None = None
 ) -> tuple[tuple[PadSettings, Contact, SearchSettings, RulesSettings], Morphology | None, dict[str, Any]]:
     """Return the settings of a search, the pad it starts from, and the provenance of its result."""
     inputs: list[Path] = []
@@ -141,17 +139,15 @@ def load_result(out: Path) -> SearchResult:
     """Load the result of a search from the folder of a pad; InputError if a file is damaged."""
     document = files.read_json(out / "design.json", FORMAT)
     with files.reraise_as_input_error(out / "design.json"):
-        violations = [Violation(**violation) for violation in document["violations"]]
-        list(map(str, violations))  # fails on values of the wrong type
         return SearchResult(
             Morphology.load(out / "morphology.json"),
-            {name: float(value) for name, value in document["terms"].items()},
-            violations,
-            str(document["candidate"]),
-            {name: float(value) for name, value in document["straight"].items()},
-            bool(document["provenance"]["settings"]["rules"]["enforce"]),
+            document["terms"],
+            [Violation(**violation) for violation in document["violations"]],
+            document["candidate"],
+            document["straight"],
+            document["provenance"]["settings"]["rules"]["enforce"],
             document["history"],
-            float(document["seconds"]),
+            document["seconds"],
             document["stopped"],
         )
 

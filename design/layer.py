@@ -47,59 +47,33 @@ TERMS = 16
 """Number of Legendre polynomials of phi, with which forces have a relative error of 1e-6 up to a contact radius of ten
 thicknesses, and of 5e-4 at MAX_CONTACT.
 """
-MAX_CONTACT = 100.0
-"""Maximum contact radius, thicknesses."""
-_DECAY = 25.0
-"""Wavenumber times depth below the face from which a field is neglected, since it has decayed to exp(-25)."""
+MAX_CONTACT = 100.0  # maximum contact radius, thicknesses
+_DECAY = 25.0  # wavenumber times depth below the face from which a field is neglected, since it has decayed to exp(-25)
 
 
 class Strains(NamedTuple):
-    """Strains of the silicone at a height, by the distance from the axis of the tool; they are incompressible.
+    """Strains (n,) of the incompressible silicone at a height, by the distance from the axis of the tool."""
 
-    Attributes:
-        compressive: vertical compression -eps_zz; shape (n,).
-        radial: radial strain du / dr; shape (n,).
-        hoop: circumferential strain u / r; shape (n,).
-    """
-
-    compressive: Array
-    radial: Array
-    hoop: Array
+    compressive: Array  # vertical compression -eps_zz
+    radial: Array  # du / dr
+    hoop: Array  # circumferential strain u / r
 
 
 @dataclass(frozen=True)
 class LayerPress:
-    """One press of a tool into a layer, all lengths in mm.
-
-    Attributes:
-        thickness_mm: thickness t of the layer.
-        base: "bonded" to what it lies on, or "slipping" without friction.
-        contact_radius_mm: radius a of the contact.
-        load: coefficients of phi by the Legendre polynomials P_0, P_2, ... of x / a; shape (TERMS,), mm.
-    """
+    """One press of a tool into a layer."""
 
     thickness_mm: float
     base: Base
     contact_radius_mm: float
-    load: Array
+    load: Array  # coefficients of phi by the Legendre polynomials P_0, P_2, ... of x / a; shape (TERMS,), mm
 
     def force_n(self, reduced_modulus_kpa: float = REDUCED_MODULUS_KPA) -> float:
-        """Return the force, N.
-
-        Args:
-            reduced_modulus_kpa: E* = E / (1 - nu^2) of the silicone, kPa.
-        """
+        """Return the force, N, for E* = E / (1 - nu^2) of the silicone, kPa."""
         return 2e-3 * reduced_modulus_kpa * self.contact_radius_mm * float(self.load[0])  # kPa mm^2 = 1e-3 N
 
     def deflection(self, r_mm: ArrayLike) -> Array:
-        """Return the downward displacement of the pressed face.
-
-        Args:
-            r_mm: distances from the axis; shape (n,).
-
-        Returns:
-            Displacements; shape (n,), mm.
-        """
+        """Return the downward displacement (n,) of the pressed face, mm, at distances (n,) from the axis."""
         r, a = np.asarray(r_mm, dtype=float), self.contact_radius_mm
         nodes, weights = _gauss(200)
         # 1. the half-space: int phi(s) / sqrt(r^2 - s^2) ds with s = min(r, a) sin(angle)
@@ -198,11 +172,7 @@ def solve_press(
 def _solve_phi(
     tool: Tool, radius: float, a: float, thickness: float, base: Base, compliance: float
 ) -> tuple[Array, Array]:
-    """Solve for phi on [0, a] by Galerkin's method with the right side 1, and with f(x).
-
-    Returns:
-        Legendre coefficients of both solutions, each of shape (TERMS,).
-    """
+    """Return the Legendre coefficients (TERMS,) of phi on [0, a], by Galerkin's method for 1 and for f(x)."""
     nodes, weights = _gauss(400)
     x = a * nodes
     k, correction = _thickness_correction(base, thickness, 2 * a)

@@ -16,8 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from padforge.common.files import read_json, write_json
 from padforge.common.mat_files import load_mat
-from padforge.common.validation import InputError, check_array, check_int, check_mapping
-from padforge.common.validation import check_path as as_path
+from padforge.common.validation import InputError, check_array, check_int, check_mapping, check_path, naming_file
 from padforge.design.kernels.geometry import INVERSE_SQUARE, MANHATTAN, UNIFORM, Ends, WeightLaw, frame_shape
 from padforge.design.published.kernels import quantized_signals
 from padforge.design.settings import DEFAULT_PITCH_MM, MAX_FIBRES, Contact, Counts, Layout, Pitch
@@ -232,15 +231,13 @@ class Morphology:
         Raises:
             InputError: the file is missing, torn, of another kind, or its knots break the rules of the class.
         """
-        path = as_path("path", path)
+        path = check_path("path", path)
         kind = path.suffix.lower()
         if kind not in (".json", ".mat"):
             raise InputError(f"{path}: no morphology, allowed are a .json and a published .mat")
-        document = None if kind == ".mat" else read_json(path, FORMAT)
-        try:
-            return cls.from_dict(document) if document is not None else cls(_read_published_knots(path))
-        except InputError as error:
-            raise InputError(f"{path}: {str(error).removeprefix(f'{path}: ')}") from error
+        content = read_json(path, FORMAT) if kind == ".json" else load_mat(path, ("para",))
+        with naming_file(path):
+            return cls.from_dict(content) if kind == ".json" else cls(_published_knots(content))
 
     @classmethod
     def from_dict(cls, document: Mapping[str, Any]) -> "Morphology":
@@ -278,7 +275,7 @@ class Morphology:
         Args:
             path: a `morphology.json`.
         """
-        write_json(as_path("path", path), self.to_dict())
+        write_json(check_path("path", path), self.to_dict())
 
     def to_mm(self, positions: ArrayLike) -> Array:
         """Convert grid units to mm from the pad's centre, the frame that presses are recorded in.
@@ -286,7 +283,7 @@ class Morphology:
         Args:
             positions: shape (..., 2), grid units.
         """
-        return (_check_positions("positions", positions) - np.array(self.layout.extent) / 2) * self.unit_mm
+        return (np.asarray(positions, dtype=np.float64) - np.array(self.layout.extent) / 2) * self.unit_mm
 
     def to_grid(self, positions_mm: ArrayLike) -> Array:
         """Convert mm from the pad's centre to grid units.
@@ -294,16 +291,7 @@ class Morphology:
         Args:
             positions_mm: shape (..., 2), mm.
         """
-        return _check_positions("positions_mm", positions_mm) / self.unit_mm + np.array(self.layout.extent) / 2
-
-
-def _check_positions(name: str, values: ArrayLike) -> Array:
-    positions = check_array(name, values, MAX_COORDINATE)
-    if positions.shape == (0,):
-        return positions.reshape(0, 2)
-    if positions.shape[-1:] != (2,):
-        raise InputError(f"{name} have shape {positions.shape}, expected (..., 2)")
-    return positions
+        return np.asarray(positions_mm, dtype=np.float64) / self.unit_mm + np.array(self.layout.extent) / 2
 
 
 def _check_knot_count(layout: Layout, knots: int) -> int:
@@ -339,12 +327,11 @@ def _validate(knots: Array, layout: Layout) -> None:
             raise InputError(f"{name} fibres must run from (0, i) to {end} along their axis, i = 1..M, in pitches")
 
 
-def _read_published_knots(path: Path) -> Array:
-    """Read the knots (2 M, N + 2, 2) of a published `.mat`.
+def _published_knots(content: dict[str, Any]) -> Array:
+    """Return the knots (2 M, N + 2, 2) of a published `.mat`.
 
     Files of the square grid carry a `para` that was never used: their samples fit straight fibres and not `para`.
     """
-    content = load_mat(path, ("para",))
     para = check_array("parameters", content["para"])
     if para.size == 0 or para.ndim != 2 or para.shape[1] % 4:
         raise InputError(f"parameters have shape {para.shape}, expected (N, 4 M)")

@@ -19,7 +19,6 @@ from padforge.common.plotting import (
     save_figure,
     style_axes,
 )
-from padforge.common.validation import InputError, check_array, check_type
 from padforge.design.contact import (
     FIBRE_BLUR_MM,
     contact_press,
@@ -29,13 +28,14 @@ from padforge.design.contact import (
     profile_weights,
 )
 from padforge.design.layer import LayerPress, reduced_modulus_kpa
+from padforge.design.morphology import Array, Morphology
+from padforge.design.paths.curves import crossings, flatten
 from padforge.design.settings import Contact, Corners, PadSettings, RulesSettings
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from matplotlib.patches import Circle, Polygon
 
-    from padforge.design.morphology import Array, Morphology
     from padforge.design.objectives.rules import Violation
 
 FAMILIES = (("horizontal", HORIZONTAL), ("vertical", VERTICAL))
@@ -44,7 +44,7 @@ TOLERANCE = 1e-3  # deviation of drawn curves from exact ones, grid units
 
 
 def draw_plan(
-    pad: "Morphology", contact: Contact, violations: "Sequence[Violation]" = (), keep_out_mm: Sequence[Corners] = ()
+    pad: Morphology, contact: Contact, violations: "Sequence[Violation]" = (), keep_out_mm: Sequence[Corners] = ()
 ) -> "Figure":
     """Draw the plan of a pad.
 
@@ -59,32 +59,16 @@ def draw_plan(
 
     Returns:
         A matplotlib figure with axes in mm from the centre of the pad.
-
-    Raises:
-        InputError: an argument of the wrong type, or a polygon of the wrong shape.
     """
     from matplotlib.figure import Figure
     from matplotlib.patches import Polygon, Rectangle
-
-    from padforge.design.morphology import Morphology
-    from padforge.design.objectives.rules import Violation
-    from padforge.design.paths.curves import crossings, flatten
-
-    check_type("pad", pad, Morphology)
-    check_type("contact", contact, Contact)
-    for violation in check_type("violations", violations, Sequence):
-        check_type("violations", violation, Violation)
-    polygons = [check_array("keep_out_mm", corners) for corners in check_type("keep_out_mm", keep_out_mm, Sequence)]
-    for polygon in polygons:
-        if polygon.ndim != 2 or polygon.shape[1] != 2 or not len(polygon):
-            raise InputError(f"keep_out_mm has a polygon of shape {polygon.shape}, expected (n, 2)")
 
     width, height = (side / 2 for side in pad.layout.size_mm)
     half, scale = max(width, height), 6.4 / max(width, height)
     figure = Figure(figsize=(max(scale * width, 4.8), max(scale * height, 2.4)), layout="constrained")
     axes = figure.add_subplot(aspect="equal")
     axes.add_patch(Rectangle((-width, -height), 2 * width, 2 * height, facecolor=PAPER, edgecolor=FAINT, gid="pad"))
-    for polygon in polygons:
+    for polygon in keep_out_mm:
         axes.add_patch(Polygon(polygon, facecolor="white", edgecolor=INK, hatch="///", linewidth=0.8))
     for fibre, points in enumerate(flatten(pad, TOLERANCE)):
         family = pad.layout.family(fibre)
@@ -241,7 +225,7 @@ def draw_press(contact: Contact, pitch_mm: float) -> "Figure":
     return figure
 
 
-def _tool_surface(contact: Contact, x: "Array") -> "Array":
+def _tool_surface(contact: Contact, x: Array) -> Array:
     """Return the height of the undeformed tool over the base; infinite beside it."""
     radius, tip = contact.tool_radius_mm, contact.thickness_mm - contact.depth_mm
     if contact.tool == "flat":
@@ -251,7 +235,7 @@ def _tool_surface(contact: Contact, x: "Array") -> "Array":
     return tip + x**2 / (2 * radius)
 
 
-def _sink(press: LayerPress, r: "Array", height_mm: float) -> "Array":
+def _sink(press: LayerPress, r: Array, height_mm: float) -> Array:
     """Return how far the silicone at a height is down, mm: the integral of its vertical strain from the base."""
     heights = (np.arange(6) + 0.5) / 6 * height_mm
     return np.sum([press.strains(r, z, FIBRE_BLUR_MM).compressive for z in heights], axis=0) * height_mm / 6

@@ -35,18 +35,12 @@ class Layout:
     Horizontal fibre i runs along x at a height of i pitches along y, i = 1..H; vertical fibre i runs along y at i
     pitches along x, i = 1..V. The pad is V + 1 pitches wide and H + 1 high. Positions are in grid units, equally long
     in both directions: the pitch, or the geometric mean of two, so that a pad turned by 90 degrees responds alike.
-
-    Attributes:
-        horizontals: H, 0 to MAX_FIBRES; one fibre or more in all.
-        verticals: V, 0 to MAX_FIBRES.
-        pitch_x_mm: distance of the ends of neighbouring verticals, 0.1 to 1000 mm.
-        pitch_y_mm: distance of the ends of neighbouring horizontals, 0.1 to 1000 mm.
     """
 
-    horizontals: int
-    verticals: int
-    pitch_x_mm: float
-    pitch_y_mm: float
+    horizontals: int  # H, 0 to MAX_FIBRES; one fibre or more in all
+    verticals: int  # V, 0 to MAX_FIBRES
+    pitch_x_mm: float  # distance of the ends of neighbouring verticals, 0.1 to 1000 mm
+    pitch_y_mm: float  # distance of the ends of neighbouring horizontals, 0.1 to 1000 mm
 
     def __post_init__(self) -> None:
         for name in ("horizontals", "verticals"):
@@ -572,8 +566,7 @@ _StatedKeepOut = Annotated[
     BeforeValidator(_as_tuples),
 ]
 BentRadius = Annotated[Annotated[float, Field(ge=1, le=1e6)] | None, *null_as("flat")]
-_HOLE_SIDES = 64
-"""Sides of the polygon that stands for a round hole where paths and presses avoid it."""
+_HOLE_SIDES = 64  # sides of the polygon that stands for a round hole where paths and presses avoid it
 Count = Annotated[Annotated[int, Field(ge=0, le=256)] | None, *null_as("grid")]
 PitchMm = Annotated[float, Field(ge=0.1, le=1000)]
 
@@ -778,8 +771,7 @@ def _layout(fields: Mapping[str, Any]) -> Layout:
     return _create_layout((horizontals, verticals), fields["pitch_mm"])
 
 
-_create_layout = lru_cache(Layout.create)
-"""A search asks for the layout of its pad many times a step."""
+_create_layout = lru_cache(Layout.create)  # a search asks for the layout of its pad many times a step
 
 
 def _validated_layout(fields: Mapping[str, Any]) -> Layout | None:

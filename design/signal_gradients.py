@@ -6,7 +6,6 @@ from functools import cached_property
 
 import numpy as np
 
-from padforge.common import profiling
 from padforge.design.contact import element_spacings, press_shape, record_visits, search_precision, weight_table
 from padforge.design.kernels.element_signals import element_signals, elements_gradient, fibre_elements
 from padforge.design.kernels.exact_gradient import signals_gradient
@@ -67,6 +66,5 @@ class FibreCurves:
             where = max_offsets, ends, presses, shape, 0, len(presses), (none, none)
             visited = exact_signals(curves, *where, out.reshape(-1))
             kernel = lambda upstream: signals_gradient(t, v, d, max_offsets[0], ends, presses, upstream, shape)  # noqa: E731
-        if profiling.is_profiling():
-            record_visits(t[None], compute_max_offsets(v[None], ends), ends, presses, shape[1], visited)
+        record_visits(t[None], v[None], ends, presses, shape[1], visited)
         return out.T, lambda grad_signals: np.asarray(kernel(np.ascontiguousarray(grad_signals.T)))

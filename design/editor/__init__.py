@@ -8,20 +8,18 @@ from functools import cached_property
 from itertools import count
 from pathlib import Path
 from threading import Lock
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from padforge.common.files import check_replaceable, find_dependents, provenance, sha256
+from padforge.common.settings import Spec
 from padforge.common.validation import InputError, check_float, check_int, short_repr
 from padforge.design.morphology import MAX_COORDINATE, Array, Morphology
 from padforge.design.objectives.ambiguity import AMBIGUITY_NOISE, ambiguity_map, free_presses
 from padforge.design.objectives.rules import check_rules
 from padforge.design.paths.curves import add_spare_knots, beziers, remove_spare_knots
 from padforge.design.settings import PadSettings, RulesSettings, SearchSettings, read_contact
-
-if TYPE_CHECKING:
-    from padforge.common.settings import Spec
 
 MIN_DISTANCE = 1e-3  # smallest distance of two knots along a fibre, grid units
 MAX_KNOTS = 64  # inner knots of a fibre, as for [search] knots
@@ -62,13 +60,9 @@ class EditSession:
     """
 
     def __init__(
-        self, spec: "Spec", source: Path | None, out: Path, publish: Callable[[dict[str, Any]], None], force: bool
+        self, spec: Spec, source: Path | None, out: Path, publish: Callable[[dict[str, Any]], None], force: bool
     ) -> None:
-        """Load the pad to edit, straight fibres without a `source`; `publish` sends a view to all pages.
-
-        Raises:
-            InputError: invalid settings, an unreadable pad, or other files were made from the pad at `out`.
-        """
+        """Load the pad to edit, straight fibres without a `source`; `publish` sends a view to all pages."""
         self.out, self._force, self._publish = out, force, publish
         self._provenance = provenance("padforge design edit", None, [] if source is None else [source])
         pad = Morphology.straight(spec.section(PadSettings).layout) if source is None else Morphology.load(source)
@@ -109,17 +103,10 @@ class EditSession:
         """Apply an edit, such as {"do": "move", "fibre": 1, "knot": 2, "x_mm": 3.0, "y_mm": 4.0, "gesture": "a"}.
 
         "add" takes a fibre and optionally a position, "remove" a fibre and a knot, "undo" and "redo" nothing. Fibres
-        and inner knots count from 1. Edits of one gesture are undone together.
-
-        Returns:
-            The new view; InputError for an invalid edit, which changes nothing.
+        and inner knots count from 1. Edits of one gesture are undone together; an invalid one changes nothing. Returned
+        is the new view.
         """
-        try:
-            edit = json.loads(body)
-        except ValueError:
-            edit = None
-        if not isinstance(edit, dict):
-            raise InputError(f"got {short_repr(body)} as an edit, expected a JSON object")
+        edit = json.loads(body)
         with self._lock:
             history, gesture, kind = self._history, edit.get("gesture", ""), edit.get("do")
             if kind in ("undo", "redo"):

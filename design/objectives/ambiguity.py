@@ -25,18 +25,13 @@ from padforge.design.settings import Contact, PadSettings
 
 AMBIGUITY_NOISE = 0.05
 """Noise of signals, relative to full scale, for comparing pads: with less, no good pad confuses any presses."""
-MAX_NEG_LOG_LIKELIHOOD = 20.0
-"""Presses are not confused if their likelihood ratio is below exp(-20) = 2e-9."""
+MAX_NEG_LOG_LIKELIHOOD = 20.0  # presses are not confused if their likelihood ratio is below exp(-20) = 2e-9
 MAX_EXPONENT = 300.0
 """Up to this sum of squares, a likelihood may be computed as a product of exponentials without overflow."""
 
 
 def free_presses(size: PadSettings) -> Array:
-    """Return the positions (Q, 2), grid units, of a 20 x 20 grid over the pressed rectangle that are outside keep-outs.
-
-    Raises:
-        InputError: there are none.
-    """
+    """Return the positions (Q, 2), grid units, of a 20 x 20 grid over the pressed rectangle that no keep-out covers."""
     presses = grid_positions(size.sensed, side=20)
     presses = presses[is_outside(presses, size)]
     if not len(presses):
@@ -47,15 +42,7 @@ def free_presses(size: PadSettings) -> Array:
 def ambiguities(
     pad: Morphology, contact: Contact, max_failures: int | tuple[float, ...], noise: float, size: PadSettings
 ) -> list[float]:
-    """Compute the ambiguity, grid units, with 0, 1, ... fibres failed, on a grid of presses.
-
-    Args:
-        pad: the fibres.
-        contact: contact model of the presses.
-        max_failures: maximum number of failed fibres, or weights of 0, 1, ... failed fibres.
-        noise: noise of the signals, relative to full scale.
-        size: settings of the pad, with the rectangle that is pressed.
-    """
+    """Compute the ambiguity, grid units, with 0, 1, ... fibres failed, on a grid of presses."""
     presses = free_presses(size)
     return _by_press(relative_stretch(pad, presses, contact), presses, max_failures, noise).mean(axis=1).tolist()
 
@@ -89,15 +76,10 @@ def _by_press(stretch: Array, presses: Array, max_failures: int | tuple[float, .
 
 @kernel
 def press_ambiguities(signals: Any, presses: Any, failed: Any) -> Any:
-    """Compute sum_b w_ab |p_a - p_b| for each press a and each set of failed fibres, skipping pairs of no likelihood.
+    """Compute sum_b w_ab |p_a - p_b| (Q, L) for each press a and each set of failed fibres, grid units.
 
-    Args:
-        signals: signals divided by twice their noise; shape (Q, F).
-        presses: positions; shape (Q, 2), grid units.
-        failed: indices of the failed fibres of each set, filled up with F; shape (L, K).
-
-    Returns:
-        The sums; shape (Q, L), grid units.
+    Signals (Q, F) are divided by twice their noise, presses (Q, 2) in grid units; `failed` (L, K) are the indices of
+    the failed fibres of each set, filled up with F. Pairs of no likelihood are skipped.
     """
     count, fibres = signals.shape
     sets, max_failures = failed.shape

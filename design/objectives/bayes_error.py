@@ -23,11 +23,7 @@ from threadpoolctl import threadpool_limits
 
 from padforge.design.contact import relative_stretch
 from padforge.design.morphology import Array, Morphology
-from padforge.design.objectives.expected_error import (
-    evaluation_windows,
-    scatter_of_full_scale,
-    straight_full_scale,
-)
+from padforge.design.objectives.expected_error import evaluation_windows, scatter_of_full_scale, straight_full_scale
 from padforge.design.objectives.fibre_loss import failure_masks, failure_shares
 from padforge.design.paths.keep_outs import is_outside
 from padforge.design.settings import Contact, PadSettings, Rectangle, Scatter, SearchSettings
@@ -38,55 +34,33 @@ STEP = 0.1
 """Step of the fine grid of positions, over a window and its surroundings, grid units. It is about the standard
 deviation of a posterior, which is fine enough for a sum over Gaussians.
 """
-MARGIN = 1.0
-"""Width of these surroundings, grid units."""
-FAR_STEP = 0.7
-"""Minimum step of the coarse grid over the remaining pad, grid units."""
-MAX_FAR = 2048
-"""Maximum number of positions of the coarse grid."""
+MARGIN = 1.0  # width of these surroundings, grid units
+FAR_STEP = 0.7  # minimum step of the coarse grid over the remaining pad, grid units
+MAX_FAR = 2048  # maximum number of positions of the coarse grid
 PRESSES = 8192
 """Presses that are localized for each number of failed fibres, over all windows and sets of failed fibres."""
-MIN_PRESSES = 64
-"""Minimum number of presses for each set of failed fibres."""
-MAX_SETS = 64
-"""Maximum number of sets of failed fibres of each size, divided among the windows."""
-MIN_SETS = 8
-"""Number of such sets for a window even if there are many windows."""
-MIN_NOISE = 5e-3
-"""Minimum floor of the scatter, full scales: below, the grid would not resolve the posterior."""
-BLOCK = 128
-"""Readings whose posteriors are computed together, so that these stay in the cache of a core."""
+MIN_PRESSES = 64  # minimum number of presses for each set of failed fibres
+MAX_SETS = 64  # maximum number of sets of failed fibres of each size, divided among the windows
+MIN_SETS = 8  # number of such sets for a window even if there are many windows
+MIN_NOISE = 5e-3  # minimum floor of the scatter, full scales: below, the grid would not resolve the posterior
+BLOCK = 128  # readings whose posteriors are computed together, so that these stay in the cache of a core
 MIN_EXPONENT = np.float32(-60)
 """Exponents are clipped to it: smaller ones are negligible, and several times slower to exponentiate."""
 Mask = NDArray[np.bool_]
 
 
 class Positions(NamedTuple):
-    """Positions that a press may have, each of which stands for a cell around it.
+    """Positions that a press may have, each of which stands for a cell around it."""
 
-    Attributes:
-        places: the positions; shape (P, 2), grid units.
-        log_prior: logarithms of the areas of the cells; shape (P,).
-        responses: responses of the fibres; shape (P, F), full scales.
-        blur: variances of the responses within the cells; shape (P, F).
-    """
-
-    places: Array
-    log_prior: Array
-    responses: Array
-    blur: Array
+    places: Array  # the positions; shape (P, 2), grid units
+    log_prior: Array  # logarithms of the areas of the cells; shape (P,)
+    responses: Array  # responses of the fibres; shape (P, F), full scales
+    blur: Array  # variances of the responses within the cells; shape (P, F)
 
 
 @threadpool_limits.wrap(limits=1, user_api="blas")  # several threads wait for each other, and other work goes on
 def expected_errors(pad: Morphology, contact: Contact, search: SearchSettings, size: PadSettings) -> list[float]:
-    """Compute the expected errors with 0, 1, ... fibres failed, grid units, always with the same random numbers.
-
-    Args:
-        pad: the fibres.
-        contact: contact model of the presses.
-        search: number of fibres that may fail, and scatter of the responses.
-        size: settings of the pad, with the rectangle that is pressed.
-    """
+    """Compute the expected errors with 0, 1, ... fibres failed, grid units, always with the same random numbers."""
     fibres, windows = len(pad.knots), evaluation_windows(size.sensed)
     levels = range(min(len(failure_shares(search.max_failures)), fibres))
     masks = [failure_masks(fibres, k, max(MAX_SETS // len(windows), MIN_SETS)) > 0 for k in levels]

@@ -50,58 +50,38 @@ SEARCH_SIDE = 12
 """Presses along a side of a window's grid in a search. With 10 a search errs more under a small contact; 14 take a
 seventh to a third more time for an improvement of 1 to 2 %.
 """
-EVALUATION_SIDE = 14
-"""Presses along a side of a window's grid in an evaluation."""
-WINDOW = 5.0
-"""Maximum side of a window, grid units."""
-COARSE_STEP = 0.7
-"""Step of the coarse grid over the remaining pad, grid units."""
-WINDOW_MARGIN = 1.0
-"""Minimum distance of the coarse grid to the window, grid units."""
-MAX_FAR = 2048
-"""Maximum number of presses of the coarse grid."""
-MAX_WINDOWS = 16
-"""Maximum number of windows by which a pad is evaluated; of more, a sample is taken."""
-MAX_PARTNERS = 36
-"""Maximum number of presses of the coarse grid that join the regression."""
+EVALUATION_SIDE = 14  # presses along a side of a window's grid in an evaluation
+WINDOW = 5.0  # maximum side of a window, grid units
+COARSE_STEP = 0.7  # step of the coarse grid over the remaining pad, grid units
+WINDOW_MARGIN = 1.0  # minimum distance of the coarse grid to the window, grid units
+MAX_FAR = 2048  # maximum number of presses of the coarse grid
+MAX_WINDOWS = 16  # maximum number of windows by which a pad is evaluated; of more, a sample is taken
+MAX_PARTNERS = 36  # maximum number of presses of the coarse grid that join the regression
 MAX_PARTNER_DISTANCE = 1.0
 """Maximum response distance of such presses to a press of the window, kernel widths. Fibres along a strip respond
 equally to many presses; a network distinguishes these by the other fibres.
 """
-MAX_SETS = 32
-"""Maximum number of sets of failed fibres of each size in an evaluation, divided among the windows."""
-MIN_SETS = 8
-"""Number of such sets for a window even if there are many windows."""
-WIDTH = 0.8
-"""Width of the kernel, full scales."""
-RIDGE = 1e-2
-"""Ridge of the regression."""
+MAX_SETS = 32  # maximum number of sets of failed fibres of each size in an evaluation, divided among the windows
+MIN_SETS = 8  # number of such sets for a window even if there are many windows
+WIDTH = 0.8  # width of the kernel, full scales
+RIDGE = 1e-2  # ridge of the regression
 BOUND_WEIGHT = 0.85
 """Weight of the Cramer-Rao bound. With both weights the criterion agrees with errors of trained networks within 7 %
 over straight, gently and strongly curved pads. This one is below 1 since a mean error is below the root of a variance.
 """
-REGRESSION_WEIGHT = 0.47
-"""Weight of the regression error, below 1 since a network learns better than ridge regression."""
-POWER = 12
-"""Exponent of the power mean of relative errors over contacts and numbers of failed fibres."""
+REGRESSION_WEIGHT = 0.47  # weight of the regression error, below 1 since a network learns better than ridge regression
+POWER = 12  # exponent of the power mean of relative errors over contacts and numbers of failed fibres
 DEFAULT_FULL_SCALE = 0.182
 """Full scale of straight fibres of the default pad under the default press, a relative stretch."""
 
 
 class PressWindow(NamedTuple):
-    """Presses on a square grid over a window of the pad, and on a coarse grid over the remaining pad.
+    """Presses on a square grid over a window of the pad, and on a coarse grid over the remaining pad; grid units."""
 
-    Attributes:
-        positions: positions in the window, row by row; shape (Q, 2), grid units.
-        step: distance of neighbours; shape (2,), grid units.
-        free: mask of the positions outside keep-outs; shape (Q,).
-        far: positions on the remaining pad, none if the window covers all of it; shape (P, 2), grid units.
-    """
-
-    positions: Array
-    step: Array
-    free: NDArray[np.bool_]
-    far: Array
+    positions: Array  # in the window, row by row; shape (Q, 2)
+    step: Array  # distance of neighbours; shape (2,)
+    free: NDArray[np.bool_]  # mask of the positions outside keep-outs; shape (Q,)
+    far: Array  # on the remaining pad, none if the window covers all of it; shape (P, 2)
 
     def with_partners(self, partners: Ints) -> Array:
         """Return the positions of the window, and of the far presses of these indices; shape (Q + len(partners), 2)."""
@@ -109,14 +89,7 @@ class PressWindow(NamedTuple):
 
 
 def criterion_errors(pad: Morphology, contact: Contact, search: SearchSettings, size: PadSettings) -> list[float]:
-    """Compute the criterion with 0, 1, ... fibres failed, grid units, always on the same presses.
-
-    Args:
-        pad: the fibres.
-        contact: contact model of the presses.
-        search: number of fibres that may fail, and scatter of the responses.
-        size: settings of the pad, with the rectangle that is pressed.
-    """
+    """Compute the criterion with 0, 1, ... fibres failed, grid units, always on the same presses."""
     rng, fibres = np.random.default_rng(0), len(pad.knots)
     levels = range(min(len(failure_shares(search.max_failures)), fibres))
     windows = evaluation_windows(size.sensed)
@@ -205,14 +178,7 @@ def place_window(rectangle: Rectangle, share: float | Array) -> Rectangle:
 
 
 def window_presses(size: PadSettings, window: Rectangle, side: int, rng: np.random.Generator) -> PressWindow:
-    """Return side x side presses on a randomly shifted grid over a window, and a coarse grid over the rest of the pad.
-
-    Args:
-        size: settings of the pad.
-        window: corners of the window, grid units.
-        side: presses along a side.
-        rng: generator of the shifts.
-    """
+    """Return side^2 presses on a randomly shifted grid over a window, and a coarse grid over the rest of the pad."""
 
     def shifted_grid(low: Array, high: Array, counts: Array) -> Array:
         cells = np.stack(np.meshgrid(*(np.arange(n, dtype=float) for n in counts)), axis=-1).reshape(-1, 2)
@@ -231,16 +197,11 @@ def window_presses(size: PadSettings, window: Rectangle, side: int, rng: np.rand
 
 
 def confusable(near: Array, far: Array, masks: Array) -> Ints:
-    """Find the far presses that may be confused with a press of the window under any set of failed fibres.
+    """Find the far presses that may be confused with a press of the window under any of the `masks` (L, F).
 
-    Args:
-        near: responses to the presses of the window, weighted as in the kernel; shape (F, Q).
-        far: responses to those of the remaining pad; shape (F, N).
-        masks: sets of working fibres; shape (L, F).
-
-    Returns:
-        Ascending indices of those with the most similar responses, at most MAX_PARTNERS, all of which are nearer than
-        MAX_PARTNER_DISTANCE kernel widths.
+    These are at most MAX_PARTNERS, with the most similar responses, and nearer than MAX_PARTNER_DISTANCE kernel widths;
+    their indices ascend. Responses to the presses of the window (F, Q) and of the remaining pad (F, N) are weighted as
+    in the kernel.
     """
     if not far.shape[1]:
         return np.empty(0, np.int64)
@@ -342,26 +303,16 @@ def expected_error(
 
 
 def averages(masks: Array, levels: int) -> Array:
-    """Return the matrix (K, L) that averages over the sets of 0, 1, ... K - 1 failed fibres.
-
-    Args:
-        masks: the sets, 1 for a working fibre; shape (L, F).
-        levels: K.
-    """
+    """Return the matrix (`levels`, L) that averages over the sets (L, F) of 0, 1, ... failed fibres."""
     has_size = (masks == 0).sum(axis=1) == np.arange(levels)[:, None]
     return has_size / np.maximum(has_size.sum(axis=1, keepdims=True), 1)
 
 
 def relative_error(errors: Array, straight: Array, shares: tuple[float, ...]) -> tuple[float, Array]:
-    """Return the power mean of the errors relative to those of straight fibres, in which the worst dominate.
+    """Return the power mean of the errors relative to those of straight fibres, and its gradient (C, K) by the errors.
 
-    Args:
-        errors: errors by contact and number of failed fibres; shape (C, K).
-        straight: errors of straight fibres; shape (C, K).
-        shares: probabilities of 0, 1, ... failed fibres.
-
-    Returns:
-        The mean, and its gradient (C, K) by the errors.
+    The worst dominate in it. Errors (C, K) are by contact and number of failed fibres, of which `shares` are the
+    probabilities.
     """
     weights = np.array(shares[: errors.shape[1]])
     weights /= weights.sum() * len(errors)

@@ -19,12 +19,10 @@ from padforge.design.paths.curves import UNFOLDED, bend_radius, extreme_headings
 from padforge.design.paths.keep_outs import keep_outs
 from padforge.design.settings import TRACK_WIDTH_MM, Layout, PadSettings, RulesSettings
 
-TOLERANCE_MM = 1e-3
-"""Maximum deviation of the polylines by which curves are checked, mm."""
+TOLERANCE_MM = 1e-3  # maximum deviation of the polylines by which curves are checked, mm
 FOLD_TOLERANCE = 1e-4
 """The same for folds relative to the gap, if that is more: all pairs of points within a gap are compared."""
-CACHE_SIZE = 256
-"""Number of fibres whose bends and folds are cached: an editor changes one fibre at a time."""
+CACHE_SIZE = 256  # number of fibres whose bends and folds are cached: an editor changes one fibre at a time
 
 
 @dataclass(frozen=True)

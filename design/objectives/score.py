@@ -29,23 +29,14 @@ from padforge.design.signal_gradients import FibreCurves
 
 @dataclass(frozen=True)
 class ScoredPad:
-    """A pad and the settings on which its terms depend.
-
-    Attributes:
-        pad: the fibres.
-        contact: contact model of the presses.
-        search: number of fibres that may fail, and scatter of the responses.
-        rules: limits of the penalties.
-        size: settings of the pad, with the rectangle that is pressed.
-        noise: noise of the signals in the ambiguity, relative to full scale.
-    """
+    """A pad and the settings on which its terms depend."""
 
     pad: Morphology
     contact: Contact
     search: SearchSettings
     rules: RulesSettings
     size: PadSettings
-    noise: float = AMBIGUITY_NOISE
+    noise: float = AMBIGUITY_NOISE  # of the signals in the ambiguity, relative to full scale
 
     def terms(self, names: Collection[str] = ()) -> dict[str, float]:
         """Compute the terms of the rows of TERMS with these names, or of all rows, by name."""
@@ -80,23 +71,15 @@ class ScoredPad:
 
 @dataclass(frozen=True)
 class Term:
-    """A row of the table of terms.
+    """A row of the table of terms."""
 
-    Attributes:
-        name: name of the value, or the common prefix of several.
-        description: text for people; `{}` stands for the suffix of the name.
-        compute: returns the value, or several by their suffix.
-        weight: key of its weight in `[search]`; None if no search minimises it.
-        loss: returns its value in a search and its gradient (3, F, n) by the curves.
-        is_published: whether it belongs to the published method, whose contact is a shape.
-    """
-
-    name: str
-    description: str
-    compute: Callable[[ScoredPad], float | Mapping[object, float]]
-    weight: str | None = None
+    name: str  # of the value, or the common prefix of several
+    description: str  # text for people; `{}` stands for the suffix of the name
+    compute: Callable[[ScoredPad], float | Mapping[object, float]]  # returns the value, or several by their suffix
+    weight: str | None = None  # key of its weight in `[search]`; None if no search minimises it
+    # returns its value in a search and its gradient (3, F, n) by the curves
     loss: Callable[[FibreCurves, Contact, PadSettings], tuple[float, Array]] | None = None
-    is_published: bool = False
+    is_published: bool = False  # whether it belongs to the published method, whose contact is a shape
 
 
 def sharpness(signals: Array) -> float:

@@ -18,10 +18,8 @@ from padforge.design.optimize.problem import SearchProblem
 from padforge.design.paths.curves import refine
 from padforge.design.published.objective import published_presses, published_terms
 
-LEVEL_STD = 1.0
-"""Standard deviation of initial knots about the level of their fibre, grid units."""
-ORIGIN_STD = 0.3
-"""Standard deviation of initial knots about those of an origin, grid units."""
+LEVEL_STD = 1.0  # standard deviation of initial knots about the level of their fibre, grid units
+ORIGIN_STD = 0.3  # standard deviation of initial knots about those of an origin, grid units
 
 
 class GeneticSearch:

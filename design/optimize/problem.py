@@ -25,21 +25,13 @@ of 1000 reduce errors by 8 %, and 3000 steps by 12 %.
 
 @dataclass(frozen=True)
 class SearchProblem:
-    """The problem of finding a pad that serves all contacts within the rules.
-
-    Attributes:
-        pad: settings of the pad.
-        contacts: contact models, the main one first.
-        search: settings of the search.
-        rules: limits of the design rules.
-        origin: morphology to start from; None for random starts.
-    """
+    """The problem of finding a pad that serves all contacts within the rules."""
 
     pad: PadSettings
-    contacts: tuple[Contact, ...]
+    contacts: tuple[Contact, ...]  # the main one first
     search: SearchSettings
     rules: RulesSettings
-    origin: Morphology | None = None
+    origin: Morphology | None = None  # morphology to start from; None for random starts
 
     @property
     def starts(self) -> range:
@@ -91,14 +83,7 @@ class SearchProblem:
 def build_problem(
     pad: PadSettings, contact: Contact, settings: SearchSettings, rules: RulesSettings, origin: Morphology | None = None
 ) -> SearchProblem:
-    """Build the search problem, checking its settings against each other.
-
-    Args:
-        pad: settings of the pad.
-        contact: the main contact; `contact_set` adds those to serve besides.
-        settings: settings of the search.
-        rules: limits of the design rules.
-        origin: morphology to start from; None for random starts.
+    """Build the search problem; `contact_set` adds the contacts to serve besides the main one.
 
     Raises:
         InputError: settings that do not fit each other or the origin.

@@ -23,8 +23,8 @@ import numpy as np
 from padforge.common import profiling
 from padforge.common.parallel import Checkpoints, State, run_tasks
 from padforge.common.progress import OnProgress, ignore_progress
-from padforge.common.settings import or_default
-from padforge.common.validation import InputError, check_float, check_path, check_type, short_repr
+from padforge.common.settings import Spec, or_default
+from padforge.common.validation import InputError
 from padforge.design.contact_comparison import errors_by_contact
 from padforge.design.morphology import Array, Morphology
 from padforge.design.objectives.expected_error import straight_full_scale
@@ -37,15 +37,11 @@ from padforge.design.settings import Contact, Layout, PadSettings, RulesSettings
 from padforge.design.twin import Twin
 
 if TYPE_CHECKING:
-    from padforge.common.settings import Spec
     from padforge.design.optimize.genetic import GeneticSearch
 
-SLICE_STEPS = {"descent": 20, "genetic": 2}
-"""Steps or generations of a slice, by method: about a third of a second."""
-SLICE_S = 1.0
-"""Time after which a slice ends early, so that a time budget is kept even if steps are slow."""
-MIN_STARTS = 2
-"""Minimum number of starts that are continued after half of the steps."""
+SLICE_STEPS = {"descent": 20, "genetic": 2}  # steps or generations of a slice, by method: about a third of a second
+SLICE_S = 1.0  # time after which a slice ends early, so that a time budget is kept even if steps are slow
+MIN_STARTS = 2  # minimum number of starts that are continued after half of the steps
 GRACE_S = 10.0
 """Time after a deadline for running slices to end. One takes a second or so, but an executor may hang."""
 LAYOUT_KEYS = ("grid", "horizontals", "verticals", "pitch_mm", "size_mm")
@@ -72,17 +68,6 @@ class SearchOptions:
     resume: bool = False
     time_budget: float | None = None
     executor: Executor | None = None
-
-    def __post_init__(self) -> None:
-        if not callable(self.on_progress):
-            raise InputError(f"on_progress is {short_repr(self.on_progress)}, expected a function")
-        if self.keep_in is not None:
-            object.__setattr__(self, "keep_in", check_path("keep_in", self.keep_in))
-        check_type("resume", self.resume, bool)
-        if self.time_budget is not None:
-            object.__setattr__(self, "time_budget", check_float("time_budget", self.time_budget, 0, 1e9))
-        if self.executor is not None:
-            check_type("executor", self.executor, Executor)
 
 
 @dataclass(frozen=True)
@@ -142,7 +127,7 @@ def search(
     pad, settings = or_default("pad", pad, PadSettings), or_default("settings", settings, SearchSettings)
     contact = or_default("contact", contact, Contact, settings.default_contact)
     problem = build_problem(pad, contact, settings, or_default("rules", rules, RulesSettings), origin)
-    run = SearchOptions() if run is None else check_type("run", run, SearchOptions)
+    run = run or SearchOptions()
     checkpoints = Checkpoints(run.keep_in, problem.settings()) if run.keep_in else None
     states = checkpoints.begin(run.resume) if checkpoints else {}
     stop = Stop(begin, run.time_budget)
@@ -362,15 +347,11 @@ def _name(problem: SearchProblem, start: int) -> str:
     return "genetic" if problem.search.method == "genetic" else f"start {start + 1}"
 
 
-def settings_for_twin(spec: "Spec", path: Path, pad: Morphology | None = None) -> "Spec":
+def settings_for_twin(spec: Spec, path: Path, pad: Morphology | None = None) -> Spec:
     """Return the settings of `spec` with the sensitivity profile, the noise and the sensed rectangle of a twin.
 
-    On a pad of another pitch, profile and rectangle keep their size in mm, and the rectangle is cut to the pad.
-
-    Args:
-        spec: the settings.
-        path: file of the twin.
-        pad: fibres whose number and pitch are taken; by default those that `spec` states, or else the twin's.
+    On a pad of another pitch, profile and rectangle keep their size in mm, and the rectangle is cut to the pad. The
+    number and the pitch of the fibres are those of `pad`, by default those that `spec` states, or else the twin's.
 
     Raises:
         InputError: no valid twin; `spec` states another contact, or other fibres than the twin's.
@@ -420,19 +401,10 @@ def search_for_twin(
     Three searches run: for the default contact, which needs no measurement; for the measured contact from random
     starts; and for the measured contact from the default pad. Among their pads and straight fibres, the one with the
     least expected error under the measured contact is returned, but never one that locates less well than the default
-    pad or straight fibres.
+    pad or straight fibres; its `candidate` is "twin", "from default", "default" or "straight fibres".
 
-    Args:
-        pad: settings of the pad.
-        contact: the measured contact.
-        settings: settings of the searches for it.
-        rules: limits of the design rules.
-        default_settings: settings of the search for the default contact.
-        origin: morphology from which the second search starts; random if None.
-        run: options of all three searches together.
-
-    Returns:
-        The result, whose `candidate` is "twin", "from default", "default" or "straight fibres".
+    `settings` are those of the searches for the measured contact, the second of which starts from `origin` if that is
+    stated. The options `run` are those of all three searches together.
     """
     run = run or SearchOptions()
     default = search(pad, None, default_settings, rules, run=_part_options(run, "default"))
@@ -450,8 +422,8 @@ def search_for_twin(
     buildable = {name: fibres for name, fibres in pads.items() if not problem.violations(fibres)}
     pads = buildable or {"twin": twin.morphology}
     with profiling.stage("judge"):
-        rows = errors_by_contact(pads, {"": contact}, pad, settings)
-    name = choose({row.pad: np.array(row.errors_mm) for row in rows})
+        errors = errors_by_contact(pads, {"": contact}, pad, settings)
+    name = choose({name: np.array(values) for (_, name), values in errors.items()})
     straight = Candidate("straight fibres", _straight_pad(problem, Stop(time.perf_counter(), None)), problem)
     return replace(
         Candidate(name, pads[name], problem).to_result(straight),

@@ -291,10 +291,8 @@ def extreme_headings(slopes: Array) -> Array:
 def trace_curve(spans: Array, slopes: Array, step: float) -> tuple[Array, Array]:
     """Sample one fibre, its `beziers` and `slope_beziers`, so that it turns by at most `step`, rad, between points.
 
-    Such points also measure its length: a chord is shorter than its arc by less than the fraction step^2 / 8.
-
-    Returns:
-        Points (n, 2), and the exact headings there (n,), rad.
+    Such points (n, 2) also measure its length: a chord is shorter than its arc by less than the fraction step^2 / 8.
+    Also returned are the exact headings there (n,), rad.
     """
     starts = np.arange(len(spans))
     at = np.append(np.column_stack([starts, starts + _stationary(slopes)]), len(spans))  # span + parameter in it
@@ -332,14 +330,9 @@ def bend_radius(
     how a fibre of finite stiffness lies. The curve is assumed to turn evenly between two points; the turn in a window
     is then piecewise linear in the window's position, with its maximum at a window that starts or ends at a point.
 
-    Args:
-        points: points so dense that chords measure the length; a corner is a point twice; shape (n, 2).
-        headings: headings of the tangents there, unwrapped; shape (n,), rad.
-        window: length over which turns are added up.
-        out_of_plane: turns out of the plane from point to point, from `rolled_turns`; shape (n - 1,), rad.
-
-    Returns:
-        Radius, and the position (2,) of the middle of that bend.
+    The points (n, 2) are so dense that chords measure the length, a corner is a point twice; headings (n,), rad, of the
+    tangents there are unwrapped. Turns `out_of_plane` (n - 1,), rad, are those of `rolled_turns`. Returned are the
+    radius, and the position (2,) of the middle of that bend.
     """
     arc = _cumulative_length(points)
     window = min(window, arc[-1])
@@ -359,10 +352,7 @@ def fold_gap(line: Array, gap: float) -> tuple[float, Array] | None:
     """Compute the smallest distance of two points of a polyline that are at least `FOLD` gaps apart along it.
 
     The polyline must not cross itself: the smallest distance is then between a vertex and a segment, or between two
-    points exactly `FOLD` gaps apart.
-
-    Returns:
-        Distance, and the middle (2,) of the two points; None if all keep the gap.
+    points exactly `FOLD` gaps apart. Also returned is the middle (2,) of the two points; None if all keep the gap.
     """
     min_arc = FOLD * gap
     arc = _cumulative_length(line)

@@ -3,7 +3,8 @@
 # pyright: reportPrivateImportUsage=false  ezdxf does not mark as exported what its manual imports
 import io
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
@@ -13,14 +14,12 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from padforge.common.files import check_file, read_bytes
-from padforge.common.validation import InputError, short_repr
+from padforge.common.validation import InputError, naming_file, short_repr
 from padforge.design.morphology import Array
 
 if TYPE_CHECKING:
     from ezdxf.path import Path as BezierPath
 
-MAX_BYTES = 2**22  # size of a drawing; drawings of fibres are far smaller
 MAX_COORDINATE = 1e6  # largest absolute coordinate, in units of the drawing
 _FIBRES = re.compile(r"(fibre|fiber|horizontal|vertical)", re.IGNORECASE)
 JOIN_MM = 0.01  # distance of ends that are joined, as programs round where pieces of a line meet
@@ -32,7 +31,6 @@ class DrawnCurve:
 
     name: str  # in the file, or kind and number
     points: Array  # vertices; shape (n, 2), in units of the drawing, y upwards
-    ends: Array  # as the file has them; shape (2, 2)
     groups: tuple[str, ...] = ()  # names of the curve and of all groups or layers that contain it
     closed: bool = False
 
@@ -43,18 +41,22 @@ class DrawnPlan:
 
     unit_mm: float = 1.0  # of the drawing
     unit: str = "mm"  # name of the unit that the file states
+    to_file: Callable[[Array], Array] = lambda point: point  # converts a point to the coordinates that the file has
     notes: list[str] = field(default_factory=list)  # assumptions about the drawing, and omitted curves
     curves: list[DrawnCurve] = field(default_factory=list)
     n_hidden: int = 0
 
-    def add(self, name: str, points: Array, ends: Array, groups: Sequence[str] = (), closed: bool = False) -> None:
-        """Add a `DrawnCurve` unless it is a single point; refuse coordinates beyond MAX_COORDINATE."""
-        if not (np.abs(points) <= MAX_COORDINATE).all():
-            raise InputError(f"{name}: coordinates that are no numbers or beyond {MAX_COORDINATE:g}")
+    def add(self, name: str, points: Array, groups: Sequence[str], closed: bool = False) -> None:
+        """Add a `DrawnCurve` unless it is a single point."""
         points = points[np.append(True, (np.diff(points, axis=0) != 0).any(axis=1))]
         if len(points) > 1:
             closed = closed or bool((points[0] == points[-1]).all())
-            self.curves.append(DrawnCurve(name, points, ends, tuple(filter(None, groups)), closed))
+            self.curves.append(DrawnCurve(name, points, tuple(filter(None, groups)), closed))
+
+    def describe(self, points: Iterable[Array]) -> str:
+        """Return the coordinates of points as the file has them: "(-20, 3) to (20, 3)"."""
+        in_file = (np.round(self.to_file(point), 9) + 0.0 for point in points)  # + 0.0 removes the sign of 0
+        return " to ".join(f"({x:.6g}, {y:.6g})" for x, y in in_file)
 
     @property
     def border(self) -> Array | None:
@@ -81,58 +83,65 @@ class DrawnPlan:
             layers = dict.fromkeys(next(filter(_FIBRES.match, curve.groups)) for curve in named)
             where = ", ".join(map(short_repr, list(layers)[:3]))
             self.notes.append(f"open curves outside of {where}, which are left out: {len(others)}")
-        return list(_join(named or others, JOIN_MM / self.unit_mm))
+        return self._join(named or others)
+
+    def _join(self, curves: Sequence[DrawnCurve]) -> list[DrawnCurve]:
+        """Join curves whose ends are within JOIN_MM."""
+        from ezdxf import edgeminer
+
+        if not curves:
+            return []
+        size = float(np.ptp(np.vstack([curve.points[[0, -1]] for curve in curves]), axis=0).max())
+        tolerance = min(JOIN_MM / self.unit_mm, 1e-3 * size)  # of a drawing in m whose unit is not stated
+        edges = [
+            edgeminer.make_edge(curve.points[0], curve.points[-1], payload=number)
+            for number, curve in enumerate(curves)
+        ]
+        deposit = edgeminer.Deposit(edges, gap_tol=tolerance)
+        for curve in curves:
+            for end in curve.points[[0, -1]]:
+                if deposit.degree(end) > 2:
+                    raise InputError(f"{curve.name}: more than two curves end at {self.describe([end])} in the drawing")
+
+        def first_curve(chain: "Sequence[edgeminer.Edge]") -> int:
+            return min(edge.payload for edge in chain)
+
+        joined = []
+        for chain in sorted(edgeminer.find_all_simple_chains(deposit), key=first_curve):
+            if len(chain) > 1 and edgeminer.is_loop(chain, gap_tol=tolerance):
+                name = curves[first_curve(chain)].name
+                raise InputError(f"{name}: part of a ring, or drawn twice, expected curves from border to border")
+            if chain[0].payload > chain[-1].payload:
+                chain = edgeminer.reverse_chain(chain)
+            first, last = curves[chain[0].payload], curves[chain[-1].payload]
+            pieces = [curves[edge.payload].points[:: -1 if edge.is_reverse else 1].copy() for edge in chain]
+            for before, after in pairwise(pieces):
+                before[-1] = after[0] = (before[-1] + after[0]) / 2
+            name = first.name if len(chain) == 1 else f"{first.name} to {last.name}"
+            joined.append(DrawnCurve(name, np.vstack(pieces), first.groups))
+        return joined
 
 
 def _is_pad(curve: DrawnCurve) -> bool:
     return "pad" in (group.lower() for group in curve.groups)
 
 
-def _join(curves: Sequence[DrawnCurve], tolerance: float) -> Iterator[DrawnCurve]:
-    """Join curves whose ends are within the tolerance, in units of the drawing."""
-    from ezdxf import edgeminer
-
-    if not curves:
-        return
-    size = float(np.ptp(np.vstack([curve.points[[0, -1]] for curve in curves]), axis=0).max())
-    tolerance = min(tolerance, 1e-3 * size)  # of a drawing in m whose unit is not stated
-    edges = [
-        edgeminer.make_edge(curve.points[0], curve.points[-1], payload=number) for number, curve in enumerate(curves)
-    ]
-    deposit = edgeminer.Deposit(edges, gap_tol=tolerance)
-
-    def first_curve(chain: "Sequence[edgeminer.Edge]") -> int:
-        return min(edge.payload for edge in chain)
-
-    for curve in curves:
-        for end in (0, -1):
-            if deposit.degree(curve.points[end]) > 2:
-                x, y = curve.ends[end]
-                raise InputError(f"{curve.name}: more than two curves end at ({x:g}, {y:g}) in the drawing")
-    for chain in sorted(edgeminer.find_all_simple_chains(deposit), key=first_curve):
-        if len(chain) > 1 and edgeminer.is_loop(chain, gap_tol=tolerance):
-            name = curves[first_curve(chain)].name
-            raise InputError(f"{name}: part of a ring, or drawn twice, expected curves from border to border")
-        if chain[0].payload > chain[-1].payload:
-            chain = edgeminer.reverse_chain(chain)
-        first, last = curves[chain[0].payload], curves[chain[-1].payload]
-        pieces = [curves[edge.payload].points[:: -1 if edge.is_reverse else 1].copy() for edge in chain]
-        for before, after in pairwise(pieces):
-            before[-1] = after[0] = (before[-1] + after[0]) / 2
-        name = first.name if len(chain) == 1 else f"{first.name} to {last.name}"
-        ends = np.array([first.ends[int(chain[0].is_reverse)], last.ends[int(not chain[-1].is_reverse)]])
-        yield DrawnCurve(name, np.vstack(pieces), ends, first.groups)
-
-
-def _shorten(error: Exception) -> str:
-    """Return a library's message in one line of limited length."""
-    return " ".join(str(error).split())[:120] or type(error).__name__
+@contextmanager
+def _reraise(message: str) -> Iterator[None]:
+    """Put an error of a library, which raises whatever a torn file leads it to, into one line of limited length."""
+    try:
+        yield
+    except (InputError, MemoryError):
+        raise
+    except Exception as error:
+        reason = " ".join(str(error).split())[:120] or type(error).__name__
+        raise InputError(f"{message} ({reason})") from error
 
 
 def _flatten(path: "BezierPath") -> Array:
     """Flatten a path of Bezier curves to a polyline (n, 2), within 1e-5 of its size."""
     control = np.array([vertex.xyz for vertex in path.control_vertices()])
-    if not (np.abs(control) <= 1e3 * MAX_COORDINATE).all():  # a matrix may still scale it down
+    if not (np.abs(control) <= MAX_COORDINATE).all():
         raise InputError(f"coordinates that are no numbers or beyond {MAX_COORDINATE:g}")
     distance = 1e-5 * max(float(np.ptp(control, axis=0).max()), 1e-12)
     return np.array([vertex.xyz[:2] for vertex in path.flattening(distance, segments=16)])
@@ -147,35 +156,32 @@ def read_svg(path: Path) -> DrawnPlan:
     """Read the curves of an SVG; lengths without a unit are pixels of 1/96 inch."""
     from svgelements import SVG, Matrix
 
-    content = read_bytes(path, MAX_BYTES)
-    drawing = DrawnPlan(unit="mm of its width and viewBox")
-    try:
-        tree = ElementTree.fromstring(content)
+    with _reraise("not an SVG file that can be read"):
+        tree = ElementTree.fromstring(path.read_bytes())
         if _kind(tree) != "svg":
-            raise InputError(f"{path}: the root is <{_kind(tree)}>, expected <svg>")
+            raise InputError(f"the root is <{_kind(tree)}>, expected <svg>")
         _adapt_tree(tree)
-        if not tree.get("width", "%").endswith(("mm", "cm", "in", "pt", "pc", "m")) or "viewBox" not in tree.attrib:
-            drawing.unit = "pixels of 1/96 inch, as it states no other unit"
+        has_unit = tree.get("width", "%").endswith(("mm", "cm", "in", "pt", "pc", "m")) and "viewBox" in tree.attrib
+        unit = "mm of its width and viewBox" if has_unit else "pixels of 1/96 inch, as it states no other unit"
         # Internal entities, as Illustrator declares them, are replaced by expat, which limits them.
         root: Any = SVG.parse(io.BytesIO(ElementTree.tostring(tree)), on_error="raise", parse_display_none=True)
         # positions count from the origin of the drawing's coordinates, not from the corner of the viewBox
         to_pixels = Matrix(root.viewbox_transform)
-        to_file = ~to_pixels
-        origin = to_pixels.point_in_matrix_space((0, 0))
+        origin = np.array(to_pixels.point_in_matrix_space((0, 0)))
+        mm = np.array([_MM_PER_PIXEL, -_MM_PER_PIXEL])  # y points down
+
+        def to_file(point_mm: Array) -> Array:
+            return np.array((~to_pixels).point_in_matrix_space(tuple(point_mm / mm + origin)))
+
+        drawing = DrawnPlan(unit=unit, to_file=to_file)
         for shape, groups, is_hidden in _iterate_shapes(root, (), False):
             number = f"{shape.values['tag']} {len(drawing.curves) + 1}"
             name = next((group for group in reversed(groups) if group), number)
             for points, closed in _flatten_shape(shape):
                 if is_hidden:
                     drawing.n_hidden += 1
-                    continue
-                ends = np.array([tuple(to_file.point_in_matrix_space(tuple(points[end]))) for end in (0, -1)])
-                points_mm = (points - origin) * [_MM_PER_PIXEL, -_MM_PER_PIXEL]  # y points down
-                drawing.add(name, points_mm, ends, groups, closed)
-    except InputError:
-        raise
-    except (ElementTree.ParseError, ValueError, ArithmeticError, LookupError, RecursionError, TypeError) as error:
-        raise InputError(f"{path}: not an SVG file that can be read ({_shorten(error)})") from error
+                else:
+                    drawing.add(name, (points - origin) * mm, groups, closed)
     return drawing
 
 
@@ -243,15 +249,10 @@ def read_dxf(path: Path) -> DrawnPlan:
     from ezdxf import path as paths
     from ezdxf import units
 
-    path = check_file(path, MAX_BYTES)
-    try:
+    with _reraise("not a DXF file that can be read"):
         document = ezdxf.readfile(path)
         unit, millimetre = document.units, units.InsertUnits.Millimeters
         unit_mm = float(units.conversion_factor(units.InsertUnits(unit), millimetre)) if unit else 1.0
-    except MemoryError:
-        raise
-    except Exception as error:  # ezdxf raises whatever a torn file leads it to
-        raise InputError(f"{path}: not a DXF file that can be read ({_shorten(error)})") from error
     unit_name = f"{units.unit_name(unit).lower()}, as $INSUNITS says" if unit else "mm, as it states no unit"
     drawing = DrawnPlan(unit_mm, unit_name, notes=[] if unit else ["the file says no unit: mm"])
     hidden = {layer.dxf.name.lower() for layer in document.layers if layer.is_off() or layer.is_frozen()}
@@ -260,14 +261,9 @@ def read_dxf(path: Path) -> DrawnPlan:
         if entity.dxf.get("invisible", 0) or any(layer.lower() in hidden for layer in layers):
             drawing.n_hidden += 1
             continue
-        try:
-            lines = [_flatten(part) for part in paths.make_path(entity).sub_paths()]
-        except InputError as error:
-            raise InputError(f"{name}: {error}") from error
-        except (ValueError, TypeError, ArithmeticError, LookupError, AttributeError, ezdxf.DXFError) as error:
-            raise InputError(f"{name}: no curve ({_shorten(error)})") from error
-        for points in lines:
-            drawing.add(name, points, points[[0, -1]], layers)
+        with naming_file(name), _reraise("no curve"):
+            for part in paths.make_path(entity).sub_paths():
+                drawing.add(name, _flatten(part), layers)
     return drawing
 
 

@@ -7,7 +7,8 @@ from pathlib import Path
 import numpy as np
 import shapely
 
-from padforge.common.validation import InputError
+from padforge.common.files import check_file
+from padforge.common.validation import InputError, naming_file
 from padforge.design.morphology import Array, Morphology
 from padforge.design.paths.curves import add_spare_knots, flatten
 from padforge.design.paths.drawing_files import DrawnCurve, DrawnPlan, read_dxf, read_svg
@@ -15,6 +16,7 @@ from padforge.design.paths.knot_fitting import fit_knots
 from padforge.design.settings import Layout
 
 READERS = {".svg": read_svg, ".dxf": read_dxf}
+MAX_BYTES = 2**22  # size of a drawing; drawings of fibres are far smaller
 MAX_KNOTS = 64  # inner knots of a fibre, as of `[search] knots`
 _FAMILIES = "horizontal", "vertical"
 _MAX_BACKTRACK_MM = 2e-4  # largest step backwards along the axis: files are rounded
@@ -79,7 +81,8 @@ def import_plan(path: Path, layout: Layout, tolerance_mm: float) -> ImportedPlan
     reader = READERS.get(path.suffix.lower())
     if reader is None:
         raise InputError(f"{path}: ends in {path.suffix or 'nothing'}, allowed are {' and '.join(READERS)}")
-    try:
+    check_file(path, MAX_BYTES)
+    with naming_file(path):
         drawing = reader(path)
         curves = drawing.fibres
         if not curves:
@@ -96,10 +99,8 @@ def import_plan(path: Path, layout: Layout, tolerance_mm: float) -> ImportedPlan
         pad = Morphology.from_layout(_fit_paths(fibre_paths, layout, tolerance_mm), layout)
         lines = flatten(pad, _FLATNESS_MM / layout.unit_mm)
         fibres = [_check_fit(line, drawn, layout, tolerance_mm) for line, drawn in zip(lines, fibre_paths, strict=True)]
-    except InputError as error:
-        raise InputError(f"{path}: {str(error).removeprefix(f'{path}: ')}") from error
-    notes = [f"hidden curves, which are left out: {drawing.n_hidden}"] if drawing.n_hidden else []
-    return ImportedPlan(pad, tuple(fibres), "; ".join([placement, *drawing.notes, *notes]))
+    hidden = [f"hidden curves, which are left out: {drawing.n_hidden}"] if drawing.n_hidden else []
+    return ImportedPlan(pad, tuple(fibres), "; ".join([placement, *drawing.notes, *hidden]))
 
 
 def _describe_scale(drawing: DrawnPlan, curves: Sequence[DrawnCurve], layout: Layout) -> str:
@@ -126,7 +127,7 @@ def _place_curves(drawing: DrawnPlan, curves: Sequence[DrawnCurve], layout: Layo
             shape = f"{size[0]:g} by {size[1]:g} mm"
             raise InputError(f"pad is drawn {width:g} by {height:g}, expected the shape of {shape}")
         lines = [(curve.points - border.mean(axis=0)) / ratio for curve in curves]
-        return _assign_curves(curves, lines, layout), "the border is that named pad"
+        return _assign_curves(drawing, curves, lines, layout), "the border is that named pad"
     lines = [curve.points * drawing.unit_mm for curve in curves]
     points = np.vstack(lines)
     origins = {
@@ -135,30 +136,32 @@ def _place_curves(drawing: DrawnPlan, curves: Sequence[DrawnCurve], layout: Layo
         "its origin is the upper left corner of the pad": size / 2 * [1, -1],
         "the middle of its curves is that of the pad": (points.min(axis=0) + points.max(axis=0)) / 2,
     }
-    placements: list[tuple[float, str, list[_FibrePath] | InputError]] = []
+    placements: list[tuple[float, str, list[_FibrePath]]] = []
+    errors: list[InputError] = []
     for description, middle in origins.items():
         try:
-            paths = _assign_curves(curves, [line - middle for line in lines], layout)
-        except InputError as error:
-            placements.append((np.inf, description, error))
-        else:
+            paths = _assign_curves(drawing, curves, [line - middle for line in lines], layout)
             placements.append((sum(path.error_mm for path in paths), description, paths))
+        except InputError as error:
+            errors.append(error)
+    if not placements:
+        raise errors[0]
     limit = min(error for error, _, _ in placements) + _FLATNESS_MM * len(lines)
-    _, description, paths = next(placement for placement in placements if placement[0] <= limit)
-    if isinstance(paths, InputError):
-        raise paths
-    return paths, description
+    return next((paths, description) for error, description, paths in placements if error <= limit)
 
 
-def _assign_curves(curves: Sequence[DrawnCurve], lines: Sequence[Array], layout: Layout) -> list[_FibrePath]:
+def _assign_curves(
+    drawing: DrawnPlan, curves: Sequence[DrawnCurve], lines: Sequence[Array], layout: Layout
+) -> list[_FibrePath]:
     """Assign each curve to the nearest fibre, of the family that it fits better."""
     paths = []
     for curve, line in zip(curves, lines, strict=True):
+        drawn = drawing.describe(curve.points[[0, -1]])
         candidates, errors = [], []
         for family in (0, 1):
             if layout.counts[family]:
                 try:
-                    candidates.append(_assign_to_family(curve, line, family, layout))
+                    candidates.append(_assign_to_family(curve.name, drawn, line, family, layout))
                 except InputError as error:
                     errors.append((abs(np.diff(line[[0, -1], family])[0]), error))
         if not candidates:
@@ -167,9 +170,8 @@ def _assign_curves(curves: Sequence[DrawnCurve], lines: Sequence[Array], layout:
     return paths
 
 
-def _assign_to_family(curve: DrawnCurve, line: Array, family: int, layout: Layout) -> _FibrePath:
+def _assign_to_family(name: str, drawn: str, line: Array, family: int, layout: Layout) -> _FibrePath:
     """Clip a curve to the pad, and assign it to the nearest fibre of a family."""
-    name, drawn = curve.name, " to ".join(f"({x:.6g}, {y:.6g})" for x, y in curve.ends + 0.0)
     half_length, half_width = layout.size_mm[family] / 2, layout.size_mm[1 - family] / 2
     # 1. from the first to the last point on the pad
     dense = np.empty((2 * len(line) - 1, 2))  # with midpoints: a straight line may have no vertex on the pad

@@ -18,11 +18,7 @@ def keep_outs(pad: PadSettings) -> list[Polygon]:
 
 
 def check_fibre_ends(pad: PadSettings, rules: RulesSettings) -> None:
-    """Refuse keep-outs too near to fibre ends, which cannot move.
-
-    Raises:
-        InputError: naming the keep-out, the fibre and the position of its end.
-    """
+    """Refuse keep-outs too near to fibre ends, which cannot move."""
     layout = pad.layout
     for number, polygon in enumerate(keep_outs(pad), 1):
         for fibre in range(layout.fibres):

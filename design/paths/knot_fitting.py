@@ -19,12 +19,9 @@ _MIN_SPAN = 2e-3  # smallest distance of knots along the axis, as a share of the
 
 
 def fit_knots(points: Array, tolerance: float, max_inner: int = 64) -> Array:
-    """Fit the knots (n, 2) of a PCHIP curve to a polyline; misfits are measured along the normal.
+    """Fit the knots (n, 2) of a PCHIP curve to a polyline (m, 2); misfits are measured along the normal.
 
-    Args:
-        points: coordinates along, strictly ascending, and across; shape (m, 2).
-        tolerance: largest misfit, in the unit of the points.
-        max_inner: largest number of inner knots; with that many the tolerance may be exceeded.
+    Coordinates along ascend strictly. The tolerance may be exceeded with `max_inner` inner knots, the most allowed.
     """
     samples, weight = _sample(points)
     knots = samples[_find_turns(samples, tolerance)]

@@ -21,8 +21,7 @@ MIN_DAMPING, MAX_DAMPING = 1e-15, 1e10
 MIN_GRADIENT = 1e-7
 BLOCK = 64  # columns of a symmetric product computed at once
 
-Samples = tuple[Tensor, Tensor]
-"""Scaled inputs (S, Q, D) and targets (S, A, Q, O)."""
+Samples = tuple[Tensor, Tensor]  # scaled inputs (S, Q, D) and targets (S, A, Q, O)
 
 
 def train_batch(

@@ -27,8 +27,7 @@ BATCH = 14  # networks trained at once by a core, which gains nothing from more;
 _FIRST_CALL = Lock()
 """Torch loads the linear algebra of a GPU at its first call, which fails where two threads make it at once."""
 
-FailureSet = tuple[int, ...]
-"""Indices of failed fibres."""
+FailureSet = tuple[int, ...]  # indices of failed fibres
 
 
 @dataclass(frozen=True)
@@ -84,14 +83,10 @@ def fit_batch(
     that did best on validation. Except for rounding, a network depends on its samples and its generator alone, and on
     no other network of the batch.
 
-    Args:
-        inputs: finite samples of S networks (S, Q, D), or (Q, D) that all of them share.
-        targets: shape (Q, O), shared.
-        rngs: S generators of the splits and of the first weights.
-        hidden: neurons of the hidden layer.
-        epochs: most steps of a network.
-        validation: inputs (S, C, D) and targets (C, O); if given, all samples are for training.
-        alternatives: targets (A, Q, O) as valid as `targets`: a sample counts by the nearest one.
+    The inputs are samples of S networks (S, Q, D), or (Q, D) that all of them share; the targets (Q, O) are shared.
+    `rngs` are S generators of the splits and of the first weights. If inputs (S, C, D) and targets (C, O) for the
+    validation are given, all samples are for training. Alternative targets (A, Q, O) are as valid as `targets`: a
+    sample counts by the nearest one.
     """
     inputs = np.broadcast_to(inputs, (len(rngs), *inputs.shape[-2:]))
     options = targets[None] if alternatives is None else np.concatenate([targets[None], alternatives])

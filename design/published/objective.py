@@ -2,14 +2,13 @@
 
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from padforge.common.parallel import map_chunks
 from padforge.common.settings import or_default
-from padforge.common.validation import InputError, check_array, check_int, check_type, short_repr
+from padforge.common.validation import check_int, check_type
 from padforge.design.contact import (
     check_presses,
     check_samples,
@@ -148,10 +147,6 @@ def published_terms(
     before; by default they are the 49 published ones. Signals and C are computed from `samples` points per fibre, and
     signals are rounded up to `levels` levels.
     """
-    if weights is not WEIGHTS and check_array("weights", weights, 1e12).shape != (3,):
-        raise InputError(f"weights are {short_repr(weights)}, expected three numbers: alpha, beta, gamma")
-    if entropy not in get_args(Entropy):
-        raise InputError(f"entropy is {short_repr(entropy)}, allowed are {', '.join(get_args(Entropy))}")
     alpha, beta, gamma = weights
     along, across, ends, _ = fibre_axes(pads, layout)
     samples, levels = check_samples(samples, along.shape[1]), check_int("levels", levels, 1, MAX_LEVELS)

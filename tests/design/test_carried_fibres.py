@@ -9,8 +9,7 @@ from padforge.design.contact import grid_positions
 from padforge.design.layer import solve_press
 from padforge.design.settings import Layout
 
-AMPLITUDE = 1e-6
-"""Share of the displacements by which points are carried, so that lengths change in proportion."""
+AMPLITUDE = 1e-6  # share of the displacements by which points are carried, so that lengths change in proportion
 TOOLS = ("dome", "ball", "flat", "finger")
 
 

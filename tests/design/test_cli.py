@@ -1,17 +1,15 @@
-"""Searches for a twin and plans of measured profiles; `test_outputs` has what commands print."""
+"""Searches for a twin; `test_outputs` has what commands print."""
 
 import json
 from pathlib import Path
 
-import numpy as np
 import pytest
 from click.testing import CliRunner
-from matplotlib.patches import Circle
 
 from padforge import Spec
 from padforge.common.files import sha256
 from padforge.common.settings import commented_toml
-from padforge.design import Contact, Morphology, SearchOptions, Twin, draw_plan, score, search
+from padforge.design import Contact, Morphology, SearchOptions, Twin, score, search
 from padforge.design.cli import design
 from padforge.design.objectives.expected_error import straight_full_scale
 from padforge.design.optimize.search import settings_for_twin, state_folders
@@ -71,9 +69,3 @@ def test_design_for_twin_uses_its_contact_and_resumes(here, twin, little_scored,
     assert list(states.glob("start_*.npz"))
     assert run("--twin", twin, "--resume", spec=SEARCH)["terms"] == unbroken["terms"]
     assert not list(Path("out/pad").glob("search*"))
-
-
-def test_plan_draws_the_half_width_of_a_measured_profile():
-    patches = draw_plan(Morphology.straight(2, (20.0, 8.0)), Contact(model="profile")).axes[0].patches
-    (press,) = (patch for patch in patches if isinstance(patch, Circle))
-    assert press.radius == pytest.approx(np.sqrt(2 * np.log(2)) * 6.2, rel=0.01)

@@ -1,16 +1,26 @@
-"""Signals of rectangles as they are turned, and of presses of known depth against solved contacts; their forces."""
+"""Signals of rectangles as they are turned and of presses of known depth, forces, and further contacts."""
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from padforge.design import Contact, Morphology, indented_signals, press_forces_n, signals, signals_quantized
-from padforge.design.contact import signals_sparse
+from padforge.design import (
+    Contact,
+    Morphology,
+    SearchSettings,
+    indented_signals,
+    press_forces_n,
+    signals,
+    signals_quantized,
+)
+from padforge.design.contact import half_width_mm, signals_sparse
+from padforge.design.contact_set import judged_contacts, served_contacts
 from padforge.design.layer import solve_press
 from padforge.design.objectives.rules import check_rules
 from padforge.design.paths.curves import crossings, lengths
-from padforge.design.settings import Layout, RulesSettings
+from padforge.design.settings import PUBLISHED_CONTACT, Layout, RulesSettings
+from tests.helpers.golden import Golden
 
 CONTACTS = [Contact(radius=0.5, sides=4, length="euclidean"), Contact(), Contact(model="profile")]
 
@@ -85,13 +95,6 @@ def test_indented_signals_are_those_of_solved_contacts():
     assert indented_signals(PAD, [], [], contact).shape == (0, 4)
 
 
-def test_indented_signals_of_a_flat_end_grow_in_proportion_to_the_depth():
-    contact, presses = Contact(tool="flat", tool_radius_mm=5.0), presses_on(PAD, 3)
-    depths_mm = np.array([0.0, 0.02, 4.9])
-    expected = depths_mm[:, None] / 5.0 * signals(PAD, presses, contact)
-    np.testing.assert_allclose(indented_signals(PAD, presses, depths_mm, contact), expected, rtol=1e-6, atol=1e-9)
-
-
 def test_press_forces_are_those_of_solved_contacts():
     contact, depths_mm = Contact(tool="ball", tool_radius_mm=6.0, base="slipping"), np.array([[0.0, 0.02], [1.3, 4.8]])
     solved = [
@@ -100,3 +103,36 @@ def test_press_forces_are_those_of_solved_contacts():
     ]
     deepest_n = float(press_forces_n(contact.depth_mm, contact))
     np.testing.assert_allclose(press_forces_n(depths_mm, contact).ravel(), solved, rtol=0, atol=5e-4 * deepest_n)
+
+
+MEASURED = Contact(model="profile")
+
+
+ASSUMED = {"layer": Contact(), "no stretch": Contact(stretch=0.0), "profile": MEASURED, "shape": PUBLISHED_CONTACT}
+
+
+def test_contacts_served_and_judged_begin_with_the_assumed_one(golden: Golden) -> None:
+    """And none is there twice; their profiles are given by where they end."""
+    lines = []
+    for name, assumed in ASSUMED.items():
+        for contacts in ("plausible", "assumed", (Contact(radius=0.9), assumed)):
+            search = SearchSettings(contacts=contacts)
+            for what, found in (("served", served_contacts), ("judged", judged_contacts)):
+                named = found(assumed, search)
+                assert next(iter(named.values())) == assumed
+                assert len({str(contact) for contact in named.values()}) == len(named)
+                listed = [f"{other} ({contact.model}, {half_mm(contact)})" for other, contact in named.items()]
+                lines.append(f"{name}, {contacts if isinstance(contacts, str) else 'stated'}, {what}: {listed}")
+    golden("design/contact_names.txt", "\n".join(lines))
+
+
+def half_mm(contact: Contact) -> str:
+    return f"K = {contact.radius:g}" if contact.model == "shape" else f"{half_width_mm(contact):.3f} mm"
+
+
+def test_plausible_contacts_are_as_wide_as_the_assumed_layer_in_proportion():
+    ratios = []
+    for assumed in (Contact(), Contact(tool="ball", tool_radius_mm=4.0, depth_mm=2.5, thickness_mm=4.0)):
+        _, *others = served_contacts(assumed, SearchSettings()).values()
+        ratios.append([half_width_mm(other) / half_width_mm(assumed) for other in others])
+    assert ratios[1] == pytest.approx(ratios[0], rel=0.01)

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.integrate import quad
 
-from padforge.design.contact import FIBRE_BLUR_MM, contact_press, describe_large_strain, profile_weights
-from padforge.design.layer import MAX_CONTACT, solve_press
+from padforge.design.contact import describe_large_strain, profile_weights
+from padforge.design.layer import solve_press
 from padforge.design.settings import Contact
 from tests.helpers.axisymmetric import press
 from tests.helpers.golden import Golden
@@ -63,15 +63,6 @@ def test_strains_near_the_face_of_a_thick_layer_are_those_of_a_half_space(thickn
     assert solved.strains([0.0], thickness - below).compressive[0] == pytest.approx(strain, rel=0.05)
 
 
-@pytest.mark.parametrize("ratio", [0.1, 1.0, 10.0, 100.0])
-def test_contact_radius_of_a_bonded_layer_follows_chi(ratio):
-    thickness = 3.0
-    chi = 1 / 4 + 3 / 4 / (1 + 1.3 * ratio)
-    depth = chi * (ratio * thickness) ** 2 / 20
-    solved = solve_press("dome", 20.0, depth, thickness)
-    assert 20.0 * depth / solved.contact_radius_mm**2 == pytest.approx(chi, rel=0.05)
-
-
 def test_thin_bonded_layer_is_a_lubrication_film():
     a, thickness = 90.0, 1.0
     dome = solve_press("dome", 1000.0, a**2 / 4000, thickness)
@@ -83,11 +74,6 @@ def test_thin_bonded_layer_is_a_lubrication_film():
     assert flat.force_n(4) == pytest.approx(1e-3 * 3 * math.pi * 0.01 * a**4 / (8 * thickness**3), rel=0.11)
 
 
-def test_thin_slipping_layer_has_half_of_chi():
-    solved = solve_press("dome", 1000.0, 1.0, 0.5, "slipping")
-    assert 1000.0 / solved.contact_radius_mm**2 == pytest.approx(1 / 2, rel=0.01)
-
-
 @pytest.mark.parametrize("base", ["bonded", "slipping"])
 @pytest.mark.parametrize("tool", ["dome", "ball", "flat"])
 def test_face_follows_the_tool_inside_and_stays_clear_of_it_outside(tool, base):
@@ -96,18 +82,6 @@ def test_face_follows_the_tool_inside_and_stays_clear_of_it_outside(tool, base):
     inside, outside = np.linspace(0, 0.999 * a, 40), np.linspace(1.001 * a, 3 * a, 40)
     np.testing.assert_allclose(solved.deflection(inside), tool_depth(tool, 8.4, 3.0, inside), atol=1e-3)
     assert (solved.deflection(outside) > tool_depth(tool, 8.4, 3.0, outside)).all()
-
-
-@pytest.mark.parametrize("base", ["bonded", "slipping"])
-def test_silicone_keeps_its_volume(base):
-    solved = solve_press("dome", 8.4, 4.0, 6.0, base)
-    heights, weights = np.polynomial.legendre.leggauss(20)
-    radii = np.array([3.0, 8.0, 14.0])
-    outward = weights @ np.array([solved.strains(radii, 3 + 3 * height).hoop for height in heights]) * radii
-    for radius, through in zip(radii, outward, strict=True):
-        r = radius * (1 + heights) / 2
-        displaced = radius / 2 * weights @ (solved.deflection(r) * r)
-        assert radius * 3 * through == pytest.approx(displaced, abs=0.01 * 4.0 * 8.0)
 
 
 @pytest.mark.parametrize("base", ["bonded", "slipping"])
@@ -163,15 +137,6 @@ def test_finger_on_thick_layer_is_a_dome_with_half_the_force():
     assert finger.force_n() == pytest.approx(dome.force_n() / 2, rel=0.01)
 
 
-@pytest.mark.parametrize("tool", ["dome", "ball", "flat", "finger"])
-def test_half_of_every_length_has_the_same_strains_at_half_the_distance(tool):
-    whole, half = solve_press(tool, 8.4, 4.0, 6.0), solve_press(tool, 4.2, 2.0, 3.0)
-    assert half.contact_radius_mm == pytest.approx(whole.contact_radius_mm / 2, rel=1e-9)
-    assert half.force_n() == pytest.approx(whole.force_n() / 4, rel=1e-9)
-    r = np.linspace(0, 20, 50)
-    np.testing.assert_allclose(half.strains(r / 2, 2.5, 0.1), whole.strains(r, 5.0, 0.2), atol=1e-9)
-
-
 @pytest.mark.parametrize(
     ("tool", "radius", "depth", "thickness"),
     [
@@ -197,20 +162,12 @@ def test_extreme_presses_are_solved(tool, radius, depth, thickness, base):
         np.testing.assert_allclose(face[:3], shape, atol=0.05 * depth)
 
 
-def test_widest_contact_of_a_layer_is_solved():
-    assert solve_press("flat", MAX_CONTACT, 0.1, 1.0).contact_radius_mm == MAX_CONTACT
-
-
 def test_strains_above_1_are_said_with_their_size(golden: Golden) -> None:
     """The largest lies in the silicone below the fibres, for a flat end at the edge of the contact."""
     for contact in (Contact(), Contact(tool="flat", depth_mm=1), Contact(model="profile"), Contact(radius=0.6)):
         assert describe_large_strain(contact) == ""
-    bonded, flat = Contact(base="bonded"), Contact(tool="flat")
-    for contact, height_mm in ((bonded, 3.75), (flat, 5.75)):
+    for contact in (Contact(base="bonded"), Contact(tool="flat")):
         golden(f"design/large_strain_{contact.tool}.txt", describe_large_strain(contact))
-        strains = contact_press(contact).strains(np.linspace(0, 20, 500), height_mm, FIBRE_BLUR_MM)
-        told = float(describe_large_strain(contact).partition("up to ")[2].partition(",")[0])
-        assert told == pytest.approx(strains.compressive.max(), abs=0.07)
 
 
 @pytest.mark.parametrize("base", ["bonded", "slipping"])

@@ -10,19 +10,7 @@ from hypothesis import strategies as st
 from padforge.design import Morphology, signals
 from padforge.design.morphology import assemble_knots
 from padforge.design.settings import PUBLISHED_CONTACT, Layout
-from tests.design.wild_pads import SEEDS, wild_pads
-
-
-@given(grid=st.integers(1, 5), knots=st.integers(0, 6), seed=SEEDS)
-@settings(max_examples=30)
-def test_random_morphologies_are_valid_and_reproducible(grid, knots, seed):
-    pad = Morphology.random(grid, knots, seed)
-    assert pad.knots.shape == (2 * grid, knots + 2, 2)
-    assert pad == Morphology.random(grid, knots, np.random.default_rng(seed))
-    for fibre, points in enumerate(pad.knots):
-        axis = 0 if fibre < grid else 1
-        assert (np.diff(points[:, axis]) > 0).all()
-        assert tuple(points[[0, -1], axis]) == (0, grid + 1)
+from tests.design.wild_pads import wild_pads
 
 
 @given(wild_pads((1, 4), (0, 20)))

@@ -1,14 +1,12 @@
-"""What commands of design print, write and draw, whole, and what a few of these numbers are by another way."""
+"""What commands of design print, write and draw."""
 
 import json
-import re
 import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 import shapely
 
@@ -21,10 +19,9 @@ from padforge.design.cli import design
 from padforge.design.contact_comparison import compare_contacts
 from padforge.design.design_run import load_result, summary_lines
 from padforge.design.editor import EditSession
-from padforge.design.objectives.bayes_error import expected_errors
 from padforge.design.objectives.rules import Violation
 from padforge.design.optimize.search import SearchResult
-from padforge.design.settings import PUBLISHED_CONTACT, SearchSettings
+from padforge.design.settings import SearchSettings
 from tests.helpers.door import call
 from tests.helpers.golden import Golden, page_text
 from tests.helpers.json_text import json_text
@@ -102,18 +99,13 @@ def test_design(run, golden: Golden) -> None:
     assert sorted(path.name for path in Path("out/pad").iterdir()) == [
         *("design.json", "design.png", "design.svg", "morphology.json")
     ]
-    lines = lines_mm(Morphology.load("out/pad/morphology.json"))
-    points = shapely.get_parts([one.intersection(other) for n, one in enumerate(lines) for other in lines[:n]])
-    crossings, length_m = (~shapely.is_empty(points)).sum(), sum(line.length for line in lines) / 1000
-    assert f"fibre           {length_m:.2f} m, {crossings} crossings; straight fibres 0.08 m, 2 crossings" in printed
 
     read = load_result(Path("out/pad"))
     assert summary_lines(read, Path("out/pad")) == printed.splitlines()[1:-1]
     assert (read.terms, read.straight, read.history) == tuple(document[x] for x in ("terms", "straight", "history"))
-    for change in ({"terms": {"a": {}}}, {"terms": []}, {"straight": {"a": "b"}}, {"violations": [{"rule": 1}]}):
-        Path("out/pad/design.json").write_text(json.dumps(document | change))
-        with pytest.raises(InputError, match="not as padforge writes it"):
-            load_result(Path("out/pad"))
+    Path("out/pad/design.json").write_text(json.dumps(document | {"violations": [{"rule": 1}]}))
+    with pytest.raises(InputError, match="not as padforge writes it"):
+        load_result(Path("out/pad"))
 
 
 def test_summaries_of_searches(golden: Golden) -> None:
@@ -168,16 +160,6 @@ def test_import(run, golden: Golden) -> None:
     written = document_of("out/plan/morphology.json")
     golden("design/import_morphology.json", json_text(written), forget=[VERSIONS], rtol=1e-3)
 
-    upper = lines_mm(Morphology.load("out/plan/morphology.json"))[1]
-    t = np.linspace(0, 1, 200)[:, None]
-    control = np.array([[-20, 6], [-10, 15], [10, -3], [20, 6.13]])
-    drawn = np.sum([factor * (1 - t) ** (3 - k) * t**k * control[k] for k, factor in enumerate((1, 3, 3, 1))], axis=0)
-    stated = json.loads(printed.split("\n", 1)[1].rpartition("[")[0])
-    assert stated["fibres"][1]["max_error_mm"] == pytest.approx(
-        shapely.distance(shapely.points(drawn), upper).max(), abs=2e-3
-    )
-    assert [fibre["end_shift_mm"] for fibre in stated["fibres"]] == pytest.approx([0, 0.13, 0, 0, 0], abs=1e-4)
-
 
 def test_edit(run, golden: Golden, monkeypatch: pytest.MonkeyPatch) -> None:
     """As a command that is interrupted at once, and as the view of a page after some edits."""
@@ -221,12 +203,6 @@ def test_compare(run, golden: Golden, figures: list[Any], bent_pad: Morphology) 
     golden("design/comparison.txt", "\n".join(comparison.comparison_lines(document)))
     golden("design/comparison_figure.txt", figures[-1], rtol=1e-3)
 
-    rows = document["rows"]
-    assert rows[0]["length_mm"] == pytest.approx(sum(line.length for line in lines_mm(bent_pad)), rel=1e-5)
-    assert [row["straight_length_mm"] for row in rows] == pytest.approx([2 * 40 + 3 * 36] * 2)
-    assert [row["straight_crossings"] for row in rows] == [6, 6]
-    assert rows[1]["errors_mm"] == rows[1]["straight_mm"] == rows[0]["straight_mm"]
-
 
 def test_names_of_variants(golden: Golden) -> None:
     vary = ["pad.grid=1,2", "pad.pitch_mm=9.5,[8,12]", 'contact.tool="ball"']
@@ -240,13 +216,7 @@ def test_contacts(run, golden: Golden, bent_pad: Morphology) -> None:
     bent_pad.save("out/pad/morphology.json")
     spec = Spec({"contact": {"model": "profile"}, "search": {"max_failures": 1}})
     compare_contacts(spec, bent_pad, Path("out/pad"), seed=3)
-    document = document_of("out/pad/contacts.json")
-    golden("design/contacts.json", json_text(document), forget=[VERSIONS], rtol=1e-3)
-    straight, size = Morphology.straight((2, 3), (10.0, 12.0)), PadSettings(**bent_pad.layout.settings)
-    settings = SearchSettings(max_failures=1)
-    for row, contact in ((1, Contact(model="profile")), (-1, PUBLISHED_CONTACT)):
-        expected = straight.unit_mm * np.array(expected_errors(straight, contact, settings, size))
-        assert document["rows"][row]["errors_mm"] == pytest.approx(expected)
+    golden("design/contacts.json", json_text(document_of("out/pad/contacts.json")), forget=[VERSIONS], rtol=1e-3)
 
 
 def test_progress_and_history_of_a_search(golden: Golden, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -260,6 +230,3 @@ def test_progress_and_history_of_a_search(golden: Golden, monkeypatch: pytest.Mo
     lines = sorted(f"{done} of {total}, {what}" for done, total, what in reported)
     golden("design/progress.txt", "\n".join(lines), forget=["(?<=best ).*"], rtol=1e-3)
     golden("design/history.json", json_text([*found.history, {"candidate": found.candidate}]), rtol=1e-3)
-
-    objectives, best = np.array([re.findall(r"\d+\.\d+", what) for *_, what in reported], dtype=float).T
-    assert (best[:4] == np.minimum.accumulate(objectives[:4])).all()

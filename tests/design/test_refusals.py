@@ -2,7 +2,6 @@
 
 import json
 from collections.abc import Callable
-from dataclasses import replace
 from functools import reduce
 from pathlib import Path
 from typing import Any
@@ -16,9 +15,7 @@ from padforge.design.layer import solve_press
 from padforge.design.objectives.ambiguity import free_presses
 from padforge.design.paths.import_plan import import_plan
 from padforge.design.paths.keep_outs import check_fibre_ends
-from padforge.design.published.objective import published_terms
 from padforge.design.settings import Layout
-from padforge.design.twin import PARTS, TwinChannel, TwinPart, TwinResidual
 from tests.helpers.golden import Golden
 from tests.helpers.refusals import refusal_table
 
@@ -89,12 +86,10 @@ VALUES: dict[str, Callable[[], object]] = {
     "a sensed area": lambda: design.score(Morphology.straight(3), size=PadSettings(sensed_mm=(46, 20))),
     "too many fibres to compare": lambda: design.score(Morphology.random(16, 3000, seed=0), max_failures=0),
     "no noise": lambda: design.score(PAD, noise=0.0),
-    "an entropy": lambda: published_terms(PAD, entropy="all"),  # pyright: ignore[reportArgumentType]
     "training presses": lambda: design.localisation_error(PAD, presses=1000),
     "failed fibres": lambda: design.localisation_error(PAD, n_failed=(-1,)),
     "an origin of other fibres": lambda: design.search(PadSettings(grid=2), origin=Morphology.straight(3)),
     "a population": lambda: design.search(settings=SearchSettings(method="genetic", population=100_000)),
-    "a time budget": lambda: design.SearchOptions(time_budget=-1),
 }
 
 
@@ -106,9 +101,6 @@ def test_refusals_of_values(golden: Golden) -> None:
 def test_refusals_of_twins(golden: Golden, twin: Path, tmp_path: Path) -> None:
     whole, path = Twin.load(twin), tmp_path / "twin.json"
 
-    def changed(**values: Any) -> Callable[[], Twin]:
-        return lambda: replace(whole, **values)
-
     def with_value(value: Any, *way: str) -> Callable[[], Twin]:
         def load() -> Twin:
             document = json.loads(twin.read_text())
@@ -118,24 +110,12 @@ def test_refusals_of_twins(golden: Golden, twin: Path, tmp_path: Path) -> None:
 
         return load
 
-    part, small = (TwinPart(whole.distance_mm, whole.weight, np.zeros(count)) for count in (3, 2))
     rows: dict[str, Callable[[], object]] = {
-        "a channel of no fibre": changed(channels=(TwinChannel(0, 9, 0.1, 0.0, 0.9),)),
-        "two channels of a fibre": changed(channels=tuple(TwinChannel(c, 0, 0.1, 0.0, 0.9) for c in (0, 1))),
-        "a shorter weight": changed(weight=whole.weight[:-1]),
-        "fewer lines": changed(as_built_mm=(None,)),
-        "sensitivities of no line": changed(sensitivity=(None,) * 4),
-        "no sensed area": changed(sensed_mm=(20.0, 0.0)),
-        "one part": changed(parts={"onset": part}),
-        "gains of too few channels": changed(parts=dict.fromkeys(PARTS, small)),
-        "a residual without parts": changed(residual=TwinResidual((0.0, 0.0), 1.0, np.zeros((4, 4, 2, 2)))),
         "presses of three numbers": lambda: whole.as_built_stretch([[1.0, 2.0, 3.0]]),
         "presses that are NaN": lambda: whole.as_built_stretch([[np.nan, 0.0]]),
         "no such part": lambda: whole.as_built_stretch([[0.0, 0.0]], "of"),
         "a file of another kind": with_value("padforge-design/1", "format"),
         "a file of other channels": with_value([{"gain": 1}], "channels"),
-        "a file of a scale": with_value(-1, "frame", "scale"),
-        "a file of a noise": with_value("much", "noise"),
     }
     golden("design/refusals_of_twins.txt", refusal_table(rows).replace(str(path), "twin.json"), forget=[CAUSE])
 

@@ -9,10 +9,8 @@ import pytest
 from padforge import InputError, Spec, design
 from padforge.common.settings import commented_toml, settings_schema
 from padforge.design import Contact, Morphology, PadSettings, RulesSettings, SearchSettings, signals
-from padforge.design.published.objective import information
 from padforge.design.settings import (
     BUILT,
-    MEASURED_PROFILE,
     PUBLISHED,
     PUBLISHED_CONTACT,
     Layout,
@@ -22,7 +20,6 @@ from padforge.design.settings import (
 )
 from tests.helpers.golden import Golden
 from tests.helpers.json_text import json_text
-from tests.helpers.limits import require_ends
 
 MODELS = {model.section(): model for model in (PadSettings, Contact, SearchSettings, RulesSettings)}
 
@@ -39,11 +36,6 @@ def test_commented_toml_round_trip(stated, request, golden: Golden) -> None:
 
 def test_schema_states_defaults_and_limits(golden: Golden) -> None:
     golden("design/schema.json", json_text(settings_schema(MODELS)))
-
-
-def test_overrides_win_over_the_file() -> None:
-    found = Spec({"search": {"knots": 7, "seed": 3}}).section(SearchSettings, knots=2, seed=None)
-    assert (found.knots, found.seed) == (2, 3)
 
 
 REFUSED = {
@@ -63,7 +55,7 @@ REFUSED = {
         *({"weight": "cubic"}, {"model": "half-space"}, {"tool": "cone"}, {"depth_mm": 6}, {"thickness_mm": 4}),
         *({"fibre_depths_mm": [1, 6.5]}, {"fibre_depths_mm": [1, 0]}, {"squeeze": 0, "stretch": 0}),
         *({"length": "manhattan"}, {"model": "layer", "radius": 0.9}, {"radius": 0.9, "depth_mm": 2}),
-        *({"model": "profile", "scale": 2}, {"sensitivity_profile": [], "tool": "ball"}),
+        *({"model": "profile", "scale": 2}, {"model": "shape", "tool": "ball"}),
         *({"sensitivity_profile": [[0, 1], *rest]} for rest in ([[1, 0]], [[1, 0.5], [1, 0]], [[1, 0.5], [2, 0.1]])),
         # whose splines leave their points
         *({"sensitivity_profile": points} for points in ([[0, 10], [9, 10], [10, 0]], [[0, -1], [0.2, 1], [1, 0]])),
@@ -97,16 +89,6 @@ def test_wrong_override_is_not_blamed_on_the_file():
         spec.section(PadSettings, horizontals=3)
 
 
-def test_limits_of_settings():
-    for model, key, kept, refused in (
-        (PadSettings, "sensed_mm", [(56.25, 0.1)], ["all", (0.0, 1.0), (1.0, 56.3), (1.0,), 5.0]),
-        (SearchSettings, "max_failures", [0, (0.0, 1.0)], [-1, (-1.0, 2.0)]),
-        (SearchSettings, "weights", [(0.0, 1e6, 5e-324)], [(0.0, 0.0, 0.0), (-1.0, 1.0, 1.0), (1.0,)]),
-        (RulesSettings, "max_crossings", [0], [-1]),
-    ):
-        require_ends(model, key, kept, refused)
-
-
 def test_holes_of_a_pad_are_polygons_around_their_screws():
     pad = PadSettings.model_validate({"keep_out_mm": [[1, 2, 3], [-9, 0, 3, 6], HOLE]})
     assert PadSettings.model_validate_json(pad.model_dump_json()) == pad
@@ -133,9 +115,7 @@ SHAPE = {"radius": 0.6, "sides": 30, "weight": "uniform"}
         ({"radius": 0.9}, "shape", "manhattan"),
         ({"sides": "circle"}, "shape", "manhattan"),
         ({"weight": "inverse", "length": "euclidean"}, "shape", "euclidean"),
-        # as written before there was a layer
         ({"sensitivity_profile": []}, "shape", "manhattan"),
-        (SHAPE | {"length": "manhattan", "sensitivity_profile": []}, "shape", "manhattan"),
         (SHAPE | {"length": "euclidean", "sensitivity_profile": PROFILE}, "profile", "euclidean"),
     ],
     ids=str,
@@ -169,7 +149,7 @@ def test_unstated_lengths_of_contact_are_those_of_the_mould(tables, thickness_mm
 
 
 def test_other_contacts_do_not_depend_on_the_mould():
-    tables: list[dict[str, Any]] = [{"radius": 0.5}, {"model": "profile"}, {"sensitivity_profile": []}]
+    tables: list[dict[str, Any]] = [{"radius": 0.5}, {"model": "profile"}]
     for stated in tables:
         assert read_contact(Spec({"contact": stated, "mould": {"silicone_mm": 8.0}})) == Contact(**stated)
     with pytest.raises(InputError, match=r"^pad: \[contact\] .*depth_mm is 5, the pad is 4 mm thick"):
@@ -182,11 +162,6 @@ def test_gains_scatter_by_their_share_and_have_the_common_part_of_its_variance()
     assert gains.std(axis=0) == pytest.approx([0.2] * 3, rel=0.02)
     expected = 0.36 + 0.64 * np.eye(3)
     np.testing.assert_allclose(np.corrcoef(gains.T), expected, atol=0.02)
-
-
-def test_measured_profile_is_a_gaussian():
-    for d, weight in MEASURED_PROFILE:
-        assert weight == pytest.approx(np.exp(-(d**2) / (2 * 6.2**2)), abs=0.015)
 
 
 def test_settings_accept_numpy_numbers():
@@ -202,11 +177,7 @@ def test_settings_accept_numpy_numbers():
 def test_default_contact_is_a_layer_or_published():
     pad, presses = Morphology.random(1, 3, seed=0), [[1.2, 0.7], [0.5, 0.8]]
     np.testing.assert_array_equal(signals(pad, presses), signals(pad, presses, Contact()))
-    np.testing.assert_array_equal(design.signals_sparse(pad, presses).toarray(), signals(pad, presses))
-    sampled = design.signals_quantized(pad, presses, PUBLISHED_CONTACT)
-    np.testing.assert_array_equal(design.signals_quantized(pad, presses), sampled)
     assert design.published_objective(pad) == design.published_objective(pad, PUBLISHED_CONTACT)
-    assert information(pad) == information(pad, Contact())
     assert SearchSettings().default_contact == Contact()
     assert SearchSettings(method="genetic").default_contact == PUBLISHED_CONTACT
 

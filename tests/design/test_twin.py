@@ -45,18 +45,16 @@ def test_twin_file_round_trip(twin, tmp_path):
     for each in (twin, whole):
         each.save(tmp_path / "twin.json")
         back = Twin.load(tmp_path / "twin.json")
+        back.save(tmp_path / "again.json")
+        assert (tmp_path / "again.json").read_bytes() == (tmp_path / "twin.json").read_bytes()
         for name in ("channels", "frame", "noise", "sensed_mm", "presses", "readings", "scatter", "morphology"):
             assert getattr(back, name) == getattr(each, name)
-        assert back.contact() == each.contact()
-        assert back.contact().sensitivity_profile == tuple(zip(each.distance_mm, each.weight, strict=True))
         for part in (None, *each.parts):
             expected = each.as_built_stretch(PLACES, part)
             assert back.as_built_stretch(PLACES, part) == pytest.approx(expected, abs=1e-3)
     assert back.parts["after"].gains_v == pytest.approx(narrow.gains_v)
     assert back.residual is not None
-    assert (back.residual.middle_mm, back.residual.half_mm) == ((1.0, -2.0), 11.0)
     assert back.residual.volts == pytest.approx(whole.residual.volts, abs=1e-6)
-    assert np.abs(back.as_built_stretch(PLACES, "after")).sum() < np.abs(back.as_built_stretch(PLACES)).sum()
 
 
 def test_as_built_stretch_matches_the_contact_model(twin):

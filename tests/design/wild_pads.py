@@ -55,13 +55,6 @@ wild_contacts = st.builds(
     weight=st.sampled_from(WEIGHTS),
     length=st.sampled_from(LENGTHS),
 )
-contacts = st.builds(
-    Contact,
-    radius=st.floats(0.05, 3),
-    sides=st.none() | st.integers(3, 64),
-    weight=st.sampled_from(WEIGHTS),
-    length=st.sampled_from(LENGTHS),
-)
 
 
 def wild_presses(pad: Morphology, seed: int, count: int = 8) -> Array:

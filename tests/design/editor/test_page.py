@@ -20,8 +20,7 @@ from padforge.design.cli import design
 from tests.helpers.chromium import CHROMIUM, Chromium
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="Ctrl-C is a signal here")
-PATIENCE_S = 120
-"""Kernels may have to be compiled first."""
+PATIENCE_S = 120  # kernels may have to be compiled first
 
 
 class Program:

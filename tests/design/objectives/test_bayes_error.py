@@ -23,16 +23,6 @@ def positions(responses: np.ndarray, blur: float = 0.0) -> Positions:
     return Positions(PLACES, np.zeros(len(PLACES)), responses, np.full(responses.shape, blur))
 
 
-def test_readings_linear_in_the_position_are_located_by_their_noise():
-    """Of two fibres that say x and y with noise s, the mean distance is that of a Rayleigh distribution."""
-    rng, noise = np.random.default_rng(0), 0.2
-    pressed = 2 + rng.uniform(-0.5, 0.5, (2000, 2))
-    readings = pressed + noise * rng.standard_normal(pressed.shape)
-    found = bayes_positions(readings, positions(PLACES), Scatter(noise), np.array([True, True]))
-    error = np.hypot(*(found - pressed).T).mean()
-    assert error == pytest.approx(noise * np.sqrt(np.pi / 2), rel=0.03)
-
-
 def test_posteriors_match_explicit_covariances(monkeypatch):
     monkeypatch.setattr(module, "BLOCK", 4)  # so that the readings are of several blocks
     rng, scatter, working = np.random.default_rng(1), Scatter(0.1, 0.3, 0.4), np.array([True, False, True])
@@ -65,16 +55,6 @@ def test_huge_pads_are_sampled():
     pad = Morphology.straight(size.layout)
     possible = possible_positions(pad, PUBLISHED_CONTACT, size, evaluation_windows(size.sensed)[0], 1.0)
     assert len(possible.places) < module.MAX_FAR + 5000
-
-
-def test_expected_errors_grow_with_failures_and_scatter(monkeypatch):
-    monkeypatch.setattr(module, "PRESSES", 1024)
-    size = PadSettings(horizontals=2, verticals=5, pitch_mm=6.0)
-    pad = Morphology.straight(size.layout)
-    quiet, loud = (expected_errors(pad, Contact(), SearchSettings(scatter=share), size) for share in (0.18, 0.4))
-    assert quiet == sorted(quiet)
-    assert np.all(np.array(loud) > quiet)
-    assert quiet == expected_errors(pad, Contact(), SearchSettings(scatter=0.18), size)
 
 
 @pytest.mark.parametrize("scatter", [Scatter(0.2), Scatter(0.02, 0.3, 0.5)])

@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from padforge.design.contact import grid_positions, relative_stretch
 from padforge.design.morphology import Morphology
 from padforge.design.objectives import expected_error as module
 from padforge.design.objectives.expected_error import (
@@ -16,7 +15,6 @@ from padforge.design.objectives.expected_error import (
     confusable,
     evaluation_windows,
     expected_error,
-    kernel_weights,
     place_window,
     relative_error,
     straight_full_scale,
@@ -28,8 +26,7 @@ SIDE, SIZE = 14, np.array([4.0, 4.0])
 PAD = PadSettings(grid=4, sensed_mm=(45.0, 45.0))
 PLACES, STEPS, FREE, _ = window_presses(PAD, PAD.sensed, SIDE, np.random.default_rng(0))
 PLACES = PLACES - PAD.sensed[0]
-SILENT = Scatter(1e-9)
-"""Noise that adds nothing where signals tell the place."""
+SILENT = Scatter(1e-9)  # noise that adds nothing where signals tell the place
 
 
 def errors(signals: np.ndarray, masks, scatter=SILENT, free=FREE) -> list[float]:
@@ -146,22 +143,6 @@ def test_confusable_matches_all_differences():
     assert 0 < len(found) <= module.MAX_PARTNERS
 
 
-def test_kernel_weights_scale_fibres_of_a_strip():
-    """Those along a strip show a third of those across it; a localizer scales its inputs, and is no worse for it."""
-    size, profile = PadSettings(horizontals=3, verticals=12), Contact(model="profile")
-    weights = kernel_weights(size.layout)
-    stretch = relative_stretch(Morphology.straight(size.layout), grid_positions(size.sensed, 40), profile)
-    full_scale = stretch.max(axis=0) / straight_full_scale(size.layout, profile, "beyond")
-    assert (weights * full_scale)[[0, 2, 3, 8, 14]] == pytest.approx(np.ones(5), rel=0.05)
-    assert kernel_weights(PadSettings(grid=4).layout) == pytest.approx(np.ones(8))
-
-
-def test_bound_in_single_precision_does_not_overflow_under_faint_noise():
-    responses = np.repeat(2 * (PLACES @ [[1.0, 1.0], [1.0, 0.5]]).T, 8, axis=0).astype(np.float32)
-    expected = REGRESSION_WEIGHT * leave_one_out_error(responses.astype(float))
-    assert error(responses, Scatter(1e-9)) == pytest.approx(expected, rel=1e-4)
-
-
 def test_window_presses_sample_the_remaining_pad_coarsely():
     """Without the presses in a keep-out."""
     size = PadSettings(grid=9)
@@ -211,8 +192,3 @@ def test_expected_error_counts_distant_presses_with_equal_responses():
     confused, apart = (expected_error(np.hstack([signals, far]), *given)[0][0] for far in (alike, other))
     assert apart == pytest.approx(error(signals), rel=0.2)
     assert confused > 5 * apart
-
-
-def test_averages_are_means_over_the_sets_of_each_size():
-    kept = np.array([[1.0, 1.0, 1.0], [0.0, 1.0, 1.0], [1.0, 1.0, 0.0]])
-    assert averages(kept, 3) @ [0.1, 0.2, 0.4] == pytest.approx([0.1, 0.3, 0.0])

@@ -155,14 +155,35 @@ def test_turns_and_end_slopes_and_their_gradients_are_those_of_torch(bent_radius
 
 
 @pytest.mark.parametrize("margin", [1.0, 1.2])
-def test_min_gap_penalty_of_a_narrow_grid_has_a_closed_form(margin):
-    """A sample nearer by the share c costs c + 10 c^2; in a row of four the outer two have one neighbour, not two."""
-    close = 1 - 11.25 / (15.0 * margin)
-    terms = found(Morphology.straight(4), only(min_gap_mm=15.0, same_family_crossings=0), margin)
+def test_penalties_of_plain_pads_have_closed_forms(margin):
+    # a sample nearer by the share c costs c + 10 c^2; in a row of four the outer two have one neighbour, not two
+    straight, close = Morphology.straight(4), 1 - 11.25 / (15.0 * margin)
+    terms = found(straight, only(min_gap_mm=15.0, same_family_crossings=0), margin)
     assert terms["min_gap_mm"] == pytest.approx((close + 10 * close**2) * 6 / 4)
     assert terms["same_family_crossings"] == pytest.approx(close + 10 * close**2)
-    passing = found(Morphology.straight(4), only(min_gap_mm=11.2 / margin, same_family_crossings=0), margin)
-    assert passing["min_gap_mm"] == passing["same_family_crossings"] == 0
+    # two fibres that swing by a slope of 1.5 cross at 33.7 degrees, and the other three pairs more steeply
+    shortfall = 1 - np.degrees(np.arctan(1 / 1.5)) / 50 / margin
+    terms = found(swung(), only(min_crossing_angle_deg=50.0), margin)
+    assert terms["min_crossing_angle_deg"] == pytest.approx(shortfall, rel=0.1)
+    # half the limit from where a straight horizontal crosses a fibre it is off by that times the sine; half-way between
+    # turning points a PCHIP is half as steep again
+    share = 1 - 0.8 / margin * np.sin(np.arctan(0.4 / 3.0)) / 0.4
+    expected = COMMON_WEIGHT * share * 1.6 / margin / 11.25 / 8 / 5  # by its share of the length of all fibres
+    assert found(slanting(2.0), only(max_common_track_mm=1.6), margin)["max_common_track_mm"] == pytest.approx(
+        expected, rel=0.05
+    )
+    # all fibres of the grid are 56.25 mm long; one alone counts by its share of the pad
+    assert found(straight, only(max_length_mm=45.0), margin)["max_length_mm"] == pytest.approx(1.25 * margin - 1)
+    pad = bent(3.0)
+    over = lengths(pad)[0] * pad.unit_mm / 57.0 - 1
+    assert found(pad, only(max_length_mm=57.0 * margin), margin)["max_length_mm"] == pytest.approx(over / 8, rel=0.02)
+
+
+def test_penalties_vanish_just_within_the_limits():
+    terms = found(Morphology.straight(4), only(min_gap_mm=11.2, same_family_crossings=0))
+    assert terms["min_gap_mm"] == terms["same_family_crossings"] == 0
+    assert found(swung(), only(min_crossing_angle_deg=30.0))["min_crossing_angle_deg"] == pytest.approx(0, abs=0.01)
+    assert found(slanting(2.0), only(max_common_track_mm=7.0))["max_common_track_mm"] == 0
 
 
 @given(st.integers(1, 8), st.integers(0, 10**6))
@@ -173,27 +194,6 @@ def test_no_bend_that_breaks_the_rule_clearly_goes_without_a_penalty(knots, seed
     pad = Morphology.random(size.layout, knots, seed=seed)
     if any(bend.measured < 0.93 * 2.0 for bend in check_rules(pad, rules)):
         assert penalties(*axes(pad), size, rules, 1.05).values["min_mean_bend_radius_mm"] > 0
-
-
-def test_min_crossing_angle_penalty_is_the_relative_shortfall():
-    """Two fibres that swing by a slope of 1.5 cross at 33.7 degrees, and the other three pairs more steeply."""
-    pad, rules = swung(), only(min_crossing_angle_deg=50.0)
-    for margin in (1.0, 1.2):
-        expected = 1 - np.degrees(np.arctan(1 / 1.5)) / 50 / margin
-        assert found(pad, rules, margin)["min_crossing_angle_deg"] == pytest.approx(expected, rel=0.1)
-    rules = only(min_crossing_angle_deg=30.0)
-    assert found(pad, rules)["min_crossing_angle_deg"] == pytest.approx(0, abs=0.01)
-
-
-def test_max_common_track_penalty_has_a_closed_form():
-    """The horizontal is straight: half the limit from where they cross it is off by that times the sine."""
-    pad, limit = slanting(2.0), only(max_common_track_mm=1.6)
-    sine = np.sin(np.arctan(0.4 / 3.0))  # half-way between turning points a PCHIP is half as steep again
-    for margin in (1.0, 1.2):
-        share = 1 - 0.8 / margin * sine / 0.4
-        expected = COMMON_WEIGHT * share * 1.6 / margin / 11.25 / 8 / 5  # by its share of the length of all fibres
-        assert found(pad, limit, margin)["max_common_track_mm"] == pytest.approx(expected, rel=0.05)
-    assert found(pad, only(max_common_track_mm=7.0))["max_common_track_mm"] == 0
 
 
 def test_same_family_crossings_penalty_counts_the_excess():
@@ -220,16 +220,6 @@ def test_max_crossings_penalty_counts_those_above_the_fewest_that_families_have(
         number = sum((c.first < 3) != (c.second < 3) for c in crossings(pad))
         assert number > 9
         assert 9 * (found(pad, only(max_crossings=9))["max_crossings"] + 1) == pytest.approx(number, rel=0.25)
-
-
-def test_max_length_penalty_is_the_relative_excess():
-    """All fibres of the grid are 56.25 mm long; one alone counts by its share of the pad."""
-    for margin in (1.0, 1.25):
-        penalty = found(Morphology.straight(4), only(max_length_mm=45.0), margin)["max_length_mm"]
-        assert penalty == pytest.approx(1.25 * margin - 1)
-    pad = bent(3.0)
-    over = lengths(pad)[0] * pad.unit_mm / 57.0 - 1
-    assert found(pad, only(max_length_mm=57.0))["max_length_mm"] == pytest.approx(over / 8, rel=0.02)
 
 
 @pytest.mark.parametrize("margin", [1.0, 1.5])

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 from scipy.interpolate import PchipInterpolator
 
-from padforge import Spec
 from padforge.design import Morphology, crossings
 from padforge.design.contact import fibre_axes
 from padforge.design.objectives.penalties import penalties
@@ -26,12 +25,6 @@ def test_check_rules_of_the_straight_grid_at_its_limits():
     ):
         assert check_rules(grid, only(**met)) == []
         assert len(check_rules(grid, only(**broken))) == count
-
-
-def test_rules_settings_write_no_limit_as_any():
-    for key in ("max_crossings", "max_common_track_mm"):
-        assert getattr(Spec({"rules": {key: "any"}}).section(RulesSettings), key) is None
-        assert RulesSettings.model_validate({key: None}).model_dump()[key] == "any"
 
 
 @pytest.mark.parametrize(("rise", "breaks"), [(0.145, False), (0.155, True)])

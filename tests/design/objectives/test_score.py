@@ -1,7 +1,5 @@
 """Scores of pads: every term by name, whatever the size of the pad."""
 
-import math
-
 import numpy as np
 import pytest
 
@@ -29,15 +27,6 @@ def test_score_evaluates_the_sensed_area(little_scored):
     layer = score(pad, max_failures=0)
     assert beyond["published_objective"] == published_terms(pad, disc)[0].objective != layer["published_objective"]
     assert layer["published_objective"] == published_terms(pad)[0].objective  # a layer has none of its own
-
-
-def test_score_joint_entropy_saturates_before_those_of_families(little_scored):
-    """49 presses give no more than log2 49 bits, and straight fibres have them."""
-    pad = Morphology.straight(4)
-    assert score(pad, max_failures=0)["published_joint_entropy"] == pytest.approx(math.log2(49))
-    assert published_terms(pad)[0].entropy < 9
-    one = score(Morphology.straight((1, 0)), max_failures=0)  # one family is all there is
-    assert one["published_joint_entropy"] == one["published_entropy"]
 
 
 def test_sharpness_has_a_closed_form():
@@ -89,15 +78,10 @@ def test_score_rules_and_plan_of_wild_pads_are_finite(kind, little_scored):
     assert np.isfinite([[finding.measured, finding.limit] for finding in findings]).all()
     draw_plan(pad, contact, findings).draw_without_rendering()
     assert pad.tiled(2).grid == 2 * pad.grid
-
-
-@pytest.mark.parametrize("kind", KINDS)
-def test_penalties_and_gradients_of_wild_pads_are_finite(kind):
-    pad = wild_pad(kind, 0)
-    for rules in RULES:
+    if pad.knots.shape[1] > 2:
         fibres = Parametrization.from_knots(pad.knots, pad.layout, 0.01)
         assert np.isfinite(fibres.knots()).all()
-        along, across = fibres.axes()
-        values, *gradient = penalties(along, across, PadSettings(grid=pad.grid, pitch_mm=pad.pitch_mm), rules)
+        size = PadSettings(grid=pad.grid, pitch_mm=pad.pitch_mm)
+        values, *gradient = penalties(*fibres.axes(), size, rules)
         assert all(np.isfinite(value) and value >= 0 for value in values.values())
         assert np.isfinite(gradient).all()

@@ -71,19 +71,10 @@ def test_gradients_by_free_variables_match_differences(knots, seed):
         assert (gradient * move).sum() == pytest.approx((values[0] - values[1]) / 2e-5, rel=1e-5, abs=1e-7)
 
 
-def test_steps_of_adam_are_those_of_kingma_and_ba():
-    """Algorithm 1 of their paper, with its constants; torch has the same."""
-    rng, mine = np.random.default_rng(3), np.array([0.3, -1.0, 2.0])
-    adam, theirs, mean, square = Adam([mine]), mine.copy(), np.zeros(3), np.zeros(3)
-    for number, rate in enumerate((0.1, 0.1, 0.03, 0.01), 1):
-        gradient = rng.standard_normal(3)
-        mean, square = 0.9 * mean + 0.1 * gradient, 0.999 * square + 0.001 * gradient**2
-        theirs -= rate * mean / (1 - 0.9**number) / (np.sqrt(square / (1 - 0.999**number)) + 1e-8)
-        adam.step((gradient,), rate)
-        assert mine == pytest.approx(theirs, rel=1e-12)
-    before = mine.copy()
-    Adam([mine]).step((np.array([np.nan, np.inf, -np.inf]),), 0.1)
-    assert np.array_equal(mine, before)
+def test_steps_of_adam_ignore_what_is_no_number():
+    variable = np.array([0.3, -1.0, 2.0])
+    Adam([variable]).step((np.array([np.nan, np.inf, -np.inf]),), 0.1)
+    assert variable.tolist() == [0.3, -1.0, 2.0]
 
 
 def test_initial_paths_from_an_origin_are_it_and_near_it():
@@ -207,13 +198,3 @@ def test_what_fine_steps_do_not_repair_firm_ones_do():
     assert check_rules(run.morphology(), RulesSettings()) != []
     advance(run, REPAIR_STEPS)
     assert check_rules(run.morphology(), RulesSettings()) == []
-
-
-def test_steps_are_by_the_contact_unless_they_are_stated():
-    for contact, others, steps, expected in (
-        (Contact(), (), None, 1200),
-        (Contact(), (PUBLISHED_CONTACT,), None, 3000),
-        (PUBLISHED_CONTACT, (), 7, 7),
-    ):
-        search = SearchSettings(steps=steps, contacts=others)
-        assert begun(search, FREE, contact=contact).problem.steps == expected

@@ -1,13 +1,10 @@
 """Searches that end before they are done, and that go on where they were broken off, also by process."""
 
 import json
-import math
 import os
 import signal
-import subprocess
 import sys
 import threading
-import time
 from concurrent.futures import Executor, Future
 from dataclasses import replace
 
@@ -75,12 +72,6 @@ def test_search_out_of_time_returns_the_start_that_is_best_by_now(tmp_path):
             kept.save(start, state | {"history": np.array([[1, 0.5 - last], [2, last]])})
         result = search(PAD, None, settings, FREE, run=SearchOptions(keep_in=folder, resume=True, time_budget=1e-6))
         assert (result.stopped, result.candidate) == ("out of time", f"start {best + 1}")
-
-
-def test_little_of_a_time_budget_is_left_for_repair():
-    stop = stopping.Stop(10.0, 200.0)
-    assert 10.0 + 0.75 * 200.0 <= stop.deadline < stop.end == 210.0
-    assert stopping.Stop(10.0, None).deadline == math.inf
 
 
 class Hung(Executor):
@@ -179,29 +170,6 @@ def design_here(folder, monkeypatch, *arguments):
     monkeypatch.chdir(folder)
     monkeypatch.setattr(sys, "argv", ["padforge", "design", "--out", "pad", *arguments])
     return run_to_end(cli, "padforge", {})
-
-
-@pytest.mark.slow
-@POSIX
-def test_killed_design_resumes_to_the_same_file(tmp_path, monkeypatch):
-    """A kill leaves the states alone, from which the command goes on as if unbroken."""
-    unbroken, broken = tmp_path / "unbroken", tmp_path / "broken"
-    unbroken.mkdir()
-    broken.mkdir()
-    assert design_here(unbroken, monkeypatch) == 0
-    (broken / "pad.toml").write_text(SETTINGS)
-    process = subprocess.Popen([sys.executable, "-m", "padforge", "design", "--out", "pad"], cwd=broken)
-    pad = broken / "pad"
-    while not list((pad / "search").glob("start_*.npz")):
-        assert process.poll() is None
-        time.sleep(0.01)
-    process.kill()
-    process.communicate(timeout=300)
-    assert not (pad / "morphology.json").exists()
-    assert design_here(broken, monkeypatch, "--resume") == 0
-    for name in ("morphology.json", "design.svg"):
-        assert (pad / name).read_bytes() == (unbroken / "pad" / name).read_bytes()
-    assert not (pad / "search").exists()
 
 
 def test_interrupted_design_says_so_and_keeps_its_states(tmp_path, monkeypatch, capsys):

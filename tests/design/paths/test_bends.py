@@ -5,18 +5,14 @@ import pytest
 import shapely
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.interpolate import PchipInterpolator
 
 from padforge.design import Morphology, flatten
 from padforge.design.paths.curves import (
     FOLD,
     UNFOLDED,
     bend_radius,
-    beziers,
     common_stretches,
     fold_gap,
-    slope_beziers,
-    trace_curve,
 )
 from tests.design.wild_pads import SEEDS
 
@@ -25,20 +21,6 @@ AXES = np.array([[1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
 
 def arc_of(points):
     return np.append(0, np.linalg.norm(np.diff(points, axis=0), axis=1).cumsum())
-
-
-def traced(pad, fibre, step=2.5e-3):
-    return trace_curve(beziers(pad)[fibre], slope_beziers(pad)[fibre], step)
-
-
-def dense(pad, fibre, per_span=2000):
-    """Points and headings by SciPy, dense at the ends of spans, where steep ones turn."""
-    axis = 0 if fibre < pad.grid else 1
-    t, v = pad.knots[fibre, :, axis], pad.knots[fibre, :, 1 - axis]
-    u = np.sin(np.linspace(0, np.pi / 2, per_span)) ** 2
-    at = np.append((t[:-1, None] + np.diff(t)[:, None] * u[:-1]).ravel(), t[-1])
-    curve = PchipInterpolator(t, v)
-    return np.column_stack([at, curve(at)]), np.arctan(curve.derivative()(at))
 
 
 @given(st.lists(st.tuples(st.integers(1, 5), st.integers(0, 2)), min_size=1, max_size=20), st.integers(1, 12))
@@ -54,19 +36,6 @@ def test_bend_radius_includes_corners_at_window_ends(steps, quarters):
     turns = np.abs(np.diff(headings[::2]))
     most = max(turns[(arc[1:-1] >= start) & (arc[1:-1] <= start + window)].sum() for start in [*arc, *(arc - window)])
     assert bend_radius(points, headings, quarters / 4)[0] == pytest.approx(window / most if most else np.inf)
-
-
-@given(SEEDS, st.integers(1, 20), st.sampled_from([0.05, 0.3, 2.0]))
-@settings(max_examples=6)
-def test_bend_radius_matches_exhaustive_windows(seed, knots, window):
-    pad = Morphology.random(2, knots, seed)
-    points, headings = dense(pad, fibre=1)
-    arc = arc_of(points)
-    turned = np.append(0, np.abs(np.diff(headings)).cumsum())
-    starts = np.concatenate([np.linspace(0, arc[-1] - window, 20_000), arc])
-    most = (np.interp(starts + window, arc, turned) - np.interp(starts, arc, turned)).max()
-    found = window / bend_radius(*traced(pad, fibre=1, step=2.5e-3), window)[0]
-    assert found == pytest.approx(most, abs=1e-3)
 
 
 def folds_tried(line, gap, step):

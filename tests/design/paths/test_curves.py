@@ -61,17 +61,6 @@ def test_flatten_keeps_the_tolerance(pad, tolerance):
         assert np.linalg.norm(fine - a - along[:, None] * way, axis=1).max() <= tolerance * 1.02
 
 
-@given(pads)
-@settings(max_examples=12)
-def test_crossing_angles_match_scipy_tangents(pad):
-    across = [c for c in crossings(pad) if c.first < pad.grid <= c.second]
-    slope = [scipy_curve(pad, fibre).derivative() for fibre in range(2 * pad.grid)]
-    for c, angle in zip(across, crossing_angles(pad, across), strict=True):
-        rise, run = slope[c.first](c.position[0]), slope[c.second](c.position[1])
-        between = np.degrees(np.arctan(rise) + np.arctan(run) - np.pi / 2) % 180
-        assert angle == pytest.approx(min(between, 180 - between), abs=1e-6)
-
-
 def test_common_stretches_of_one_line_with_two_others_stay_two() -> None:
     """One runs beside its end and the other beside its beginning, 0.5 from it: near within sqrt(1 - 0.25)."""
     line, beside = np.array([[0.0, 0.0], [10.0, 0.0]]), np.sqrt(0.75)

@@ -44,15 +44,6 @@ def test_keep_out_penalty_vanishes_with_clearance_and_has_its_gradient():
     assert (ahead - behind) / 2 == pytest.approx((penalty(pad, size).grad_across * step).sum(), rel=1e-3)
 
 
-def test_straight_paths_pass_keep_outs_within_the_rules():
-    size, rules = kept_off(square(2.0, 1.0, 10.0)), RulesSettings()
-    assert check_rules(Morphology.straight(size.layout), rules, size)
-    pad = Morphology.from_layout(straight_paths(size, rules, 21), size.layout)
-    assert check_rules(pad, rules, size) == []
-    away = np.abs(pad.knots[:3, :, 1] - size.layout.levels[:3, None]).max(axis=1)
-    assert (away[1] > 0.3, away[0] == 0) == (True, True)
-
-
 @given(st.integers(0, 99), st.floats(-8, 8), st.floats(-8, 8), st.sampled_from([6.0, 25.0]))
 @settings(max_examples=12)
 def test_pass_keep_outs_keeps_the_order_of_fibres(seed, x, y, side):

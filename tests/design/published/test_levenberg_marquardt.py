@@ -122,11 +122,3 @@ def test_initial_weights_follow_nguyen_and_widrow():
     np.testing.assert_allclose(np.abs(weights[:, -1]), np.abs(length * np.linspace(-1, 1, 16)))
     assert 0 < (weights[:, -1] * np.linspace(-1, 1, 16) < 0).sum() < 16
     assert np.ptp(np.sign(weights[:, 0])) == 2
-
-
-def test_fit_batch_with_fewer_samples_than_weights():
-    """By the dual equations, whose steps are those of the others."""
-    rng = np.random.default_rng(0)
-    samples, fresh = rng.uniform(-1, 1, (2, 60, 2))
-    network = fit(samples, waves(samples)[:, :1], rng, epochs=200, validation=(fresh, waves(fresh)[:, :1]))
-    assert rms(network(fresh) - waves(fresh)[:, :1]) < 0.05
