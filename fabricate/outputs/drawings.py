@@ -29,6 +29,7 @@ ORIENTATION_LINK = f"![{ORIENTATION_CAPTION}]({ORIENTATION_FILE})"  # link to th
 CROSSING_FILE = "crossing.svg"
 CROSSING_CAPTION = "The two fibres that cross nearest to each other, in section: the pad lies turned over, to scale."
 CROSSING_LINK = f"![{CROSSING_CAPTION}]({CROSSING_FILE})"
+MIRRORED = "Its numbers are mirrored on purpose: on the casting they read the right way."
 _TURNED = (
     "The casting is turned over, left to right, and stays so: the face with the tracks and their numbers lies up, to be"
     " laid and then to be pressed; y runs as in the mould and x the other way (mirrored = true in [rig]); "

@@ -13,7 +13,7 @@ import numpy as np
 
 from padforge.design.settings import is_hole
 from padforge.fabricate.materials import PLASTICS, PRODUCTS, divider_ohm
-from padforge.fabricate.outputs.drawings import CROSSING_LINK, ORIENTATION_LINK, orientation_sentence
+from padforge.fabricate.outputs.drawings import CROSSING_LINK, MIRRORED, ORIENTATION_LINK, orientation_sentence
 from padforge.fabricate.plan import Plan, fibre_layers, fibre_name, overlap
 from padforge.fabricate.settings import MouldSettings, PrinterSettings
 
@@ -287,6 +287,8 @@ def _print_lines(document: Document) -> Iterator[str]:
     plastic, density = PLASTICS[printer.resin]
     yield f"- The mould is {size} mm and takes {volume_ml:.1f} ml, {volume_ml * density:.0f} g of {plastic} if solid."
     yield "- Print it as it lies, open side up, without supports."
+    if mould.number_mm:
+        yield f"- {MIRRORED}"
     if printer.resin:
         pixels = mould.ridge_width_mm / printer.nozzle_mm
         yield _RESIN_SETTINGS.format(

@@ -197,7 +197,8 @@ _PANELS = (
     ("2  Turned over, left to right", "tracks up, numbers read right: lay here"),
     ("3  In use", "tracks up: this face is pressed"),
 )
-_LABEL_MM = 2.6  # text height
+_NUMBER_MM = 3.6  # text height of the numbers of fibres, and minimum height of those that are cast
+_TEXT_MM = 2.7  # other text height
 _SLAB_MM = 6.0  # thickness of the pad in the side views, which are not to scale
 _TRACK_MM = 1.6  # size of a track there
 _WALL_MM = 2.0  # thickness of the mould's walls there
@@ -232,7 +233,7 @@ def draw_orientation(plan: Plan, path: Path) -> None:
         _draw_panel(picture, plan, panel)
         for row, (text, weight) in enumerate(((title, "bold"), (note, "normal"))):
             position = panel.x - _WIDTH_MM / 2 + 4, _HEIGHT_MM / 2 + 6 - 4 * row
-            picture.axes.text(*position, text, size=picture.points(_LABEL_MM), weight=weight)
+            picture.axes.text(*position, text, size=picture.points(_TEXT_MM), weight=weight)
     _draw_arm(picture, panels[2])
     _draw_sides(picture, plan, panels)
     picture.save(path, [])
@@ -250,14 +251,16 @@ def _draw_panel(picture: "_Picture", plan: Plan, panel: _Panel) -> None:
         for fibre in layer.fibres:
             line = plan.lines[fibre].simplify(0.05)
             axes.plot(*panel.project(line.coords).T, color=layer.colour, linewidth=1)
-    size = min(_LABEL_MM, 0.6 * plan.min_pitch_mm * panel.scale)
+    size = min(_NUMBER_MM, 0.6 * plan.min_pitch_mm * panel.scale)
+    cast_scale = max(1.0, size / (panel.scale * plan.settings.mould.number_mm)) if plan.numbers else 1.0
     edges = (plan.silicone if panel.mirrored else plan.tray).bounds
     for fibre, (lead, cast) in enumerate(zip(plan.ends(0), plan.numbers or repeat(None), strict=False)):
         colour = FAMILY_COLOURS[plan.family(fibre)]
-        for outer, *holes in polygon_rings(cast) if cast is not None else ():
-            axes.fill(*panel.project(outer).T, color=colour, gid="cast")
+        legible = cast and shapely.affinity.scale(cast, cast_scale, cast_scale)  # larger than it is cast
+        for outer, *holes in polygon_rings(legible) if legible else ():
+            axes.fill(*panel.project(outer).T, color=colour, linewidth=0, gid="cast", zorder=3)
             for hole in holes:
-                axes.fill(*panel.project(hole).T, color=PAPER)
+                axes.fill(*panel.project(hole).T, color=PAPER, linewidth=0, zorder=3)
         start = lead.turned_mm.copy()
         start[lead.axis] = edges[lead.axis] - (1.2 + size / 2) / panel.scale  # outside the edge
         picture.write(str(fibre + 1), panel.project([start])[0], size, color=colour, weight="bold")
@@ -265,7 +268,7 @@ def _draw_panel(picture: "_Picture", plan: Plan, panel: _Panel) -> None:
     for axis, tip in zip("xy", np.eye(2) * length, strict=True):
         start, end, label = panel.project([0 * tip, tip, 1.2 * tip])
         picture.arrow(start, end)
-        picture.write(axis, label, _LABEL_MM)
+        picture.write(axis, label, _TEXT_MM)
 
 
 def _draw_arm(picture: "_Picture", panel: _Panel) -> None:
@@ -273,11 +276,11 @@ def _draw_arm(picture: "_Picture", panel: _Panel) -> None:
     corner = np.array([panel.x - _WIDTH_MM / 2 + 4, 2 - _HEIGHT_MM / 2])
     for axis, tip in zip("xy", 9.0 * np.eye(2), strict=True):
         picture.arrow(corner, corner + tip)
-        picture.write(axis, corner + 1.2 * tip, _LABEL_MM)
-    picture.write("arm", corner + np.array([4.5, 2.5]), _LABEL_MM)
+        picture.write(axis, corner + 1.2 * tip, _TEXT_MM)
+    picture.write("arm", corner + np.array([4.5, 2.5]), _TEXT_MM)
     top = 1.25 * _HALF_MM
     picture.axes.plot([panel.x] * 2, [0, top], ":", color=INK, linewidth=0.8)
-    picture.write("pad_angle_deg", (panel.x + 10, top), _LABEL_MM)
+    picture.write("pad_angle_deg", (panel.x + 10, top), _TEXT_MM)
 
 
 def _draw_sides(picture: "_Picture", plan: Plan, panels: Sequence[_Panel]) -> None:
@@ -291,7 +294,7 @@ def _draw_sides(picture: "_Picture", plan: Plan, panels: Sequence[_Panel]) -> No
         picture.axes.fill(*np.transpose(corners), facecolor=colour, edgecolor=_EDGE, linewidth=0.5)
 
     box(panels[0].x - half - _WALL_MM, floor, 2 * (half + _WALL_MM), top - floor, FAINT)
-    size = min(_LABEL_MM, 0.6 * plan.min_pitch_mm * panels[0].scale)
+    size = min(_NUMBER_MM, 0.6 * plan.min_pitch_mm * panels[0].scale)
     starts = [(fibre, lead.turned_mm[0]) for fibre, lead in enumerate(plan.ends(0)) if lead.axis == 1]
     for panel, y, colour in zip(panels, (bottom, *[top - _TRACK_MM] * 2), (FAINT, "white", ""), strict=True):
         box(panel.x - half, bottom, 2 * half, _SLAB_MM, PAPER)

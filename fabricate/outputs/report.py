@@ -28,6 +28,7 @@ from padforge.fabricate.outputs.drawings import (
     CROSSING_CAPTION,
     CROSSING_FILE,
     CROSSING_LINK,
+    MIRRORED,
     ORIENTATION_CAPTION,
     ORIENTATION_FILE,
     ORIENTATION_LINK,
@@ -180,9 +181,11 @@ def _mould_section(folder: Path, names: Collection[str], document: Mapping[str, 
     passed = [finding for finding in findings if finding["status"] == "pass"]
     remarks = sorted((f for f in findings if f["status"] != "pass"), key=lambda finding: finding["status"])
     large = f"{solid.name} is too large to be turned on this page, also if simplified; the pictures show it."
+    mirrored = f" {MIRRORED}" if document["settings"]["mould"]["number_mm"] else ""
     captions = {
-        "mould.png": f"The mould from above, {size} mm: colour stands for family and height.",
-        "tracks.png": "The fibres as they lie in the mould; the deeper one interrupts the other.",
+        "mould.png": f"The mould from above, {size} mm: colour stands for family and height.{mirrored}",
+        "tracks.png": "The fibres in the tray of the mould, from above, with numbers at their starts; where two cross,"
+        " the line of the deeper one is whole.",
         "toolpath.svg": "The toolpath of a needle that lays the fibres, the pad turned over.",
     }
     return PageSection(
