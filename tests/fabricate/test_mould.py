@@ -14,13 +14,13 @@ from padforge.fabricate.mould import (
     Body,
     Prism,
     bed_frame,
-    conductive_body,
     conductive_plan,
     holder_body,
     lid_body,
     mould_body,
     registration_pins,
     sizes,
+    well_outlines,
 )
 from padforge.fabricate.plan import Plan
 from padforge.fabricate.settings import WELL_MM
@@ -164,13 +164,14 @@ def test_lid_has_holes_for_pins_vents_and_spout():
 def test_tapered_moulds_with_wells_are_closed(tapered, knots, layer_mm):
     tapers = with_settings({"ridge_draft_deg": tapered, "pins": True}, printer={"layer_mm": layer_mm})
     plan = Plan(Morphology.random(1, knots, seed=3), tapers)
-    for body in (mould_body(plan), conductive_body(conductive_plan(plan))):
+    wells = conductive_plan(plan)
+    for body in (mould_body(plan), mould_body(wells, well_outlines(wells))):
         assert_one_closed_body(as_read(body))
 
 
 def test_conductive_mould_has_a_well_at_every_ridge_end():
     plan = conductive_plan(Plan(Morphology.straight(2, pitch_mm=15.0), with_settings({"number_mm": 0.0})))
-    read = as_read(conductive_body(plan))
+    read = as_read(mould_body(plan, well_outlines(plan)))
     assert_one_closed_body(read)
     edge = 1.5 * 15
     for x in (-edge - 2.5, edge + 2.5):

@@ -39,7 +39,7 @@ def test_tray_has_the_width_and_height_of_the_pad():
     assert sizes(plan)["pad_mm"] == [56.0, 60.0]
     left, low, right, high = plan.tray.bounds
     assert (right - left) - (high - low) == pytest.approx(56 - 60)
-    starts = np.array([lead.point_past_edge(0) for lead in plan.ends(0)])
+    starts = np.array([lead.point_past_edge(0) for lead, _ in plan.leads.pairs])
     assert starts[:3] == pytest.approx(np.array([[-28.0, y] for y in (-15.0, 0.0, 15.0)]))
     assert starts[3:] == pytest.approx(np.array([[x, -30.0] for x in (-20.0, -12.0, -4.0, 4.0, 12.0, 20.0)]))
 
