@@ -103,15 +103,9 @@ def write_stl(path: Path, vertices: np.ndarray, triangles: np.ndarray) -> None:
 
 
 def write_3mf(path: Path, vertices: np.ndarray, triangles: np.ndarray, *, name: str, title: str, material: str) -> None:
-    """Write a 3MF, mm, of one object.
+    """Write a 3MF, mm, of one object: vertices (n, 3), with the precision of an STL, and triangles (m, 3).
 
-    Args:
-        path: file to write.
-        vertices: vertices (n, 3), written with the precision of an STL.
-        triangles: vertex indices (m, 3).
-        name: name of the body, of `BODY_COLOURS`, which states its colour.
-        title: title for people.
-        material: name of the material.
+    `name` is that of the body, of `BODY_COLOURS`, which states its colour; `title` is for people.
     """
     points = "".join(f'<vertex x="{x:.9g}" y="{y:.9g}" z="{z:.9g}"/>' for x, y, z in vertices.tolist())
     faces = "".join(f'<triangle v1="{a}" v2="{b}" v3="{c}"/>' for a, b, c in triangles.tolist())
@@ -141,11 +135,7 @@ def write_3mf(path: Path, vertices: np.ndarray, triangles: np.ndarray, *, name: 
 
 
 def read_mesh(path: Path) -> tuple[Array, Numbers]:
-    """Read vertices (n, 3), mm, and triangles (m, 3), m > 0, of a .stl, in mm, or of all printed objects of a .3mf.
-
-    Raises:
-        InputError: the file is missing, or not a mesh with triangles.
-    """
+    """Read vertices (n, 3), mm, and triangles (m, 3), m > 0, of a .stl, in mm, or of all printed objects of a .3mf."""
     path = check_file(check_path("path", path))
     vertices, triangles = _read_by_trimesh(path)
     if not len(triangles) or triangles.min() < 0 or triangles.max() >= len(vertices):

@@ -85,17 +85,11 @@ _INTO_TERRACE_MM = 0.005  # overlap of a terrace with the one below, so that no 
 
 @dataclass(frozen=True)
 class CadPart:
-    """A part of a printed body.
+    """A part of a printed body."""
 
-    Attributes:
-        shape: named and coloured; a solid, or an assembly of solids.
-        deviation: maximum relative deviation of a solid's volume from that of its prisms as a mesh.
-        fit_mm: tolerance of curves against outlines that are drawn within `FINE_MM`; 0 without curves.
-    """
-
-    shape: Solid | Compound
-    deviation: float
-    fit_mm: float = 0.0
+    shape: Solid | Compound  # named and coloured; a solid, or an assembly of solids
+    deviation: float  # maximum relative deviation of a solid's volume from that of its prisms as a mesh
+    fit_mm: float = 0.0  # tolerance of curves against outlines that are drawn within `FINE_MM`; 0 without curves
 
 
 def build_mould(pad: Morphology, settings: FabricationSettings = DEFAULTS, *, fused: bool = False) -> Compound | Solid:
@@ -120,11 +114,7 @@ def build_mould(pad: Morphology, settings: FabricationSettings = DEFAULTS, *, fu
 
 
 def mould_parts(plan: Plan, name: str) -> list[CadPart]:
-    """Build the parts of a mould from its shrinkage-compensated plan; it has wells if `name` is "conductive".
-
-    Raises:
-        InputError: the CAD kernel finds a solid invalid at every tolerance.
-    """
+    """Build the parts of a mould from its shrinkage-compensated plan; it has wells if `name` is "conductive"."""
     parts = [_build_part("tray", BODY_COLOURS["mould"], tray_body(plan), name)]
     parts += [_ridge_part(plan, fibre, name) for fibre in range(plan.pad.layout.fibres)]
     numbers = [
@@ -145,9 +135,8 @@ def _build_part(name: str, colour: str, body: Body, printed: str) -> CadPart:
         raise InputError(f"{printed}: the CAD kernel finds its {name} invalid; leave step out of the formats")
     deviation = abs(solid.volume / build_mesh(body).volume() - 1)
     if not deviation <= MAX_BODY_DEVIATION:  # NaN fails as well
-        error = f"volume {100 * deviation:.3g} % off"
-        message = f"{printed}: the CAD solid of its {name} does not match its mesh ({error}); nothing was written"
-        raise InputError(message)
+        error = f"does not match its mesh (volume {100 * deviation:.3g} % off); nothing was written"
+        raise InputError(f"{printed}: the CAD solid of its {name} {error}")
     return CadPart(_label(solid, name, colour), deviation)
 
 
@@ -232,11 +221,7 @@ def _edge(curve: OutlineCurve, z: float) -> Edge:
 
 
 def build_parts(plan: Plan, bodies: Mapping[str, Body]) -> dict[str, list[CadPart]]:
-    """Build the parts of all printed bodies of a pad from the plan of the finished pad, in their order.
-
-    Raises:
-        InputError: the CAD kernel finds a solid invalid.
-    """
+    """Build the parts of all printed bodies of a pad from the plan of the finished pad, in their order."""
     built = {}
     for name, body in bodies.items():
         if name == "mould":
@@ -268,11 +253,7 @@ def assemble(bodies: Mapping[str, Sequence[CadPart]], plan: Plan) -> Compound:
 
 
 def fuse(parts: Sequence[CadPart], name: str) -> Solid:
-    """Unite the parts of a body into one solid, in a process that is killed after `FUSE_S`.
-
-    Raises:
-        InputError: the kernel does not make one valid solid within `FUSE_S`.
-    """
+    """Unite the parts of a body into one solid, in a process that is killed after `FUSE_S`."""
     with TemporaryDirectory() as folder:
         solids = [solid for part in parts for solid in part.shape.solids()]
         paths = [Path(folder) / f"{k}.brep" for k in range(len(solids))]

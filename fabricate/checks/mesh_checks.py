@@ -48,7 +48,7 @@ _MAX_SHELLS = 100  # shells that are classified as bodies or hollows; more are d
 def check_mesh(
     path: Path, printer: PrinterSettings = DEFAULTS.printer, min_silicone_mm: float = 0.4, genus: int | None = None
 ) -> list[Finding]:
-    """Run all checks on a mesh file of any origin.
+    """Run all checks on a mesh file of any origin, which stands as it is printed, open side up.
 
     Args:
         path: STL or 3MF file.
@@ -57,7 +57,9 @@ def check_mesh(
         genus: required number of through holes; None if unknown.
 
     Returns:
-        The findings of `check_triangles`.
+        `SOLID_CHECKS` and bed; for a solid that can be cut wall_thickness, floor_thickness, overhang, undercut,
+        self_intersection, ridge_width, silicone_wall and tight. If the mesh is too small to be in mm, only unit; if a
+        mould faces the wrong way, pose in place of the checks that need its orientation.
 
     Raises:
         InputError: the file cannot be read, or an argument is out of range.
@@ -73,21 +75,10 @@ def check_triangles(
     genus: int | None = None,
     has_plan: bool = False,
 ) -> list[Finding]:
-    """Run all checks on a mesh that stands as it is printed, open side up.
+    """Run all checks of `check_mesh` on vertices (n, 3), mm, and triangles (m, 3), counter-clockwise from outside.
 
-    Args:
-        vertices: vertices (n, 3), mm; equal ones are merged.
-        triangles: vertex indices (m, 3), counter-clockwise seen from outside.
-        printer: see `check_mesh`.
-        min_silicone_mm: see `check_mesh`.
-        genus: see `check_mesh`.
-        has_plan: whether the mesh was built from a plan, which is checked for widths faster and exactly, and by
-            manifold3d, which builds no surface that intersects itself.
-
-    Returns:
-        `SOLID_CHECKS` and bed; for a solid that can be cut wall_thickness, floor_thickness, overhang and undercut, and
-        without a plan self_intersection, ridge_width, silicone_wall and tight. If the mesh is too small to be in mm,
-        only unit; if a mould faces the wrong way, pose in place of the checks that need its orientation.
+    A mesh that `has_plan` was built from a plan, which is checked for widths faster and exactly, and by manifold3d,
+    which builds no surface that intersects itself.
     """
     check_type("printer", printer, PrinterSettings)
     min_silicone_mm = check_float("min_silicone_mm", min_silicone_mm, 0, 10)
@@ -283,11 +274,9 @@ def _silicone_area(slab: Slab, cast: Sequence[Slab], limit: float) -> BaseGeomet
 
 
 def _find_narrowest(sections: Sequence[tuple[BaseGeometry, BaseGeometry | None]], limit: float) -> tuple[float, Array]:
-    """Return the minimum width of areas, at most `limit`, and the positions of all narrow parts.
+    """Return the minimum width of areas, at most `limit`, and the positions of all parts below it.
 
-    Args:
-        sections: pairs of an area and of an area to which its narrow parts are clipped, or None.
-        limit: width below which parts are narrow, mm.
+    `sections` are pairs of an area and of an area to which its narrow parts are clipped, or None.
     """
     parts, widths = zip(*(find_narrow_parts(area, limit, within) for area, within in sections), strict=True)
     merged = shapely.get_parts(shapely.union_all(np.concatenate(parts)))  # some lie in several slabs

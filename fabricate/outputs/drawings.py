@@ -74,30 +74,21 @@ class _Label(NamedTuple):
 
 
 class _TrackSheet:
-    """Layout of the drawing of the tracks, mm, y upwards.
-
-    Attributes:
-        text_mm: text height.
-        sentence: sentence on the orientation.
-        spans: Bezier control points of every fibre and its leads; shape (n, 4, 2).
-        ends: start and end of every fibre at the silicone's edge; shape (F, 2, 2).
-        numbers: the fibres' numbers outside the silicone, at the starts; with leads to one side, at both ends.
-        scale_bar: segments of the scale bar; shape (4, 2, 2).
-        notes: lines of text beside the scale bar and below it.
-        frame: x_min, y_min, x_max and y_max of the drawing.
-    """
+    """Layout of the drawing of the tracks, mm, y upwards."""
 
     def __init__(self, plan: Plan) -> None:
         layout, pairs = plan.pad.layout, plan.leads.pairs
         x_min, y_min, x_max, y_max = plan.silicone.bounds
         self.text_mm = min(_TEXT_MM, 0.6 * plan.min_pitch_mm)
         self.sentence = orientation_sentence(layout.counts, plan.settings.pad.leads)
+        # Bezier control points of every fibre and its leads, each (n, 4, 2)
         self.spans = [
             np.concatenate([start.spans[::-1, ::-1], plan.pad.to_mm(curve), end.spans])
             for (start, end), curve in zip(pairs, beziers(plan.pad), strict=True)
         ]
         self.ends = np.array([[lead.point_past_edge(plan.settings.mould.exit_mm) for lead in pair] for pair in pairs])
 
+        # Outside the silicone, at the starts; with leads to one side, at both ends
         self.numbers: list[_Label] = []
         for ends in self.ends.swapaxes(0, 1)[: 1 + (plan.settings.pad.leads == "one side")].tolist():
             for fibre, (x, y) in enumerate(ends):

@@ -71,11 +71,7 @@ class FiniteRange(click.FloatRange):
 def setting_option(name: str, section: str, kind: Any, text: str) -> Callable[..., Any]:
     """Return an option that overrides the setting of its name and is checked when the command line is parsed.
 
-    Args:
-        name: name of the option, such as `--knots`.
-        section: model of the setting, as `module:class`; it is imported when the option is used.
-        kind: type of the value for click.
-        text: help text.
+    `section` is the model of the setting, as `module:class`, which is imported when the option is used.
     """
 
     def check(context: click.Context, param: click.Parameter, value: Any) -> Any:
@@ -97,13 +93,7 @@ class SectionedGroup(click.Group):
         super().__init__(*arguments, **options)
 
     def add_command(self, cmd: click.Command, name: str | None = None, heading: str = "Commands") -> None:
-        """Add a command.
-
-        Args:
-            cmd: the command.
-            name: name in this group; that of the command if None.
-            heading: heading in the help.
-        """
+        """Add a command under a heading of the help."""
         super().add_command(cmd, name)
         self._headings[name or cmd.name or ""] = heading
 
@@ -222,15 +212,9 @@ INTERRUPTED = 130  # exit code after Ctrl-C, as in shells
 
 
 def run_to_end(command: click.Command, name: str, extras: Mapping[str, str]) -> int:
-    """Run a command line with the arguments of this process; print an error as one line on stderr.
+    """Run a command line with the arguments of this process; errors are one line on stderr; return the exit code.
 
-    Args:
-        command: command or group.
-        name: name of the program.
-        extras: optional dependencies of its subcommands, by name; other subcommands need all of these.
-
-    Returns:
-        The exit code.
+    `extras` are the optional dependencies of its subcommands, by name; other subcommands need all of these.
     """
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, TextIOWrapper):

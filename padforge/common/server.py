@@ -48,16 +48,10 @@ class ConnectionServer(socketserver.ThreadingTCPServer):
     def __init__(
         self, address: tuple[str, int], handler: type[socketserver.BaseRequestHandler], token: str, option: str
     ) -> None:
-        """Bind the port.
+        """Bind the port of an address, 0 for any free one.
 
-        Args:
-            address: host and port, 0 for any free one.
-            handler: handler of requests.
-            token: token of clients; required if other machines can connect.
-            option: option of the command line that sets the port, for messages.
-
-        Raises:
-            InputError: the address cannot be used, or the token is missing or too short.
+        Clients need the `token`, which is required if other machines can connect. `option` is that of the command line
+        that sets the port, for messages.
         """
         host, port = address
         if token and not (len(token) >= MIN_TOKEN and token.isascii() and token.isprintable()):
@@ -146,15 +140,10 @@ class LocalPage(ConnectionServer):
         host: str = HOST,
         token: str = "",
     ) -> None:
-        """Bind the port.
+        """Bind the port, 0 for any free one.
 
-        Args:
-            port: port, 0 for any free one.
-            page: page with one <script> and one <style>, see `page_text`.
-            handlers: handlers of posts by address; called from several threads.
-            max_post_bytes: maximum size of a post.
-            host: address.
-            token: see `ConnectionServer`.
+        The page has one <script> and one <style>, see `page_text`. Handlers of posts, by address, are called from
+        several threads.
         """
         self.page, self.handlers, self.max_post_bytes = page.encode(), handlers, max_post_bytes
         self.policy = "default-src 'none'; connect-src 'self'; img-src data:; base-uri 'none'; form-action 'none'"

@@ -246,9 +246,6 @@ def settings_schema(models: Mapping[str, type[Settings]]) -> dict[str, Any]:
     """Return the JSON Schema of a `pad.toml`, with which editors complete and check it.
 
     It uses draft 7, the latest one that editors for TOML support. It has no rules on several keys.
-
-    Args:
-        models: models of the sections, by name.
     """
     from pydantic.json_schema import models_json_schema  # slow to import, and needed by one command only
 

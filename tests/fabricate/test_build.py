@@ -240,7 +240,7 @@ def test_interrupted_build_keeps_the_old_mould(tmp_path, monkeypatch):
     def stopped(*_):
         raise OSError(errno.ENOSPC, "full")
 
-    monkeypatch.setattr(export, "write_json", stopped)
+    monkeypatch.setattr(export.files, "write_json", stopped)
     with pytest.raises(InputError):
         build(Morphology.straight(2), tmp_path, ["stl", "svg"])
     assert contents(tmp_path) == before
