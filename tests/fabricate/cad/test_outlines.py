@@ -155,11 +155,6 @@ def test_track_outlines_are_half_a_width_from_exact_fibres(grid, knots, seed, mo
         assert count > 500
 
 
-def test_track_outlines_with_a_finer_fit_are_nearer():
-    plan = Plan(Morphology.random(1, 3, seed=6))
-    assert deviation(plan, 0, fit_mm=1e-4)[0] < 5e-4
-
-
 @pytest.mark.parametrize("far", [[19, 5], [10, 10, 10], [25]])
 def test_fit_spline_stays_near_sparse_vertices(far):
     """A bend of 3 mm radius, drawn finely, and a run out of it that hardly bends, of few vertices."""

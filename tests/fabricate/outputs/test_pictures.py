@@ -24,8 +24,6 @@ from tests.fabricate.planted import level_pad, with_settings
 from tests.helpers.less import small_pictures
 
 PLAN = Plan(level_pad(1.8, 1.2))
-SMALL = 200_000
-"""Bytes that a picture may have: it goes into git."""
 
 
 def make_finding(status, *positions: tuple[float, float], name: str = "wall") -> Finding:
@@ -105,16 +103,6 @@ def test_pictures_are_small_and_show_layers_and_marks(tmp_path, monkeypatch):
     assert not count_colour(pixels_of(tmp_path / "mesh.png"), ALARM)
 
 
-@pytest.mark.slow
-def test_pictures_of_a_dense_pad_are_small(tmp_path, published):
-    plan = Plan(Morphology.load(published / "20para.mat"))
-    findings = [make_finding("fail", *map(tuple, plan.clash_positions_mm.tolist()))]
-    draw_mould(plan, *mesh_of(plan), findings, tmp_path / "mould.png")
-    draw_tracks(plan, tmp_path / "tracks.png")
-    draw_findings(*mesh_of(plan), findings, tmp_path / "mesh.png")
-    assert all(path.stat().st_size < SMALL for path in tmp_path.iterdir())
-
-
 # Orientation
 
 POSES = {0: (False, 0.0), 1: (True, 0.0), 2: (True, TURN_DEG)}
@@ -156,12 +144,6 @@ def test_panels_match_frame_of_rig(tmp_path, figures):
                 assert texts[axis] / np.hypot(*texts[axis]) == pytest.approx(
                     np.array(frame.pose(unit, 0.0)[:2]), abs=0.01
                 )
-
-
-def test_side_views_number_fibres_as_panels(tmp_path, figures):
-    draw_orientation(Plan(Morphology.straight(4)), tmp_path / "orientation.svg")
-    views = [texts_in(figures[0], panel, -60, -36) for panel in POSES]
-    assert ["".join(sorted(view, key=lambda text: view[text][0])) for view in views] == ["5678", "8765", "8765"]
 
 
 def test_fibres_are_drawn_as_wide_as_they_are(tmp_path, figures):
