@@ -136,8 +136,21 @@ def write_3mf(path: Path, vertices: np.ndarray, triangles: np.ndarray, *, name: 
 
 def read_mesh(path: Path) -> tuple[Array, Numbers]:
     """Read vertices (n, 3), mm, and triangles (m, 3), m > 0, of a .stl, in mm, or of all printed objects of a .3mf."""
+    import trimesh
+
     path = check_file(check_path("path", path))
-    vertices, triangles = _read_by_trimesh(path)
+    kind = path.suffix[1:].lower()
+    logging.getLogger("trimesh").setLevel(logging.CRITICAL)  # its errors are raised as well
+    try:
+        with np.errstate(all="ignore"):
+            content = {"stl": _mended_stl, "3mf": _without_unprinted}.get(kind, Path.read_bytes)(path)
+            scene = trimesh.load_scene(BytesIO(content), file_type=kind, process=False)  # keeps triangles with NaN
+            mesh = (scene.convert_units("millimeters") if scene.units else scene).to_mesh()
+        vertices, triangles = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
+    except Exception as error:  # broken files can raise any exception
+        is_missing = isinstance(error, KeyError)
+        reason = f"{error} is missing in it" if is_missing else " ".join(str(error).split()) or type(error).__name__
+        raise InputError(f"{path}: not a mesh that can be read ({reason})") from error
     if not len(triangles) or triangles.min() < 0 or triangles.max() >= len(vertices):
         raise InputError(f"{path}: holds no triangles that can be read, or is torn")
     if not np.isfinite(vertices).all():
@@ -191,23 +204,3 @@ def _without_unprinted(path: Path) -> bytes:
     if count:
         _log.warning("%s: %d objects that are not printed are left out", path, count)
     return content.getvalue()
-
-
-def _read_by_trimesh(path: Path) -> tuple[Array, Numbers]:
-    """Read vertices and triangles of a file by trimesh."""
-    import trimesh
-
-    logging.getLogger("trimesh").setLevel(logging.CRITICAL)  # its errors are raised as well
-    try:
-        with np.errstate(all="ignore"):
-            kind = path.suffix[1:].lower()
-            content = {"stl": _mended_stl, "3mf": _without_unprinted}.get(kind, Path.read_bytes)(path)
-            scene = trimesh.load_scene(BytesIO(content), file_type=kind, process=False)  # keeps triangles with NaN
-            if scene.units:
-                scene = scene.convert_units("millimeters")
-            mesh = scene.to_mesh()
-        return np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
-    except Exception as error:  # broken files can raise any exception
-        is_missing = isinstance(error, KeyError)
-        reason = f"{error} is missing in it" if is_missing else " ".join(str(error).split()) or type(error).__name__
-        raise InputError(f"{path}: not a mesh that can be read ({reason})") from error

@@ -258,8 +258,8 @@ def _order_lines(document: Document) -> Iterator[str]:
     yield f"""
 The fibre includes {order["waste_percent"]:g} % for waste. The mould prints in about {order["print_h"]:.1f} h, by \
 rules of thumb; a slicer knows better. Laying and sealing by hand takes about {order["laying_h"]:.1f} h, an estimate \
-of {LAY_MIN_PER_M:g} minutes a metre and {LAY_MIN_PER_CROSSING:g} minutes a crossing, without the time in which silicone \
-and adhesive cure."""
+of {LAY_MIN_PER_M:g} minutes a metre and {LAY_MIN_PER_CROSSING:g} minutes a crossing, without the time in which \
+silicone and adhesive cure."""
 
 
 def _print_lines(document: Document) -> Iterator[str]:

@@ -104,7 +104,8 @@ class ConnectionServer(socketserver.ThreadingTCPServer):
         super().server_close()
         with self._lock:
             for connection in self._connections:
-                _cut_off(connection)
+                with suppress(OSError):  # sent data still arrive, and the thread that waits for it wakes up
+                    connection.shutdown(socket.SHUT_RDWR)
 
     def handle_error(self, request: Any, client_address: Any) -> None:
         """Report an error, unless it is that of a connection closed by its client."""
@@ -119,12 +120,6 @@ def is_this_machine(host: str, port: int) -> bool:
     """
     name, _, number = host.partition(":")
     return name in (HOST, "localhost") and (number or str(HTTP_PORT)) == str(port)
-
-
-def _cut_off(connection: socket.socket) -> None:
-    """Shut a connection down: sent data still arrive, and the thread that waits for the connection wakes up."""
-    with suppress(OSError):
-        connection.shutdown(socket.SHUT_RDWR)
 
 
 class LocalPage(ConnectionServer):

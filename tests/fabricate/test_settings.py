@@ -1,6 +1,7 @@
 """Settings and materials: defaults, what is refused in one line, and what a shrinking silicone makes of them."""
 
 import math
+from collections.abc import Callable
 from dataclasses import asdict
 from functools import partial
 
@@ -33,7 +34,13 @@ def test_defaults_survive_a_settings_file(tmp_path):
     assert FabricationSettings.from_spec(Spec.load(path)) == DEFAULTS
 
 
-OWN = {"name": "Sylgard 184", "density_g_per_ml": 1.03, "parts": [10, 1], "pot_life_min": 90, "cure_h": 48}
+OWN: dict[str, object] = {
+    "name": "Sylgard 184",
+    "density_g_per_ml": 1.03,
+    "parts": [10, 1],
+    "pot_life_min": 90,
+    "cure_h": 48,
+}
 
 
 KEYS: list[tuple[str, dict[str, object]]] = [
@@ -57,7 +64,7 @@ CONTRADICTIONS: list[tuple[float, dict[str, object]]] = [
 
 
 def test_refusals_of_settings(golden):
-    rows = {
+    rows: dict[str, Callable[[], object]] = {
         f"[{section}] {keys}": partial(FabricationSettings.from_spec, Spec({section: keys}, "pad.toml"))
         for section, keys in KEYS
     }

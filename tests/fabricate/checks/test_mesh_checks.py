@@ -32,8 +32,8 @@ from tests.fabricate.checks.trays import (
 )
 
 
-def cube(*sides: float, at: tuple[float, float, float] = (0, 0, 0)) -> Manifold:
-    return Manifold.cube(sides, True).translate(at)
+def cube(x: float, y: float, z: float, at: tuple[float, float, float] = (0, 0, 0)) -> Manifold:
+    return Manifold.cube((x, y, z), True).translate(at)
 
 
 def meshes(*parts: trimesh.Trimesh) -> trimesh.Trimesh:

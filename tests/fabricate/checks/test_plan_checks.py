@@ -1,11 +1,11 @@
 """What the checks of plans find on pads with a known shape or a known fault, by the title of each, as whole lines."""
 
-from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import ArrayLike
 
 from padforge.common.settings import Spec
 from padforge.design.morphology import Morphology
@@ -20,10 +20,10 @@ from tests.fabricate.planted import level_pad, with_settings
 STRAIGHT = Morphology.straight(2)
 
 
-def one_fibre(along: Sequence[float], across: Sequence[float], family: int = 0, pitch_mm: float = 10.0) -> Morphology:
+def one_fibre(along: ArrayLike, across: ArrayLike, family: int = 0, pitch_mm: float = 10.0) -> Morphology:
     """A pad of 1 x 1 whose fibre of a family runs through knots (grid units); the other one is straight."""
-    straight = np.stack([np.linspace(0, 2, len(along)), np.ones(len(along))], axis=1)
-    fibres = [np.stack([along, across], axis=1), straight]
+    knots = np.stack([along, across], axis=1)
+    fibres = [knots, np.stack([np.linspace(0, 2, len(knots)), np.ones(len(knots))], axis=1)]
     horizontal, vertical = fibres if family == 0 else fibres[::-1]
     return Morphology(np.stack([horizontal, vertical[:, ::-1]]), pitch_mm)
 
@@ -84,7 +84,7 @@ GENTLE = both((0, 1), (0.1, 1.01), (0.5, 1.1), (1.5, 0.9), (1.9, 0.99), (2, 1), 
 """Fibres whose bends are of some 13 mm."""
 TURNING = one_fibre([0, 0.95, 0.98, 1.04, 1.07, 2], [1, 1, 1.8, 0.2, 1, 1], pitch_mm=11.25)
 SHRINKING = {"silicone": {"shrinkage": 0.02}, "fibre": {"diameter_mm": 0.395}}
-ONE_SIDE = {"pad": {"leads": "one side"}}
+ONE_SIDE: dict[str, Any] = {"pad": {"leads": "one side"}}
 CASES: dict[str, tuple[Morphology, dict[str, Any]]] = {
     "straight": (STRAIGHT, {}),
     "layers of 0.16 mm": (STRAIGHT, {"printer": {"layer_mm": 0.16}}),
