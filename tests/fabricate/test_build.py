@@ -33,21 +33,9 @@ from tests.fabricate.planted import level_pad, with_settings
 from tests.helpers.less import small_pictures
 
 PAD = Morphology.random((1, 2), 2, seed=7, pitch_mm=(12.0, 10.0))
-FILES = {
-    *(f"{body}.{suffix}" for body in ("mould", "lid", "conductive", "holder") for suffix in ("stl", "3mf")),
-    "mould.step",
-    *(
-        "tracks.svg",
-        "tracks.dxf",
-        "mould.png",
-        "tracks.png",
-        "laying.md",
-        "orientation.svg",
-        "crossing.svg",
-        "fabrication.json",
-    ),
-    *("laying.gcode", "toolpath.svg"),
-}
+FILES = {f"{body}.{suffix}" for body in ("mould", "lid", "conductive", "holder") for suffix in ("stl", "3mf")}
+FILES |= {"mould.step", "mould.png", "tracks.svg", "tracks.dxf", "tracks.png", "laying.gcode", "toolpath.svg"}
+FILES |= {"fabrication.json", "laying.md", "orientation.svg", "crossing.svg"}
 SETTINGS = with_settings({"lid": True, "pins": True, "conductive": True, "holder": True})
 
 
@@ -239,15 +227,6 @@ def test_build_deletes_earlier_files_unless_they_were_changed(tmp_path, caplog):
         *(f"{tmp_path / name} {gone}" for name in ("mould.3mf", "tracks.svg")),
         f"{tmp_path / 'tracks.dxf'} is left from the mould before this one: it is not as it was written",
     ]
-
-
-def test_build_deletes_nothing_without_digests(tmp_path, caplog):
-    caplog.set_level(logging.INFO, "padforge")
-    (tmp_path / "fabrication.json").write_text('{"format": "padforge-fabrication/1", "sha256": ["mould.step"]}')
-    (tmp_path / "mould.step").write_text("somebody's own")
-    build(PAD, tmp_path, [])
-    assert not caplog.messages
-    assert (tmp_path / "mould.step").exists()
 
 
 def test_provenance_is_of_the_input_at_the_start(tmp_path, monkeypatch):

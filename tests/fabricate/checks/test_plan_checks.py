@@ -142,13 +142,26 @@ CASES: dict[str, tuple[Morphology, dict[str, Any]]] = {
 }
 
 
+EDGE_MM = 33.75 / 2 + 2 + 30
+"""From the middle of the straight pad to the ends of its leads."""
+DISPENSERS: dict[str, dict[str, Any]] = {
+    "needle of 0.5 mm, origin too near": {"dispenser": {"tip_mm": 0.5, "origin_mm": [20.0, 110.0]}},
+    "box without room": {"dispenser": {"origin_mm": [EDGE_MM, EDGE_MM]}},
+    "box 2 mm too short": {"dispenser": {"box_mm": [0.0, 220.0, 0.0, 110 + EDGE_MM - 2, -5.0, 9.0]}},
+    "box 0.4 mm too shallow": {"dispenser": {"box_mm": [0.0, 220.0, 0.0, 220.0, -0.5, 9.0]}},
+    "travel 1 mm too high": {"dispenser": {"travel_height_mm": 10.0, "box_mm": [0.0, 220.0, 0.0, 220.0, -5.0, 9.0]}},
+    "needle of 0.64 mm, tracks of 0.7 mm": {"dispenser": {"tip_mm": 0.64}, "mould": {"ridge_width_mm": 0.7}},
+}
+
+
 def test_findings_of_plans(golden):
     lines = []
     for title, (pad, settings) in CASES.items():
         findings = check_plan(Plan(pad, with_settings(**settings)))
         lines += [title, *finding_lines(findings, passed=title == "straight")]
-    machine = Plan(STRAIGHT, with_settings(dispenser={"tip_mm": 0.5, "origin_mm": [20.0, 110.0]}))
-    lines += ["placed by a machine", *finding_lines(check_toolpath(machine, plan_toolpath(machine, 0.3)), passed=True)]
+    for title, settings in DISPENSERS.items():
+        plan = Plan(STRAIGHT, with_settings(**settings))
+        lines += [title, *finding_lines(check_toolpath(plan, plan_toolpath(plan, 0.3)), passed=True)]
     golden("fabricate/findings_of_plans.txt", "\n".join(lines))
 
 

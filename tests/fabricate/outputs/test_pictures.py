@@ -1,12 +1,9 @@
-from pathlib import Path
-
 import numpy as np
 import pytest
 from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
-from PIL import Image
 
-from padforge.common.plotting import ALARM, FAINT, HORIZONTAL, PAPER, VERTICAL
+from padforge.common.plotting import FAINT, HORIZONTAL, PAPER, VERTICAL
 from padforge.design.morphology import Morphology
 from padforge.fabricate.checks import Finding
 from padforge.fabricate.mesh import mould_mesh
@@ -21,7 +18,6 @@ from padforge.fabricate.plan import Plan, fibre_layers
 from padforge.sense.rig.config import RobotFrame
 from padforge.sense.settings import RigSettings
 from tests.fabricate.planted import level_pad, with_settings
-from tests.helpers.less import small_pictures
 
 PLAN = Plan(level_pad(1.8, 1.2))
 
@@ -33,16 +29,6 @@ def make_finding(status, *positions: tuple[float, float], name: str = "wall") ->
 def mesh_of(plan: Plan) -> tuple[np.ndarray, np.ndarray]:
     mesh = mould_mesh(plan).to_mesh()
     return np.asarray(mesh.vert_properties, dtype=float), np.asarray(mesh.tri_verts, dtype=np.intp)
-
-
-def pixels_of(path: Path) -> np.ndarray:
-    with Image.open(path) as image:
-        return np.asarray(image.convert("RGB"), np.int16)
-
-
-def count_colour(picture: np.ndarray, colour: str) -> int:
-    """Return how many pixels have this colour, as nearly as a palette of 256 gives it."""
-    return int((np.abs(picture - np.array([*bytes.fromhex(colour[1:])])).max(axis=2) <= 10).sum())
 
 
 def faces_of(figure: Figure) -> tuple[np.ndarray, list[str]]:
@@ -90,17 +76,6 @@ def test_mesh_picture_has_upper_faces_on_top(tmp_path, figures):
     assert sum(bytes.fromhex(plate[1:])) < sum(bytes.fromhex(roof[1:]))  # the ramp darkens with height
     assert figures[0].axes[0].get_xlim() == (0, 10)
     assert [text.get_text() for text in figures[0].axes[1].texts] == ["0 mm", "10 mm above the lowest point"]
-
-
-def test_pictures_are_small_and_show_layers_and_marks(tmp_path, monkeypatch):
-    """By pixels, of a mesh that is closed, and of one that is invisible from above."""
-    small_pictures(monkeypatch, 300)
-    draw_mould(PLAN, *mesh_of(PLAN), [make_finding("fail", (0, 0))], tmp_path / "mould.png")
-    mould = pixels_of(tmp_path / "mould.png")
-    for colour in (*(layer.colour for layer in fibre_layers(PLAN)), PAPER, FAINT, ALARM):
-        assert count_colour(mould, colour) > 20
-    draw_findings([[100, 0, 3], [130, 0, 3], [130, 0, 3.0]], [[0, 1, 2]], [], tmp_path / "mesh.png")
-    assert not count_colour(pixels_of(tmp_path / "mesh.png"), ALARM)
 
 
 # Orientation
