@@ -32,7 +32,6 @@ SEPARATION_MM = 1e-4
 
 
 def build_mesh(body: Body) -> Manifold:
-    """Build the mesh of a body, mm."""
     solid = _unite(body.base)
     if body.cuts:
         solid -= _unite(body.cuts)

@@ -152,12 +152,10 @@ class Slab:
 
     @property
     def middle_mm(self) -> float:
-        """z of the cross section."""
         return (self.bottom_mm + self.top_mm) / 2
 
     @cached_property
     def cross_section(self) -> BaseGeometry:
-        """Cross section half way up the slab."""
         return cut_solid(self.solid, self.middle_mm)
 
     @cached_property

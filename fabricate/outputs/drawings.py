@@ -18,10 +18,7 @@ from padforge.fabricate.plan import FAMILIES, FAMILY_COLOURS, Plan, fibre_layers
 
 Bounds = tuple[float, float, float, float]
 
-_NAMESPACES = {
-    "xmlns": "http://www.w3.org/2000/svg",
-    "xmlns:inkscape": "http://www.inkscape.org/namespaces/inkscape",
-}
+_NAMESPACES = {"xmlns": "http://www.w3.org/2000/svg", "xmlns:inkscape": "http://www.inkscape.org/namespaces/inkscape"}
 _NOTE = "#555555"  # colour of notes
 ORIENTATION_FILE = "orientation.svg"
 ORIENTATION_CAPTION = "The pad in its mould, turned over, and in use, from above and from the near side."

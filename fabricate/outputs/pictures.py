@@ -396,7 +396,6 @@ class _Picture:
         self.axes.spines[:].set_color(_EDGE)
 
     def points(self, length_mm: float) -> float:
-        """Convert a length to typographic points."""
         x_min, x_max, *_ = self.extent
         return length_mm * self.pixels[0] / (x_max - x_min) * 72 / _DPI
 
@@ -425,7 +424,6 @@ class _Picture:
         return handles
 
     def write(self, text: str, position: Sequence[float] | Array, height_mm: float, **style: Any) -> None:
-        """Write a text centred at a position, mm."""
         x, y = position
         self.axes.text(x, y, text, **{"size": self.points(height_mm), "ha": "center", "va": "center", **style})
 
@@ -435,13 +433,11 @@ class _Picture:
         return self.axes.fill(*np.transpose(corners), facecolor=colour, edgecolor=_EDGE, linewidth=0.5, label=label)
 
     def arrow(self, start: Array, end: Array) -> None:
-        """Draw an arrow with a white rim."""
         for colour, width in (("white", 3.5), (INK, 1.2)):
             style = {"arrowstyle": "->", "color": colour, "linewidth": width, "shrinkA": 0, "shrinkB": 0}
             self.axes.annotate("", (end[0], end[1]), (start[0], start[1]), arrowprops=style)
 
     def scale_bar(self) -> None:
-        """Draw a scale bar under the lower right corner."""
         x_max, y = self.extent[1], -46 / self.pixels[1]
         transform = self.axes.get_xaxis_transform()
         style = {"color": INK, "clip_on": False, "transform": transform}

@@ -61,7 +61,6 @@ class FiniteRange(click.FloatRange):
     """A range of finite numbers; click's own accepts NaN and infinity."""
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        """Convert the text of an option."""
         number = super().convert(value, param, ctx)
         if not math.isfinite(number):
             self.fail(f"got {value!r}, expected a finite number", param, ctx)
@@ -93,12 +92,10 @@ class SectionedGroup(click.Group):
         super().__init__(*arguments, **options)
 
     def add_command(self, cmd: click.Command, name: str | None = None, heading: str = "Commands") -> None:
-        """Add a command under a heading of the help."""
         super().add_command(cmd, name)
         self._headings[name or cmd.name or ""] = heading
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        """Write the commands with their short helps."""
         width = max(map(len, self._headings))
         limit = formatter.width - 6 - width  # click's indent, gap and margin
         for heading in dict.fromkeys(self._headings.values()):
@@ -169,7 +166,6 @@ def progress() -> Iterator["Progress"]:
 
 @contextmanager
 def progress_bar(name: str) -> Iterator["OnProgress"]:
-    """Yield a function that shows progress on stderr."""
     with progress() as bar:
         task = bar.add_task(name, total=None, note="")
 
@@ -200,8 +196,6 @@ def text_table(rows: Sequence[Sequence[str]], text_columns: Collection[int] = (0
 
 
 class _StderrHandler(logging.Handler):
-    """Prints log records on stderr."""
-
     def emit(self, record: logging.LogRecord) -> None:
         # click.echo would bypass the sys.stderr of a progress bar and write into the bar.
         print(printable(self.format(record)), file=sys.stderr)

@@ -47,7 +47,6 @@ class Hdf5Reader:
         return value.decode() if isinstance(value, bytes) else str(value)
 
     def is_numeric(self, name: str) -> bool:
-        """Return whether a dataset holds real numbers or Booleans."""
         return self._datasets[name].dtype.base.kind in "fiub"
 
     def describe(self, name: str) -> str:

@@ -78,7 +78,6 @@ class _DaemonThreads(Executor):
     """A daemon thread for each task; unlike `ThreadPoolExecutor`, it does not delay the end of the program."""
 
     def submit(self, work: Callable[..., Any], /, *arguments: Any, **keywords: Any) -> Future[Any]:
-        """Start a task at once."""
         future: Future[Any] = Future()
 
         def run() -> None:
@@ -196,7 +195,6 @@ class Checkpoints:
         return {number: self._read(paths[number]) for number in sorted(paths)}
 
     def save(self, number: int, state: State) -> None:
-        """Write the state of a task atomically."""
         if not self._file.exists():
             files.write_json(self._file, {"format": FORMAT, "settings": self.settings})
         with files.atomic_file(self.folder / f"start_{number:04d}.npz") as temporary:

@@ -88,19 +88,16 @@ class ConnectionServer(socketserver.ThreadingTCPServer):
         raise NotImplementedError
 
     def verify_request(self, request: Any, client_address: Any) -> bool:
-        """Register a connection."""
         with self._lock:
             self._connections.add(request)
         return True
 
     def close_request(self, request: Any) -> None:
-        """Unregister and close a connection."""
         with self._lock:
             self._connections.discard(request)
         super().close_request(request)
 
     def server_close(self) -> None:
-        """Stop listening, and close all connections."""
         super().server_close()
         with self._lock:
             for connection in self._connections:

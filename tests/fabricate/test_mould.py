@@ -58,10 +58,7 @@ def height_at(solid: trimesh.Trimesh, x: float, y: float) -> float:
 
 @pytest.mark.parametrize(
     "pad",
-    [
-        *((2, 10, 2), (1, 30, 1032)),
-        *(pytest.param(each, marks=pytest.mark.slow) for each in ((4, 30, 1032), "20para")),
-    ],
+    [*((2, 10, 2), (1, 30, 1032)), *(pytest.param(each, marks=pytest.mark.slow) for each in ((4, 30, 1032), "20para"))],
 )
 def test_random_and_published_moulds_are_closed(request, pad):
     if isinstance(pad, str):
@@ -158,8 +155,7 @@ def test_lid_has_holes_for_pins_vents_and_spout():
 
 
 @pytest.mark.parametrize(
-    ("tapered", "knots", "layer_mm"),
-    [(17.0, 1, 0.3), pytest.param(5.0, 4, 0.1, marks=pytest.mark.slow)],
+    ("tapered", "knots", "layer_mm"), [(17.0, 1, 0.3), pytest.param(5.0, 4, 0.1, marks=pytest.mark.slow)]
 )
 def test_tapered_moulds_with_wells_are_closed(tapered, knots, layer_mm):
     tapers = with_settings({"ridge_draft_deg": tapered, "pins": True}, printer={"layer_mm": layer_mm})

@@ -15,14 +15,7 @@ from padforge.common.validation import InputError
 from padforge.design.morphology import Morphology
 from padforge.design.paths.curves import lengths
 from padforge.fabricate.cad import model as of_model
-from padforge.fabricate.cad.model import (
-    FIT_TOLERANCES_MM,
-    CadPart,
-    assemble,
-    build_mould,
-    build_parts,
-    mould_parts,
-)
+from padforge.fabricate.cad.model import FIT_TOLERANCES_MM, CadPart, assemble, build_mould, build_parts, mould_parts
 from padforge.fabricate.cad.step_file import write_step
 from padforge.fabricate.mesh import build_mesh
 from padforge.fabricate.mould import conductive_plan, holder_body, lid_body, mould_body, well_outlines

@@ -7,13 +7,7 @@ from padforge.common.plotting import FAINT, HORIZONTAL, PAPER, VERTICAL
 from padforge.design.morphology import Morphology
 from padforge.fabricate.checks import Finding
 from padforge.fabricate.mesh import mould_mesh
-from padforge.fabricate.outputs.pictures import (
-    TURN_DEG,
-    draw_findings,
-    draw_mould,
-    draw_orientation,
-    draw_tracks,
-)
+from padforge.fabricate.outputs.pictures import TURN_DEG, draw_findings, draw_mould, draw_orientation, draw_tracks
 from padforge.fabricate.plan import Plan, fibre_layers
 from padforge.sense.rig.config import RobotFrame
 from padforge.sense.settings import RigSettings
