@@ -124,7 +124,7 @@ def test_custom_materials_have_their_keys():
     assert spec.section(FibreSettings).material == Fibre("silvered yarn", 0.2)
 
 
-@pytest.mark.parametrize("fibre_ohm", [0.3, 99.0, 9.6e4])
+@pytest.mark.parametrize("fibre_ohm", [0.3, 34.48, 99.0, 9.6e4])
 def test_divider_ohm_is_the_most_sensitive_of_the_series(fibre_ohm):
     series = "1 1.1 1.2 1.3 1.5 1.6 1.8 2 2.2 2.4 2.7 3 3.3 3.6 3.9 4.3 4.7 5.1 5.6 6.2 6.8 7.5 8.2 9.1"
     sold = [float(f"{value}e{decade}") for value in series.split() for decade in range(-2, 8)]
