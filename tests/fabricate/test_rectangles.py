@@ -16,7 +16,7 @@ from padforge.fabricate.cad.model import body_solid
 from padforge.fabricate.checks.plan_checks import check_mould
 from padforge.fabricate.leads import lead_spacing
 from padforge.fabricate.mesh import build_mesh, mould_mesh
-from padforge.fabricate.mould import bed_frame, holder_body, lid_body, sizes, tray_body
+from padforge.fabricate.mould import bed_frame, holder_body, lid_body, tray_body
 from padforge.fabricate.plan import Plan
 from padforge.fabricate.settings import DEFAULTS, FabricationSettings, MouldSettings
 from tests.fabricate.planted import with_settings
@@ -24,34 +24,9 @@ from tests.fabricate.planted import with_settings
 PAD = Morphology.straight((3, 6), (8.0, 15.0))
 
 
-HOLE = ((-2.5, 3.0), (2.5, 3.0), (2.5, 11.0), (-2.5, 11.0))
-"""Between fibres of `PAD`."""
-
-
 def settings(pad: Morphology, mould: dict | None = None, **more) -> FabricationSettings:
     own = PadSettings(**{**pad.layout.settings, **more})
     return replace(DEFAULTS, mould=MouldSettings(**{"number_mm": 0.0, **(mould or {})}), pad=own)
-
-
-def test_tray_has_the_width_and_height_of_the_pad():
-    plan = Plan(PAD, settings(PAD))
-    assert sizes(plan)["pad_mm"] == [56.0, 60.0]
-    left, low, right, high = plan.tray.bounds
-    assert (right - left) - (high - low) == pytest.approx(56 - 60)
-    starts = np.array([lead.point_past_edge(0) for lead, _ in plan.leads.pairs])
-    assert starts[:3] == pytest.approx(np.array([[-28.0, y] for y in (-15.0, 0.0, 15.0)]))
-    assert starts[3:] == pytest.approx(np.array([[x, -30.0] for x in (-20.0, -12.0, -4.0, 4.0, 12.0, 20.0)]))
-
-
-def test_keep_out_is_a_pillar_of_the_mould():
-    with_hole, without = (Plan(PAD, settings(PAD, keep_out_mm=hole)) for hole in ((HOLE,), ()))
-    found = {finding.name: finding for finding in check_mould(with_hole)[-1]}
-    assert all(found[name].status == "pass" for name in ("watertight", "bodies", "genus", "keep_out", "pillars"))
-    more = mould_mesh(with_hole).volume() - mould_mesh(without).volume()
-    assert more == pytest.approx(5 * 8 * DEFAULTS.mould.silicone_mm, rel=1e-6)
-    rim = DEFAULTS.mould.floor_mm + DEFAULTS.mould.silicone_mm
-    section = [shapely.Polygon(ring) for ring in mould_mesh(with_hole).slice(rim - 1e-3).to_polygons()]
-    assert min(ring.symmetric_difference(shapely.Polygon(HOLE)).area for ring in section) < 1e-2
 
 
 def test_round_holes_are_round_pillars_whose_feet_are_the_heads_of_screws():
