@@ -44,13 +44,7 @@ WAYS: dict[str, dict[str, Any]] = {
 
 
 def trials(case: str, recording: Recording, n_training: int) -> Iterator[Row]:
-    """Yield calibrations by all ways, each with its run time and its errors.
-
-    Args:
-        case: title of the panel.
-        recording: with more than `n_training` presses of known position.
-        n_training: presses to train on, drawn at random.
-    """
+    """Yield calibrations by all ways, each with its run time and its errors, on presses that are drawn at random."""
     rng = np.random.default_rng(0)
     training, test = np.split(
         rng.permutation(np.flatnonzero(recording.has_position))[: n_training + TEST], [n_training]
@@ -99,10 +93,7 @@ def _row(case: str, way: str, epochs: int, seconds: float, errors_mm: Sequence[f
 def main(out: Path, mat: Path | None, presses: Sequence[int]) -> None:
     """Print a table of all calibrations, as they are done, and draw their errors against their run times.
 
-    Args:
-        out: folder of the figure.
-        mat: recording of the authors; None for the simulated pad alone.
-        presses: numbers of presses of that recording to train on.
+    They are on the simulated pad, and on numbers of presses of a recording of the authors, if there is one.
     """
     pad = Morphology.straight(4)
     cases = [("simulated", simulate(pad, RigSettings(presses=SIMULATED + TEST, seed=0)), SIMULATED)]

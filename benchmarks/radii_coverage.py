@@ -27,13 +27,8 @@ SETTINGS = LocalizerSettings(members=2, hidden=64, layers=3, epochs=240, max_fai
 def measure_coverage(number: int, seed: int) -> tuple[str, str, NDArray[np.float64]]:
     """Simulate presses on a random pad, calibrate on a part and test on the others.
 
-    Args:
-        number: of the recording.
-        seed: with the number, of the pad, the presses and the training.
-
-    Returns:
-        The pad in words; how test presses were chosen; the shares of test presses within the radii of 50 and 90 %,
-        with 0 to 3 failed fibres; shape (4, 2).
+    Returns the pad in words, how test presses were chosen, and the shares of test presses within the radii of 50 and
+    90 %, with 0 to 3 failed fibres; shape (4, 2).
     """
     rng = np.random.default_rng([seed, number])
     grid, is_straight = int(rng.choice(GRIDS)), bool(rng.integers(2))
@@ -48,12 +43,7 @@ def measure_coverage(number: int, seed: int) -> tuple[str, str, NDArray[np.float
 
 
 def main(recordings: int, seed: int) -> None:
-    """Print the coverage of every recording, and the means of each split and of all.
-
-    Args:
-        recordings: number of recordings.
-        seed: of all of them.
-    """
+    """Print the coverage of every recording, and the means of each split and of all."""
     results = []
     for number in range(recordings):
         name, split, shares = measure_coverage(number, seed)

@@ -49,7 +49,8 @@ def draw_plan(
     """Draw the plan of a pad.
 
     Crossings within a family are ringed, broken rules marked with a red cross, keep-outs hatched; the contact is drawn
-    at the centre. Fibres are numbered from 1 at their ends, and named in an SVG so that it can be imported again.
+    at the centre. Fibres are numbered from 1 at their starts, as in the mould. An SVG names them, so that it can be
+    imported again.
 
     Args:
         pad: the pad.
@@ -77,8 +78,8 @@ def draw_plan(
         gid = f"{name}-{fibre + 1 - pad.layout.families[family].start}"  # import_plan reads these names
         (line,) = axes.plot(x, y, color=color, linewidth=1.6, solid_capstyle="round", gid=gid)
         line.get_path().should_simplify = False
-        ha, va, dx, dy = (("left", "center", 0.02, 0), ("center", "bottom", 0, 0.02))[family]
-        axes.text(x[-1] + dx * half, y[-1] + dy * half, str(fibre + 1), color=color, fontsize=9, ha=ha, va=va)
+        ha, va, dx, dy = (("right", "center", 0.02, 0), ("center", "top", 0, 0.02))[family]
+        axes.text(x[0] - dx * half, y[0] - dy * half, str(fibre + 1), color=color, fontsize=9, ha=ha, va=va)
 
     markers = [
         (pad.to_mm(c.position), pad.layout.family(c.first) == pad.layout.family(c.second)) for c in crossings(pad)

@@ -163,11 +163,8 @@ def _line(finding: dict[str, Any]) -> str:
 def mould_costs(pad: "Morphology", spec: "Spec", folder: Path) -> dict[str, float]:
     """Build the mould of a pad, write fabrication.json and .stl to `folder`, and return its costs.
 
-    Returns:
-        "mould_ml" and "silicone_ml": volumes of plastic and silicone.
-        "failed": number of failed checks.
-        "strain_percent": maximum strain of a fibre under a press, if the contact is a layer.
-        "force_n": force of a press, if in addition the modulus of the silicone is known.
+    The strain of fibres under a press is one of them if the contact is a layer, its force if in addition the modulus of
+    the silicone is known.
     """
     from padforge.design.contact import contact_press, fibre_strains
     from padforge.design.layer import reduced_modulus_kpa

@@ -16,17 +16,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from padforge.common import profiling
-from padforge.common.files import (
-    atomic_files,
-    check_file,
-    find_unchanged,
-    provenance,
-    read_json,
-    reraise_write_error,
-    sha256,
-    write_json,
-)
+from padforge.common import files, profiling
 from padforge.common.validation import InputError, check_path, check_type, short_repr
 from padforge.design.morphology import Morphology
 from padforge.fabricate.checks import Finding, check_result
@@ -65,17 +55,11 @@ class PrintedBody(NamedTuple):
 
 @dataclass(frozen=True)
 class Fabrication:
-    """The contents of a mould's files; toolpath and CAD models are built on first use.
+    """The contents of a mould's files; toolpath and CAD models are built on first use."""
 
-    Attributes:
-        plan: plan of the finished pad.
-        bodies: bodies to print, the mould first.
-        findings: results of the checks so far.
-    """
-
-    plan: Plan
-    bodies: list[PrintedBody]
-    findings: list[Finding]
+    plan: Plan  # of the finished pad
+    bodies: list[PrintedBody]  # the mould first
+    findings: list[Finding]  # results of the checks so far
 
     @cached_property
     def toolpath(self) -> list[Step]:
@@ -168,19 +152,14 @@ def _write_cad(fabrication: Fabrication, path: Path) -> None:
 
 
 def _describe_cad(fabrication: Fabrication) -> Finding:
-    """Build all CAD solids and return the finding on their deviation from the mesh.
-
-    Raises:
-        InputError: a CAD solid is not valid, or differs from its mesh.
-    """
+    """Build all CAD solids and return the finding on their deviation from the mesh."""
     from padforge.fabricate.cad.model import MAX_DEVIATION
 
     parts = [part for parts in fabrication.cad_parts.values() for part in parts]
     deviation = max(part.deviation for part in parts)
     n_solids, fit_um = sum(len(part.shape.solids()) for part in parts), 1000 * max(part.fit_mm for part in parts)
-    message = (
-        f"{n_solids} solids, their volumes within {100 * deviation:.3f} % of the mesh's, curves within {fit_um:g} µm"
-    )
+    volumes = f"their volumes within {100 * deviation:.3f} % of the mesh's"
+    message = f"{n_solids} solids, {volumes}, curves within {fit_um:g} µm"
     return check_result("cad_solid", True, round(deviation, 6), MAX_DEVIATION, message)
 
 
@@ -237,9 +216,9 @@ def build(
     """
     out = check_path("out", out)
     require_formats(formats)
-    inputs = [check_file(check_path("inputs", path)) for path in check_type("inputs", inputs, Sequence)]
+    inputs = [files.check_file(check_path("inputs", path)) for path in check_type("inputs", inputs, Sequence)]
     packages = ("shapely", "manifold3d", "trimesh", *(["build123d"] if "step" in formats else []))
-    origin = provenance("fabricate", inputs=inputs, packages=packages)  # before inputs can change
+    origin = files.provenance("fabricate", inputs=inputs, packages=packages)  # before inputs can change
     profiling.add_count("formats", len(set(formats)), len(FORMATS))
     with profiling.stage("mesh"):
         plan = Plan(pad, settings)
@@ -248,7 +227,7 @@ def build(
         bodies = [PrintedBody(name, body, mesh, *mesh_arrays(mesh)) for name, body, mesh in meshes]
     with profiling.stage("checks"):
         fabrication = Fabrication(plan, bodies, _check_bodies(plan, bodies))
-    writers = _choose_writers(fabrication, [files for name, files in FORMATS.items() if name in formats])
+    writers = _choose_writers(fabrication, formats)
     with profiling.stage("checks"):
         if "toolpath.svg" in writers:
             fabrication.findings.extend(check_toolpath(plan, fabrication.toolpath))
@@ -275,27 +254,25 @@ def _check_bodies(plan: Plan, bodies: Sequence[PrintedBody]) -> list[Finding]:
     return by_body[0] + check_plan(plan)
 
 
-def _choose_writers(
-    fabrication: Fabrication, formats: Sequence[Mapping[str, Callable[..., None]]]
-) -> dict[str, Callable[[Path], None]]:
+def _choose_writers(fabrication: Fabrication, formats: Sequence[str]) -> dict[str, Callable[[Path], None]]:
     """Return the writers by the name of the file, those of the bodies first."""
-    files = [item for export in formats for item in export.items()]
+    chosen = [item for name, writers in FORMATS.items() if name in formats for item in writers.items()]
     by_body = {
-        file.replace("*", body.name): partial(write, fabrication, body)
-        for body, (file, write) in product(fabrication.bodies, files)
-        if "*" in file
+        name.replace("*", body.name): partial(write, fabrication, body)
+        for body, (name, write) in product(fabrication.bodies, chosen)
+        if "*" in name
     }
-    return by_body | {file: partial(write, fabrication) for file, write in files if "*" not in file}
+    return by_body | {name: partial(write, fabrication) for name, write in chosen if "*" not in name}
 
 
-def _compile_build(fabrication: Fabrication, files: list[str], origin: Mapping[str, Any]) -> Build:
+def _compile_build(fabrication: Fabrication, names: list[str], origin: Mapping[str, Any]) -> Build:
     """Return the fabrication document, without the digests of its files."""
     plan, settings, mould = fabrication.plan, fabrication.plan.settings, fabrication.bodies[0]
     rim = settings.mould.floor_mm + plan.shrinkage_compensated.silicone_mm
     pins_mm3 = mould.mesh.trim_by_plane((0, 0, 1), rim).volume()
     laying = laying_document(plan, mould.mesh.volume() - pins_mm3)
     return Build(
-        files=files,
+        files=names,
         size_mm=[round(side, 6) for side in np.ptp(mould.vertices.astype(float), axis=0).tolist()],
         sizes=sizes(plan),
         mould_volume_ml=round(mould.mesh.volume() / 1000, 4),
@@ -311,7 +288,7 @@ def _compile_build(fabrication: Fabrication, files: list[str], origin: Mapping[s
             "rules": settings.rules.model_dump(include={"min_mean_bend_radius_mm"}),
             "silicone": settings.silicone.model_dump(mode="json"),
             "fibre": settings.fibre.model_dump(),
-            **({"dispenser": settings.dispenser.model_dump(mode="json")} if "toolpath.svg" in files else {}),
+            **({"dispenser": settings.dispenser.model_dump(mode="json")} if "toolpath.svg" in names else {}),
         },
         provenance=dict(origin),
         sha256={},
@@ -321,17 +298,17 @@ def _compile_build(fabrication: Fabrication, files: list[str], origin: Mapping[s
 def _write_files(out: Path, writers: Mapping[str, Callable[[Path], None]], result: Build) -> Build:
     """Write the files of a mould and their digests atomically, and delete those of an earlier mould."""
     try:
-        earlier = read_json(out / "fabrication.json", FORMAT).get("sha256")
+        earlier = files.read_json(out / "fabrication.json", FORMAT).get("sha256")
     except InputError:
         earlier = {}
     earlier = earlier if isinstance(earlier, dict) else {}
-    deleted = find_unchanged(out, earlier) - writers.keys()
-    with atomic_files(out, without=deleted) as folder:
+    deleted = files.find_unchanged(out, earlier) - writers.keys()
+    with files.atomic_files(out, without=deleted) as folder:
         for name, write in writers.items():
-            with profiling.stage(f"write {name}"), reraise_write_error(out / name):
+            with profiling.stage(f"write {name}"), files.reraise_write_error(out / name):
                 write(folder / name)
-        result = replace(result, sha256={name: sha256(folder / name) for name in writers})
-        write_json(folder / "fabrication.json", result.to_dict())
+        result = replace(result, sha256={name: files.sha256(folder / name) for name in writers})
+        files.write_json(folder / "fabrication.json", result.to_dict())
     for name in sorted(deleted):
         _log.info("%s is gone: it was of the mould before this one", out / name)
     for file in sorted(out.iterdir()):

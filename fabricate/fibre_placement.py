@@ -25,19 +25,12 @@ _ROUNDING_MM = 1e-9
 
 @dataclass(frozen=True)
 class Stroke:
-    """The toolpath of one fibre, from the end of its first lead to the end of the second.
+    """The toolpath of one fibre, from the end of its first lead to the end of the second."""
 
-    Attributes:
-        fibre: index of the fibre, 0..F-1.
-        positions_mm: corners of the path in the frame of the pad turned over; shape (n, 2).
-        z_mm: height of the needle's tip, negative within the track.
-        feeds_mm_s: speed from each corner to the next; shape (n - 1,).
-    """
-
-    fibre: int
-    positions_mm: Array
-    z_mm: float
-    feeds_mm_s: Array
+    fibre: int  # index, 0..F-1
+    positions_mm: Array  # corners of the path in the frame of the pad turned over; shape (n, 2)
+    z_mm: float  # height of the needle's tip, negative within the track
+    feeds_mm_s: Array  # speed from each corner to the next; shape (n - 1,)
 
     @cached_property
     def steps_mm(self) -> Array:
@@ -54,12 +47,9 @@ class Step:
 
 
 def plan_toolpath(plan: Plan, diameter_mm: float, max_strain: float = math.inf) -> list[Step]:
-    """Compute the toolpath of every fibre, layer by layer from the deepest.
+    """Compute the toolpath of every fibre of a finished pad, layer by layer from the deepest.
 
-    Args:
-        plan: plan of the finished pad.
-        diameter_mm: diameter of the fibre.
-        max_strain: maximum strain of the fibre; inf if unknown.
+    `diameter_mm` and `max_strain` are those of the fibre.
     """
     lead_mm = plan.settings.mould.lead_mm
     paths, traces = plan.paths(_FLAT_SHARE * TOLERANCE_MM, lead_mm), plan.trace(_MAX_TURN, lead_mm)
@@ -86,10 +76,7 @@ def mirror_x(positions_mm: Array) -> Array:
 
 
 def _split_ends(positions: Array, end_mm: float) -> tuple[Array, NDArray[np.bool_]]:
-    """Split the ends off long segments, so that only the ends are slow next to a bend.
-
-    Returns the points (m, 2), and which of them (m,) are original corners.
-    """
+    """Split the ends off long segments, which alone are slow next to a bend; points (m, 2), which are original (m,)."""
     steps = np.diff(positions, axis=0)
     length = np.hypot(*steps.T)
     long = np.flatnonzero(length > 4 * end_mm)

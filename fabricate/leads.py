@@ -25,19 +25,12 @@ _NO_SPANS = np.empty((0, 4, 2))
 
 @dataclass(frozen=True, eq=False)
 class Lead:
-    """The path of a fibre from one of its ends to the edge.
+    """The path of a fibre from one of its ends to the edge: bends, if any, and a straight run."""
 
-    Attributes:
-        end_mm: the fibre's end; shape (2,).
-        spans: cubic Bezier curves from the end, mm, none for a straight lead; shape (n, 4, 2).
-        outward: direction of the straight run to the edge, a unit vector along an axis; shape (2,).
-        run_mm: length of the straight run.
-    """
-
-    end_mm: Array
-    spans: Array
-    outward: Array
-    run_mm: float
+    end_mm: Array  # the fibre's end; shape (2,)
+    spans: Array  # cubic Bezier curves from the end, mm; shape (n, 4, 2)
+    outward: Array  # direction of the straight run, a unit vector along an axis; shape (2,)
+    run_mm: float  # length of the straight run
 
     @property
     def turned_mm(self) -> Array:
@@ -91,15 +84,10 @@ class Lead:
 
 @dataclass(frozen=True, eq=False)
 class Leads:
-    """The leads of all fibres, and the rectangle of silicone around them.
+    """The leads of all fibres, and the rectangle of silicone around them."""
 
-    Attributes:
-        pairs: leads of the start and of the end of each fibre.
-        bounds_mm: x_min, y_min, x_max and y_max of the silicone.
-    """
-
-    pairs: tuple[tuple[Lead, Lead], ...]
-    bounds_mm: tuple[float, float, float, float]
+    pairs: tuple[tuple[Lead, Lead], ...]  # leads of the start and of the end of each fibre
+    bounds_mm: tuple[float, float, float, float]  # x_min, y_min, x_max and y_max of the silicone
 
     def edge_mm(self, lead: Lead) -> float:
         """Return the coordinate, along the lead's axis, of the edge that it reaches."""
@@ -132,16 +120,10 @@ def straight_leads(ends_mm: Array, layout: Layout, border_mm: float) -> Leads:
 def lead_spacing(
     settings: FabricationSettings, max_height_mm: float, flare_mm: float
 ) -> tuple[float, float, float, float]:
-    """Compute the dimensions of leads to one side.
+    """Compute the dimensions of leads to one side from the tallest ridge and the outward lean of the walls.
 
-    Args:
-        settings: mould, rules, fibre and printer.
-        max_height_mm: height of the tallest ridge.
-        flare_mm: outward lean of the walls.
-
-    Returns:
-        Width of the border in which leads are straight, distance between neighbouring centre lines, radius of the
-        bends, and distance from the outermost centre line to the silicone's edge; mm.
+    They are the width of the border in which leads are straight, the distance between neighbouring centre lines, the
+    radius of the bends, and the distance from the outermost centre line to the silicone's edge; mm.
     """
     mould, radius = settings.mould, settings.min_bend_radius_mm
     foot = mould.ridge_width_mm + 2 * max_height_mm * settings.ridge_slope

@@ -23,42 +23,24 @@ PUBLISHED = "published"
 
 @dataclass(frozen=True)
 class Silicone:
-    """A two-part silicone.
+    """A two-part silicone."""
 
-    Attributes:
-        name: name of the product.
-        density_g_per_ml: density of the mix.
-        parts: parts A and B by mass.
-        pot_life_min: time for which the mix can be poured.
-        cure_h: time until the casting can be demoulded.
-        shrinkage: relative difference in length between the mould and the cured casting.
-        modulus_kpa: stress over strain at 100 % strain; None if unknown.
-    """
-
-    name: str
-    density_g_per_ml: float
-    parts: tuple[float, float]
-    pot_life_min: float
-    cure_h: float
-    shrinkage: float
-    modulus_kpa: float | None = None
+    name: str  # of the product
+    density_g_per_ml: float  # of the mix
+    parts: tuple[float, float]  # A and B by mass
+    pot_life_min: float  # time for which the mix can be poured
+    cure_h: float  # time until the casting can be demoulded
+    shrinkage: float  # relative difference in length between the mould and the cured casting
+    modulus_kpa: float | None = None  # stress over strain at 100 % strain; None if unknown
 
 
 @dataclass(frozen=True)
 class Fibre:
-    """A fibre for the tracks; None is unknown.
+    """A fibre for the tracks; None is unknown."""
 
-    Attributes:
-        name: name of the material.
-        diameter_mm: diameter of the fibre.
-        ohm_per_mm: resistance per length at rest.
-        min_bend_radius_mm: minimum bend radius.
-        max_strain: maximum strain.
-    """
-
-    name: str
+    name: str  # of the material
     diameter_mm: float
-    ohm_per_mm: float | None = None
+    ohm_per_mm: float | None = None  # at rest
     min_bend_radius_mm: float | None = None
     max_strain: float | None = None
 
@@ -118,10 +100,7 @@ PositiveOrPreset = Annotated[Positive | None, *_or_preset]
 
 
 class _MaterialSettings(Settings):
-    """A preset by `name`; other keys override its properties.
-
-    A name without a preset is valid if all properties that cannot be unknown are set.
-    """
+    """A preset by `name`, or another name with all properties that cannot be unknown; keys override the preset."""
 
     PRESETS: ClassVar[Mapping[str, Any]]
 
@@ -200,10 +179,7 @@ class FibreSettings(_MaterialSettings):
 
     PRESETS = FIBRES
 
-    name: Name = Field(
-        default=PUBLISHED,
-        description=f"{', '.join(FIBRES)}; published: carbon-black TPE",
-    )
+    name: Name = Field(default=PUBLISHED, description=f"{', '.join(FIBRES)}; published: carbon-black TPE")
     diameter_mm: AnyOrPreset = Field(default=None, gt=0, le=10, description='diameter, mm; "preset": as of the name')
     ohm_per_mm: PositiveOrPreset = Field(
         default=None, description='resistance at rest, Ohm per mm of length; or "preset"'
@@ -225,12 +201,9 @@ _E24 = (10, 11, 12, 13, 15, 16, 18, 20, 22, 24, 27, 30, 33, 36, 39, 43, 47, 51, 
 
 
 def divider_ohm(fibre_ohm: float) -> float:
-    """Return the fixed resistor of the E24 series for the most sensitive voltage divider with a fibre.
-
-    With a fibre R and a fixed resistor F the divider outputs U = Us F / (F + R). A small relative change e of R changes
-    U by Us e F R / (F + R)^2, which has its maximum, Us e / 4, at F = R, and is equal for F = x R and F = R / x. The
-    best value is therefore the one with the smallest |log(F / R)|.
-    """
+    """Return the fixed resistor of the E24 series for the most sensitive voltage divider with a fibre."""
+    # U = Us F / (F + R). A small relative change e of R changes U by Us e F R / (F + R)^2, which has its maximum,
+    # Us e / 4, at F = R, and is equal for F = x R and F = R / x: the best F has the smallest |log(F / R)|.
     decade = 10.0 ** (math.floor(math.log10(fibre_ohm)) - 1)
     candidates = [*(value * decade for value in _E24), 100 * decade]
     return float(f"{min(candidates, key=lambda ohm: abs(math.log(ohm / fibre_ohm))):.2g}")

@@ -32,7 +32,6 @@ SEPARATION_MM = 1e-4
 
 
 def build_mesh(body: Body) -> Manifold:
-    """Build the mesh of a body, mm."""
     solid = _unite(body.base)
     if body.cuts:
         solid -= _unite(body.cuts)
@@ -103,15 +102,9 @@ def write_stl(path: Path, vertices: np.ndarray, triangles: np.ndarray) -> None:
 
 
 def write_3mf(path: Path, vertices: np.ndarray, triangles: np.ndarray, *, name: str, title: str, material: str) -> None:
-    """Write a 3MF, mm, of one object.
+    """Write a 3MF, mm, of one object: vertices (n, 3), with the precision of an STL, and triangles (m, 3).
 
-    Args:
-        path: file to write.
-        vertices: vertices (n, 3), written with the precision of an STL.
-        triangles: vertex indices (m, 3).
-        name: name of the body, of `BODY_COLOURS`, which states its colour.
-        title: title for people.
-        material: name of the material.
+    `name` is that of the body, of `BODY_COLOURS`, which states its colour; `title` is for people.
     """
     points = "".join(f'<vertex x="{x:.9g}" y="{y:.9g}" z="{z:.9g}"/>' for x, y, z in vertices.tolist())
     faces = "".join(f'<triangle v1="{a}" v2="{b}" v3="{c}"/>' for a, b, c in triangles.tolist())
@@ -141,13 +134,22 @@ def write_3mf(path: Path, vertices: np.ndarray, triangles: np.ndarray, *, name: 
 
 
 def read_mesh(path: Path) -> tuple[Array, Numbers]:
-    """Read vertices (n, 3), mm, and triangles (m, 3), m > 0, of a .stl, in mm, or of all printed objects of a .3mf.
+    """Read vertices (n, 3), mm, and triangles (m, 3), m > 0, of a .stl, in mm, or of all printed objects of a .3mf."""
+    import trimesh
 
-    Raises:
-        InputError: the file is missing, or not a mesh with triangles.
-    """
     path = check_file(check_path("path", path))
-    vertices, triangles = _read_by_trimesh(path)
+    kind = path.suffix[1:].lower()
+    logging.getLogger("trimesh").setLevel(logging.CRITICAL)  # its errors are raised as well
+    try:
+        with np.errstate(all="ignore"):
+            content = {"stl": _mended_stl, "3mf": _without_unprinted}.get(kind, Path.read_bytes)(path)
+            scene = trimesh.load_scene(BytesIO(content), file_type=kind, process=False)  # keeps triangles with NaN
+            mesh = (scene.convert_units("millimeters") if scene.units else scene).to_mesh()
+        vertices, triangles = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
+    except Exception as error:  # broken files can raise any exception
+        is_missing = isinstance(error, KeyError)
+        reason = f"{error} is missing in it" if is_missing else " ".join(str(error).split()) or type(error).__name__
+        raise InputError(f"{path}: not a mesh that can be read ({reason})") from error
     if not len(triangles) or triangles.min() < 0 or triangles.max() >= len(vertices):
         raise InputError(f"{path}: holds no triangles that can be read, or is torn")
     if not np.isfinite(vertices).all():
@@ -201,23 +203,3 @@ def _without_unprinted(path: Path) -> bytes:
     if count:
         _log.warning("%s: %d objects that are not printed are left out", path, count)
     return content.getvalue()
-
-
-def _read_by_trimesh(path: Path) -> tuple[Array, Numbers]:
-    """Read vertices and triangles of a file by trimesh."""
-    import trimesh
-
-    logging.getLogger("trimesh").setLevel(logging.CRITICAL)  # its errors are raised as well
-    try:
-        with np.errstate(all="ignore"):
-            kind = path.suffix[1:].lower()
-            content = {"stl": _mended_stl, "3mf": _without_unprinted}.get(kind, Path.read_bytes)(path)
-            scene = trimesh.load_scene(BytesIO(content), file_type=kind, process=False)  # keeps triangles with NaN
-            if scene.units:
-                scene = scene.convert_units("millimeters")
-            mesh = scene.to_mesh()
-        return np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
-    except Exception as error:  # broken files can raise any exception
-        is_missing = isinstance(error, KeyError)
-        reason = f"{error} is missing in it" if is_missing else " ".join(str(error).split()) or type(error).__name__
-        raise InputError(f"{path}: not a mesh that can be read ({reason})") from error

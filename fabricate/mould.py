@@ -37,19 +37,12 @@ Position = tuple[float, float]
 
 @dataclass(frozen=True)
 class Prism:
-    """A vertical prism, or a frustum.
+    """A vertical prism, or a frustum."""
 
-    Attributes:
-        area: outline at the bottom, mm.
-        bottom_mm: height of the bottom.
-        top_mm: height of the top.
-        flare_mm: outward offset of the outline at the top; only for rectangles and regular polygons.
-    """
-
-    area: BaseGeometry
+    area: BaseGeometry  # outline at the bottom, mm
     bottom_mm: float
     top_mm: float
-    flare_mm: float = 0.0
+    flare_mm: float = 0.0  # outward offset of the outline at the top; only for rectangles and regular polygons
 
 
 @dataclass(frozen=True)
@@ -79,11 +72,7 @@ def terraces(height_mm: float, terrace_mm: float) -> list[float]:
 
 
 def mould_body(plan: Plan, wells: Sequence[BaseGeometry] = ()) -> Body:
-    """Build the inverse mould of a compensated plan: tray, ridges with wells if any, exits, numbers, pillars and pins.
-
-    Raises:
-        InputError: pins that do not fit on the walls.
-    """
+    """Build the mould of a compensated plan: tray, ridges with wells if any, exits, numbers, pillars and pins."""
     ridges = []
     for layer, top_outline in enumerate(plan.ridges):
         ridges += ridge_prisms(plan, plan.layer_fibres(layer), top_outline | wells[layer] if wells else top_outline)
@@ -92,11 +81,7 @@ def mould_body(plan: Plan, wells: Sequence[BaseGeometry] = ()) -> Body:
 
 
 def tray_body(plan: Plan) -> Body:
-    """Build the tray of a mould with exits, pillars and pins, without ridges.
-
-    Raises:
-        InputError: pins that do not fit on the walls.
-    """
+    """Build the tray of a mould with exits, pillars and pins, without ridges."""
     floor, rim = plan.settings.mould.floor_mm, plan.settings.mould.floor_mm + plan.silicone_mm
     tray = _tray(plan.tray, [plan.cavity, *plan.exits], floor, plan.silicone_mm, plan.flare_mm)
     pillars = [Prism(outline, floor - INTO_FLOOR_MM, rim) for outline in shapely.get_parts(plan.pillars)]
@@ -109,11 +94,7 @@ def ridge_prisms(
 ) -> list[Prism]:
     """Build the terraces of the ridges of some fibres of a layer, the upper first; a ridge without taper has one.
 
-    Args:
-        plan: plan of the mould.
-        fibres: indices of the fibres.
-        top_outline: outline of the uppermost terrace.
-        tolerance_mm: maximum deviation of the other outlines; None for that of the settings.
+    `top_outline` is that of the uppermost terrace; the others deviate by `tolerance_mm`, or by that of the settings.
     """
     floor, height = plan.settings.mould.floor_mm, plan.heights_mm[plan.layer_indices[fibres[0]]]
     prisms = []
@@ -131,17 +112,17 @@ def number_prisms(plan: Plan) -> list[Prism | None]:
 
 
 def registration_pins(plan: Plan) -> list[Prism]:
-    """Build the registration pins, as high as they are wide, sunk into the walls by `INTO_FLOOR_MM`.
-
-    Raises:
-        InputError: they do not fit on the walls.
-    """
+    """Build the registration pins, as high as they are wide, sunk into the walls by `INTO_FLOOR_MM`."""
     rim, pin = plan.settings.mould.floor_mm + plan.silicone_mm, _pin_mm(plan)
     return [Prism(cylinder(x, y, pin), rim - INTO_FLOOR_MM, rim + pin) for x, y in _pin_positions(plan)]
 
 
 def _pin_mm(plan: Plan) -> float:
-    """Return the diameter of the pins: half the width of their corner, rounded down to 0.1 mm."""
+    """Return the diameter of the pins: half the width of their corner, rounded down to 0.1 mm.
+
+    Raises:
+        InputError: they do not fit on the walls.
+    """
     diameter = int(5 * plan.corner_mm + 1e-9) / 10
     if diameter < 1:
         raise InputError(
@@ -158,18 +139,9 @@ def _pin_positions(plan: Plan) -> list[Position]:
 
 
 def conductive_plan(plan: Plan) -> Plan:
-    """Return the plan of the mould for conductive material, with exits large enough for wells.
-
-    Raises:
-        InputError: such exits do not fit the pitch.
-    """
+    """Return the plan of the mould for conductive material, with exits large enough for wells."""
     mould = plan.settings.mould.model_copy(update={"exit_mm": WELL_SLOT_MM, "exit_width_mm": WELL_SLOT_MM})
     return replace(plan, settings=replace(plan.settings, mould=mould))
-
-
-def conductive_body(plan: Plan) -> Body:
-    """Build the mould of a `conductive_plan`, whose casting has a well at both ends of every track."""
-    return mould_body(plan, well_outlines(plan))
 
 
 def well_outlines(plan: Plan, sides: int = 64) -> list[BaseGeometry]:
@@ -231,8 +203,9 @@ def _free_position(plan: Plan, wanted: Position, diameter_mm: float) -> Position
     positions = np.stack(np.meshgrid(*np.linspace(*bounds, 101, axis=1)), axis=-1).reshape(-1, 2)
     positions = positions[shapely.distance(plan.pillars, shapely.points(positions)) >= reach]
     if not len(positions):
-        room = f"allowed only where keep-outs leave room for bores of {diameter_mm:g} mm"
-        raise InputError(f"[mould] lid: got true, {room}")
+        raise InputError(
+            f"[mould] lid: got true, allowed only where keep-outs leave room for bores of {diameter_mm:g} mm"
+        )
     x, y = positions[np.hypot(*(positions - wanted).T).argmin()].tolist()
     return x, y
 
@@ -258,43 +231,30 @@ def holder_body(plan: Plan) -> Body:
 
 
 def printed_bodies(plan: Plan) -> dict[str, Body]:
-    """Build all bodies to print for a pad, the mould first; all except the holder are compensated for shrinkage.
-
-    Raises:
-        InputError: settings do not fit the pad.
-    """
+    """Build all bodies to print for a pad, the mould first; all except the holder are compensated for shrinkage."""
     mould, printed = plan.settings.mould, plan.shrinkage_compensated
     bodies = {"mould": mould_body(printed)}
     if mould.lid:
         bodies["lid"] = lid_body(printed)
     if mould.conductive:
-        bodies["conductive"] = conductive_body(conductive_plan(plan).shrinkage_compensated)
+        wells = conductive_plan(plan).shrinkage_compensated
+        bodies["conductive"] = mould_body(wells, well_outlines(wells))
     if mould.holder:  # with `conductive`, wide enough for both pads
         bodies["holder"] = holder_body(conductive_plan(plan) if mould.conductive else plan)
     return bodies
 
 
 def bed_frame(plan: Plan) -> dict[str, Any]:
-    """Compute the pose of the pad in its holder, which a slicer puts in the middle of the bed.
-
-    Returns:
-        "bed_mm": width, depth and height of the printer.
-        "centre_mm": x and y of the pad's centre.
-        "angle_deg": angle from the bed's y axis to the pad's.
-        "mirrored": whether the tracks lie up, which inverts the pad's x axis.
-        "pad_mm": side of the pad, or width and height.
-        "surface_mm": height of the pad's surface above the bed.
-        "walls_mm": height of the holder's walls above the bed.
-    """
+    """Compute the pose of the pad in its holder, which a slicer puts in the middle of the bed."""
     floor_mm, bed_mm = plan.settings.mould.floor_mm, plan.settings.printer.bed_mm
     _, y_min, _, y_max = plan.tray.bounds
     return {
         "bed_mm": list(bed_mm),
-        "centre_mm": [bed_mm[0] / 2, bed_mm[1] / 2 - (y_min + y_max) / 2],
-        "angle_deg": 0.0,
-        "mirrored": True,
+        "centre_mm": [bed_mm[0] / 2, bed_mm[1] / 2 - (y_min + y_max) / 2],  # of the pad
+        "angle_deg": 0.0,  # from the bed's y axis to the pad's
+        "mirrored": True,  # the tracks lie up, which inverts the pad's x axis
         "pad_mm": np.round(_sides(plan.cavity), 6).tolist(),
-        "surface_mm": round(floor_mm + plan.thickness_mm, 6),
+        "surface_mm": round(floor_mm + plan.thickness_mm, 6),  # heights are above the bed
         "walls_mm": round(floor_mm + HOLDER_WALL_MM, 6),
     }
 

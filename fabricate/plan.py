@@ -19,19 +19,10 @@ from shapely.geometry.base import BaseGeometry
 from padforge.common.plotting import HORIZONTAL, VERTICAL
 from padforge.common.validation import InputError, check_type
 from padforge.design.morphology import Array, Morphology
-from padforge.design.paths.curves import (
-    Crossing,
-    beziers,
-    common_stretches,
-    crossings,
-    flatten,
-    lengths,
-    slope_beziers,
-    trace_curve,
-)
+from padforge.design.paths import curves
 from padforge.design.paths.keep_outs import keep_outs
 from padforge.design.settings import Layout, is_hole
-from padforge.fabricate.leads import Lead, Leads, lead_spacing, one_side_leads, straight_leads
+from padforge.fabricate.leads import Leads, lead_spacing, one_side_leads, straight_leads
 from padforge.fabricate.settings import DEFAULTS, FabricationSettings
 
 FAMILIES = ("horizontal", "vertical")
@@ -54,13 +45,12 @@ _AT_WALL_MM = 1e-3  # distance up to which a pillar touches a wall
 _MAX_WHITE = 0.7  # fraction of white in a family's palest tint; paler lines are hard to see in print
 
 
-def assign_layers(counts: tuple[int, int], clashes: Sequence[Crossing], deep_horizontal: bool) -> tuple[int, ...]:
+def assign_layers(
+    counts: tuple[int, int], clashes: Sequence[curves.Crossing], deep_horizontal: bool
+) -> tuple[int, ...]:
     """Compute the layer index of every fibre, 0 the shallowest, by colouring the graph of crossings within a family.
 
-    Args:
-        counts: numbers of horizontal and of vertical fibres.
-        clashes: crossings within a family.
-        deep_horizontal: whether horizontals are the deep family, which gets the higher indices.
+    If `deep_horizontal`, horizontals get the higher indices, otherwise verticals.
     """
     horizontal, vertical = range(counts[0]), range(counts[0], sum(counts))
     layers: dict[int, int] = {}
@@ -97,12 +87,8 @@ _DIGITS = (
 def draw_number(number: int, height_mm: float, width_mm: float) -> BaseGeometry:
     """Return the outline of a number, centred, and mirrored so that it is legible on the casting.
 
-    A bar under the digits distinguishes 6 from 9 and connects them.
-
-    Args:
-        number: number, >= 0.
-        height_mm: distance between the centre lines of the top strokes and of the bar.
-        width_mm: width of the strokes.
+    A bar under the digits distinguishes 6 from 9 and connects them; `height_mm` is from the centre lines of the top
+    strokes to that of the bar.
     """
     digit_mm = max(height_mm - width_mm, height_mm / 2)
     advance_mm = digit_mm / 2 + width_mm + max(width_mm, 0.25 * digit_mm)
@@ -164,19 +150,12 @@ def _find_free(
 
 
 class CommonTrack(NamedTuple):
-    """A stretch of a track that lies over a deeper one, so that it has no floor of silicone.
+    """A stretch of a track that lies over a deeper one, so that it has no floor of silicone."""
 
-    Attributes:
-        shallow: index of the upper fibre.
-        deep: index of the fibre below it.
-        length_mm: length over which the centre lines are closer than a track's width.
-        position_mm: middle of the stretch.
-    """
-
-    shallow: int
-    deep: int
-    length_mm: float
-    position_mm: tuple[float, float]
+    shallow: int  # index of the upper fibre
+    deep: int  # index of the fibre below it
+    length_mm: float  # over which the centre lines are closer than a track's width
+    position_mm: tuple[float, float]  # middle of the stretch
 
 
 @dataclass(frozen=True)
@@ -241,12 +220,12 @@ class Plan:
             past_mm: length of the paths beyond the outer ends of the exits.
         """
         past = self.settings.mould.exit_mm, past_mm
-        curves = flatten(self.pad, tolerance_mm / self.pad.unit_mm)
+        lines = curves.flatten(self.pad, tolerance_mm / self.pad.unit_mm)
         paths = []
-        for (start, end), curve in zip(self.leads.pairs, curves, strict=True):
+        for (start, end), line in zip(self.leads.pairs, lines, strict=True):
             bends = start.flatten_bends(tolerance_mm)[::-1], end.flatten_bends(tolerance_mm)
             ends = start.point_past_edge(*past), end.point_past_edge(*past)
-            paths.append(np.vstack([ends[0], bends[0], self.pad.to_mm(curve), bends[1], ends[1]]))
+            paths.append(np.vstack([ends[0], bends[0], self.pad.to_mm(line), bends[1], ends[1]]))
         return paths
 
     def trace(self, step: float, past_mm: float) -> list[tuple[Array, Array]]:
@@ -260,8 +239,9 @@ class Plan:
         """
         past = self.settings.mould.exit_mm + past_mm
         traces = []
-        for fibre, (spans, slopes) in enumerate(zip(beziers(self.pad), slope_beziers(self.pad), strict=True)):
-            points, headings = trace_curve(spans, slopes, step)
+        shapes = zip(curves.beziers(self.pad), curves.slope_beziers(self.pad), strict=True)
+        for fibre, (spans, slopes) in enumerate(shapes):
+            points, headings = curves.trace_curve(spans, slopes, step)
             (start, start_headings), (end, end_headings) = (lead.trace(step, past) for lead in self.leads.pairs[fibre])
             headings = np.pi / 2 - headings if self.family(fibre) else headings
             headings = np.concatenate([start_headings[::-1] + np.pi, headings, end_headings])
@@ -279,19 +259,11 @@ class Plan:
             return self.nominal.leads.scaled(1 / self.nominal.settings.shrinkage_factor)
         return one_side_leads(ends, pad.layout, lead_spacing(self.settings, self.heights_mm[-1], self.flare_mm))
 
-    def ends(self, end: int) -> list[Lead]:
-        """Return the leads at the starts (`end` = 0) or at the ends (1) of all fibres.
-
-        Args:
-            end: 0 for the starts, 1 for the other ends.
-        """
-        return [pair[end] for pair in self.leads.pairs]
-
     @cached_property
     def lengths_mm(self) -> Array:
         """Length of every fibre within the silicone, tongues included; shape (F,)."""
         leads = [start.length_mm + end.length_mm for start, end in self.leads.pairs]
-        return lengths(self.pad) * self.pad.unit_mm + leads + 2 * self.settings.mould.exit_mm
+        return curves.lengths(self.pad) * self.pad.unit_mm + leads + 2 * self.settings.mould.exit_mm
 
     @property
     def min_pitch_mm(self) -> float:
@@ -307,12 +279,12 @@ class Plan:
         return self.pad.layout.family(fibre)
 
     @cached_property
-    def crossings(self) -> list[Crossing]:
+    def crossings(self) -> list[curves.Crossing]:
         """Crossings of all fibres, with positions in grid units."""
-        return crossings(self.pad, self.settings.mould.tolerance_mm / self.pad.unit_mm)
+        return curves.crossings(self.pad, self.settings.mould.tolerance_mm / self.pad.unit_mm)
 
     @cached_property
-    def clashes(self) -> list[Crossing]:
+    def clashes(self) -> list[curves.Crossing]:
         """The crossings within a family."""
         return [c for c in self.crossings if self.family(c.first) == self.family(c.second)]
 
@@ -351,7 +323,7 @@ class Plan:
             shallow = self.layer_fibres(layer)
             deep = [fibre for fibre, index in enumerate(self.layer_indices) if index > layer]
             lines = [[shapely.get_coordinates(self.lines[fibre]) for fibre in fibres] for fibres in (shallow, deep)]
-            shared = common_stretches(*lines, self.settings.mould.ridge_width_mm)
+            shared = curves.common_stretches(*lines, self.settings.mould.ridge_width_mm)
             for line, other, start, end in zip(shared.line, shared.other, shared.begin, shared.end, strict=True):
                 middle = self.lines[shallow[line]].interpolate((start + end) / 2)
                 stretches.append(CommonTrack(shallow[line], deep[other], float(end - start), (middle.x, middle.y)))
@@ -428,7 +400,7 @@ class Plan:
         """
         mould = self.settings.mould
         half = mould.exit_width_mm / 2
-        leads = [*self.ends(0), *self.ends(1)] if mould.exit_mm else []
+        leads = [pair[end] for end in (0, 1) for pair in self.leads.pairs] if mould.exit_mm else []
         return [self.leads.box_at_edge(lead, half, -half, mould.exit_mm) for lead in leads]
 
     @cached_property
@@ -440,13 +412,9 @@ class Plan:
         if not self.settings.pad.keep_out_mm:
             return shapely.MultiPolygon()
         into_mm = self.flare_mm + INTO_WALL_MM
-        outlines = shapely.union_all(
-            [
-                self._disc(*keep_out[:3]) if is_hole(keep_out) else shapely.Polygon(keep_out)
-                for keep_out in self.settings.pad.keep_out_mm
-            ]
-        )
-        outlines = outlines.intersection(self.cavity.buffer(into_mm, join_style="mitre"))
+        keep_outs = self.settings.pad.keep_out_mm
+        discs = [self._disc(*each[:3]) if is_hole(each) else shapely.Polygon(each) for each in keep_outs]
+        outlines = shapely.union_all(discs).intersection(self.cavity.buffer(into_mm, join_style="mitre"))
         low, high = np.reshape(self.cavity.bounds, (2, 2))
         for axis in (0, 1):  # in sequence, so that corners are filled as well
             outlines = shapely.union_all([outlines, *_wall_extensions(outlines, low, high, axis, into_mm)])
@@ -547,21 +515,13 @@ def offset_box(area: BaseGeometry, *out_mm: float) -> shapely.Polygon:
 
 @dataclass(frozen=True)
 class FibreLayer:
-    """The fibres of one depth, all of one family.
+    """The fibres of one depth, all of one family."""
 
-    Attributes:
-        family: 0 horizontal, 1 vertical.
-        index: index of the layer, as in `Plan.layer_indices`.
-        depth_mm: depth of the tracks in the casting.
-        fibres: indices of the fibres, 0..F-1.
-        colour: "#rrggbb", that of the family for its deepest layer, and paler for shallower ones.
-    """
-
-    family: int
-    index: int
-    depth_mm: float
-    fibres: tuple[int, ...]
-    colour: str
+    family: int  # 0 horizontal, 1 vertical
+    index: int  # of the layer, as in `Plan.layer_indices`
+    depth_mm: float  # of the tracks in the casting
+    fibres: tuple[int, ...]  # indices, 0..F-1
+    colour: str  # "#rrggbb", that of the family for its deepest layer, and paler for shallower ones
 
     @property
     def name(self) -> str:

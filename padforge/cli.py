@@ -222,5 +222,4 @@ def _report(folder: Path) -> None:
 
 
 def main() -> None:
-    """Run the command line."""
     sys.exit(common.run_to_end(cli, "padforge", EXTRAS))

@@ -12,13 +12,7 @@ PAD = "morphology.json"
 
 
 def write_report(folder: Path) -> Path:
-    """Write `report.html` with a section on each stage that has results in a folder.
-
-    Args:
-        folder: folder of the pad.
-
-    Returns:
-        Path of the page.
+    """Write `report.html` with a section on each stage that has results in the folder of a pad.
 
     Raises:
         InputError: there are no results, or a file is damaged.

@@ -70,27 +70,15 @@ def _read_localizer(spec: "Spec", seed: int | None = None) -> "LocalizerSettings
 
 @dataclass(frozen=True)
 class Run:
-    """The request for a run.
+    """The request for a run."""
 
-    Attributes:
-        spec: settings of all stages.
-        out: folder of the pad.
-        seed: seed of every random choice; that of each section if None.
-        formats: file formats of the mould, see `padforge.fabricate.export.FORMATS`.
-        resume: whether to reuse the stages that an earlier run has finished.
-        time_budget: seconds for all stages together; unlimited if None.
-        force: whether to replace a pad from which other files in `out` were made, and a localizer that was not trained
-            on simulated presses.
-        started_s: start on the clock of `time.monotonic`.
-    """
-
-    spec: "Spec"
-    out: Path
-    seed: int | None = None
-    formats: tuple[str, ...] = ("stl", "step", "svg", "png")
-    resume: bool = False
-    time_budget: float | None = None
-    force: bool = False
+    spec: "Spec"  # settings of all stages
+    out: Path  # folder of the pad
+    seed: int | None = None  # of every random choice; that of each section if None
+    formats: tuple[str, ...] = ("stl", "step", "svg", "png")  # of the mould
+    resume: bool = False  # whether to reuse the stages that an earlier run has finished
+    time_budget: float | None = None  # seconds for all stages together; unlimited if None
+    force: bool = False  # replace also a pad that is in use, and a localizer not trained on simulated presses
     started_s: float = field(default_factory=time.monotonic)
 
     def remaining_s(self, share: float = 1.0, reserve_s: float = 0.0) -> float | None:
@@ -126,13 +114,8 @@ class _StageCache:
     ) -> Result:
         """Return the result of a stage, loaded if an earlier run had the same settings and inputs, otherwise computed.
 
-        Args:
-            stage: name of the stage.
-            files: returns the names of a result's files; results without files are not recorded.
-            compute: computes the result; its argument is a function that it may call to record the result as soon as
-                its files are written.
-            load: loads an earlier result.
-            **inputs: digests of the inputs.
+        `files` returns the names of a result's files; results without files are not recorded. The argument of `compute`
+        is a function that it may call to record the result as soon as its files are written. `inputs` are digests.
         """
         from padforge.design.settings import Contact
 
@@ -232,16 +215,9 @@ def run_stages(
     search_progress: "Callable[[], AbstractContextManager[OnProgress]]",
     training_progress: "Callable[[], AbstractContextManager[OnProgress]]",
 ) -> int:
-    """Run all stages into `run.out`.
+    """Run all stages into `run.out`, and return the exit code: 1 if a rule or a check fails, 130 after an interrupt.
 
-    Args:
-        run: the request.
-        on_line: receives the lines that summarize every stage, one by one.
-        search_progress: opens a display that receives the progress of the search.
-        training_progress: opens a display that receives the progress of the training.
-
-    Returns:
-        The exit code: 0, 1 if a rule or a check of the mould fails, or 130 if the search was interrupted.
+    `on_line` receives the lines that summarize every stage; the other two open displays of progress.
     """
     from padforge.common.parallel import Checkpoints
     from padforge.design.contact_comparison import compare_contacts

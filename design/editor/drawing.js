@@ -26,9 +26,9 @@ function build(view, handlers) {
   layers.fibres = view.fibres.map((fibre, index) => {
     const group = svgElement("g", {class: `f${fibre.family}`})
     const parts = ["halo", "path", "hit"].map(name => svgElement("path", {class: name}))
-    const [ex, ey] = fibre.knots.at(-1), horizontal = fibre.family === 0
+    const [sx, sy] = fibre.knots[0], horizontal = fibre.family === 0 // inside the left edge, beside which heights stand
     const label = svgElement("text", {
-      x: x(ex) + (horizontal ? 5 : 0), y: y(ey) + (horizontal ? 4 : -6), "text-anchor": horizontal ? "start" : "middle",
+      x: x(sx) + (horizontal ? 4 : 0), y: y(sy) + (horizontal ? -5 : 12), "text-anchor": horizontal ? "start" : "middle",
     }, index + 1)
     parts[2].addEventListener("pointerdown", () => handlers.select(index))
     parts[2].addEventListener("dblclick", event => handlers.add(index, event))

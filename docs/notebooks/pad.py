@@ -35,7 +35,8 @@ Image("plan.png")
 #
 # The mould is an inverse one: its ridges become the tracks that the fibres are laid in. `build` writes the files that a
 # lab prints and works by, among them `mould.stl`, `mould.step` and the page `laying.md`; `build_mould` gives the same
-# solid to [build123d](https://build123d.readthedocs.io), to be edited.
+# solid to [build123d](https://build123d.readthedocs.io), to be edited. Its numbers are mirrored on purpose: on the
+# casting they read the right way.
 
 # %%
 built = fabricate.build(found.morphology, "mould", formats=["stl", "png"])

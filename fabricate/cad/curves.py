@@ -36,16 +36,10 @@ _ALONG_FACTOR = 20  # tolerance of the parameter against the arc length over tha
 
 @dataclass(frozen=True, eq=False)
 class OutlineCurve:
-    """A smooth run of an outline: a straight line unless it has an arc or a spline.
+    """A smooth run of an outline: a straight line unless it has an arc or a spline."""
 
-    Attributes:
-        points: vertices of an arc, the two ends of a line or a spline; shape (n, 2).
-        spline: cubic spline over about its arc length; None for lines and arcs.
-        arc: arc; None for lines and splines.
-    """
-
-    points: Array
-    spline: BSpline | None = None
+    points: Array  # vertices of an arc, the two ends of a line or a spline; shape (n, 2)
+    spline: BSpline | None = None  # cubic, over about its arc length
     arc: Arc | None = None
 
 
@@ -164,15 +158,9 @@ def fit_arc(points: Array) -> Arc | None:
 
 
 def fit_spline(points: Array, tangents: Sequence[Array], fit_mm: float) -> BSpline:
-    """Fit a cubic spline of few spans to a polyline, parametrised by its arc length.
+    """Fit a cubic spline of few spans to a polyline (n, 2), n > 2, parametrised by its arc length.
 
-    1. Interpolate sites of the polyline, and add sites where the error exceeds the tolerance.
-    2. Use the sites as knots of a least-squares fit, and remove every knot that the tolerance does not need.
-
-    Args:
-        points: vertices; shape (n, 2), n > 2; the ends are exact.
-        tangents: unit directions (2,) at the ends.
-        fit_mm: tolerance against the whole polyline.
+    The ends are exact, and have the `tangents`, unit directions (2,). `fit_mm` is the tolerance against the whole line.
     """
     s, samples, normals, vertices = _sample_edges(points)
     s *= max(np.round(s[-1], _KNOT_DECIMALS), _MIN_SPAN_MM) / s[-1]
@@ -187,6 +175,7 @@ def fit_spline(points: Array, tangents: Sequence[Array], fit_mm: float) -> BSpli
         is_close = (across <= fit_mm) & ((error**2).sum(axis=1) <= (fit_mm * _ALONG_FACTOR) ** 2)
         return BSpline.construct_fast(padded, poles, 3), is_close
 
+    # 1. Interpolate sites of the polyline, and add sites where the error exceeds the tolerance.
     sites = np.unique(vertices[[0, len(vertices) // 2, -1]])
     while True:
         best, is_close = fit(s[sites], sites)
@@ -194,6 +183,7 @@ def fit_spline(points: Array, tangents: Sequence[Array], fit_mm: float) -> BSpli
         if not gaps:
             break
         sites = np.union1d(sites, [_next_site(a, b, vertices) for a, b in gaps])
+    # 2. Use the sites as knots of a least-squares fit, and remove every knot that the tolerance does not need.
     inner = np.unique(np.round(s[sites], _KNOT_DECIMALS))
     inner = inner[(inner > _MIN_SPAN_MM) & (inner < s[-1] - _MIN_SPAN_MM)]
     knots = np.concatenate([s[:1], inner, s[-1:]])
@@ -206,13 +196,9 @@ def fit_spline(points: Array, tangents: Sequence[Array], fit_mm: float) -> BSpli
 
 
 def _fit_poles(knots: Array, basis: Array, samples: Array, tangents: Sequence[Array]) -> Array:
-    """Return the poles of the least-squares spline with given ends and tangents.
+    """Return the poles of the least-squares spline with given tangents through the first and the last of the samples.
 
-    Args:
-        knots: knots without their multiplicity.
-        basis: basis functions at the samples; shape (n, poles).
-        samples: points to fit, the first and the last exactly; shape (n, 2).
-        tangents: unit directions (2,) at the ends.
+    `knots` are without their multiplicity, `basis` (n, poles) are the basis functions at the samples (n, 2).
     """
     poles = np.zeros((basis.shape[1], 2))
     poles[0], poles[-1] = samples[0], samples[-1]

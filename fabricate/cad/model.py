@@ -43,17 +43,9 @@ from shapely import affinity
 from padforge.common.plotting import HORIZONTAL, VERTICAL
 from padforge.common.validation import InputError
 from padforge.design.morphology import Morphology
+from padforge.fabricate import mould
 from padforge.fabricate.mesh import build_mesh
-from padforge.fabricate.mould import (
-    BODY_COLOURS,
-    Body,
-    Prism,
-    conductive_plan,
-    fibre_wells,
-    number_prisms,
-    ridge_prisms,
-    tray_body,
-)
+from padforge.fabricate.mould import BODY_COLOURS, Body, Prism
 from padforge.fabricate.plan import Plan, fibre_name, polygon_rings
 from padforge.fabricate.settings import DEFAULTS, FabricationSettings
 
@@ -85,17 +77,11 @@ _INTO_TERRACE_MM = 0.005  # overlap of a terrace with the one below, so that no 
 
 @dataclass(frozen=True)
 class CadPart:
-    """A part of a printed body.
+    """A part of a printed body."""
 
-    Attributes:
-        shape: named and coloured; a solid, or an assembly of solids.
-        deviation: maximum relative deviation of a solid's volume from that of its prisms as a mesh.
-        fit_mm: tolerance of curves against outlines that are drawn within `FINE_MM`; 0 without curves.
-    """
-
-    shape: Solid | Compound
-    deviation: float
-    fit_mm: float = 0.0
+    shape: Solid | Compound  # named and coloured; a solid, or an assembly of solids
+    deviation: float  # maximum relative deviation of a solid's volume from that of its prisms as a mesh
+    fit_mm: float = 0.0  # tolerance of curves against outlines that are drawn within `FINE_MM`; 0 without curves
 
 
 def build_mould(pad: Morphology, settings: FabricationSettings = DEFAULTS, *, fused: bool = False) -> Compound | Solid:
@@ -120,16 +106,12 @@ def build_mould(pad: Morphology, settings: FabricationSettings = DEFAULTS, *, fu
 
 
 def mould_parts(plan: Plan, name: str) -> list[CadPart]:
-    """Build the parts of a mould from its shrinkage-compensated plan; it has wells if `name` is "conductive".
-
-    Raises:
-        InputError: the CAD kernel finds a solid invalid at every tolerance.
-    """
-    parts = [_build_part("tray", BODY_COLOURS["mould"], tray_body(plan), name)]
+    """Build the parts of a mould from its shrinkage-compensated plan; it has wells if `name` is "conductive"."""
+    parts = [_build_part("tray", BODY_COLOURS["mould"], mould.tray_body(plan), name)]
     parts += [_ridge_part(plan, fibre, name) for fibre in range(plan.pad.layout.fibres)]
     numbers = [
         _build_part(f"number {fibre}", "#5D6B7A", Body((prism,)), name)
-        for fibre, prism in enumerate(number_prisms(plan), 1)
+        for fibre, prism in enumerate(mould.number_prisms(plan), 1)
         if prism
     ]
     if numbers:
@@ -145,9 +127,8 @@ def _build_part(name: str, colour: str, body: Body, printed: str) -> CadPart:
         raise InputError(f"{printed}: the CAD kernel finds its {name} invalid; leave step out of the formats")
     deviation = abs(solid.volume / build_mesh(body).volume() - 1)
     if not deviation <= MAX_BODY_DEVIATION:  # NaN fails as well
-        error = f"volume {100 * deviation:.3g} % off"
-        message = f"{printed}: the CAD solid of its {name} does not match its mesh ({error}); nothing was written"
-        raise InputError(message)
+        error = f"does not match its mesh (volume {100 * deviation:.3g} % off); nothing was written"
+        raise InputError(f"{printed}: the CAD solid of its {name} {error}")
     return CadPart(_label(solid, name, colour), deviation)
 
 
@@ -164,8 +145,8 @@ def _ridge_part(plan: Plan, fibre: int, printed: str) -> CadPart:
     """
     name, colour = fibre_name(plan, fibre), (HORIZONTAL, VERTICAL)[plan.family(fibre)]
     top = plan.outline([fibre], 0.0, FINE_MM)
-    top = top | fibre_wells(plan, fibre, _WELL_SIDES) if printed == "conductive" else top
-    prisms = ridge_prisms(plan, [fibre], top, FINE_MM)
+    top = top | mould.fibre_wells(plan, fibre, _WELL_SIDES) if printed == "conductive" else top
+    prisms = mould.ridge_prisms(plan, [fibre], top, FINE_MM)
     volume_mm3 = build_mesh(Body(tuple(prisms))).volume()
     for fit_mm in FIT_TOLERANCES_MM:
         try:
@@ -204,9 +185,9 @@ def _ridge_solid(plan: Plan, fibre: int, prisms: Sequence[Prism], fit_mm: float)
 
 def _extrude(plan: Plan, fibre: int, prism: Prism, fit_mm: float) -> Solid:
     """Extrude the exact outline of a terrace of a fibre's ridge, which is a single polygon."""
-    mould = plan.settings.mould
-    below_mm = mould.floor_mm + plan.heights_mm[plan.layer_indices[fibre]] - prism.top_mm
-    joints = find_joints(plan, fibre, mould.ridge_width_mm / 2 + below_mm * plan.settings.ridge_slope)
+    settings = plan.settings
+    below_mm = settings.mould.floor_mm + plan.heights_mm[plan.layer_indices[fibre]] - prism.top_mm
+    joints = find_joints(plan, fibre, settings.mould.ridge_width_mm / 2 + below_mm * settings.ridge_slope)
     outline = shapely.remove_repeated_points(insert_joints(prism.area, joints), _MIN_EDGE_MM)
     (rings,) = polygon_rings(outline)
     curves = [ring_curves(ring, joints, fit_mm) for ring in rings]
@@ -232,17 +213,13 @@ def _edge(curve: OutlineCurve, z: float) -> Edge:
 
 
 def build_parts(plan: Plan, bodies: Mapping[str, Body]) -> dict[str, list[CadPart]]:
-    """Build the parts of all printed bodies of a pad from the plan of the finished pad, in their order.
-
-    Raises:
-        InputError: the CAD kernel finds a solid invalid.
-    """
+    """Build the parts of all printed bodies of a pad from the plan of the finished pad, in their order."""
     built = {}
     for name, body in bodies.items():
         if name == "mould":
             built[name] = mould_parts(plan.shrinkage_compensated, name)
         elif name == "conductive":
-            built[name] = mould_parts(conductive_plan(plan).shrinkage_compensated, name)
+            built[name] = mould_parts(mould.conductive_plan(plan).shrinkage_compensated, name)
         else:
             built[name] = [_build_part(name, BODY_COLOURS[name], body, name)]
     return built
@@ -268,11 +245,7 @@ def assemble(bodies: Mapping[str, Sequence[CadPart]], plan: Plan) -> Compound:
 
 
 def fuse(parts: Sequence[CadPart], name: str) -> Solid:
-    """Unite the parts of a body into one solid, in a process that is killed after `FUSE_S`.
-
-    Raises:
-        InputError: the kernel does not make one valid solid within `FUSE_S`.
-    """
+    """Unite the parts of a body into one solid, in a process that is killed after `FUSE_S`."""
     with TemporaryDirectory() as folder:
         solids = [solid for part in parts for solid in part.shape.solids()]
         paths = [Path(folder) / f"{k}.brep" for k in range(len(solids))]

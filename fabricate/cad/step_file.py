@@ -34,15 +34,7 @@ _TIMESTAMP = "2000-01-01T00:00:00"  # a STEP file must have one; a constant make
 
 
 def write_step(path: Path, shape: Compound | Solid) -> None:
-    """Write a shape with the names and colours of its parts.
-
-    Args:
-        path: file to write.
-        shape: a solid, or an assembly whose leaves are solids.
-
-    Raises:
-        OSError: the file cannot be written.
-    """
+    """Write a solid, or an assembly whose leaves are solids, with the names and colours of its parts."""
     for printer in Message.DefaultMessenger_s().Printers():
         printer.SetTraceLevel(Message_Gravity.Message_Fail)
     STEPControl_Controller.Init_s()

@@ -12,20 +12,8 @@ from shapely.geometry.base import BaseGeometry
 
 from padforge.common.validation import check_float, check_int, check_type
 from padforge.design.morphology import Array
-from padforge.fabricate.checks import Finding, Status, check_result
-from padforge.fabricate.checks.surface import (
-    SPECK_MM2,
-    FaceMask,
-    Slab,
-    TriangleMesh,
-    build_slabs,
-    compute_min_width,
-    cut_solid,
-    fill_outline,
-    find_narrow_parts,
-    find_overlaps,
-    tested_width,
-)
+from padforge.fabricate.checks import Finding, Status, check_result, surface
+from padforge.fabricate.checks.surface import SPECK_MM2, FaceMask, Slab, TriangleMesh, tested_width
 from padforge.fabricate.mesh import read_mesh
 from padforge.fabricate.plan import areas, overlap, without
 from padforge.fabricate.settings import DEFAULTS, PrinterSettings
@@ -48,7 +36,7 @@ _MAX_SHELLS = 100  # shells that are classified as bodies or hollows; more are d
 def check_mesh(
     path: Path, printer: PrinterSettings = DEFAULTS.printer, min_silicone_mm: float = 0.4, genus: int | None = None
 ) -> list[Finding]:
-    """Run all checks on a mesh file of any origin.
+    """Run all checks on a mesh file of any origin, which stands as it is printed, open side up.
 
     Args:
         path: STL or 3MF file.
@@ -57,7 +45,9 @@ def check_mesh(
         genus: required number of through holes; None if unknown.
 
     Returns:
-        The findings of `check_triangles`.
+        `SOLID_CHECKS` and bed; for a solid that can be cut wall_thickness, floor_thickness, overhang, undercut,
+        self_intersection, ridge_width, silicone_wall and tight. If the mesh is too small to be in mm, only unit; if a
+        mould faces the wrong way, pose in place of the checks that need its orientation.
 
     Raises:
         InputError: the file cannot be read, or an argument is out of range.
@@ -73,21 +63,10 @@ def check_triangles(
     genus: int | None = None,
     has_plan: bool = False,
 ) -> list[Finding]:
-    """Run all checks on a mesh that stands as it is printed, open side up.
+    """Run all checks of `check_mesh` on vertices (n, 3), mm, and triangles (m, 3), counter-clockwise from outside.
 
-    Args:
-        vertices: vertices (n, 3), mm; equal ones are merged.
-        triangles: vertex indices (m, 3), counter-clockwise seen from outside.
-        printer: see `check_mesh`.
-        min_silicone_mm: see `check_mesh`.
-        genus: see `check_mesh`.
-        has_plan: whether the mesh was built from a plan, which is checked for widths faster and exactly, and by
-            manifold3d, which builds no surface that intersects itself.
-
-    Returns:
-        `SOLID_CHECKS` and bed; for a solid that can be cut wall_thickness, floor_thickness, overhang and undercut, and
-        without a plan self_intersection, ridge_width, silicone_wall and tight. If the mesh is too small to be in mm,
-        only unit; if a mould faces the wrong way, pose in place of the checks that need its orientation.
+    A mesh that `has_plan` was built from a plan, which is checked for widths faster and exactly, and by manifold3d,
+    which builds no surface that intersects itself.
     """
     check_type("printer", printer, PrinterSettings)
     min_silicone_mm = check_float("min_silicone_mm", min_silicone_mm, 0, 10)
@@ -98,7 +77,7 @@ def check_triangles(
     findings = [*check_solid(mesh, genus), _check_bed(mesh, printer)]
     if any(finding.name in ("manifold", "volume") and finding.status == "fail" for finding in findings):
         return findings
-    slabs, size = build_slabs(mesh, printer.layer_mm), float(np.ptp(mesh.bounds, axis=0).max())
+    slabs, size = surface.build_slabs(mesh, printer.layer_mm), float(np.ptp(mesh.bounds, axis=0).max())
     cast = [slab for slab in slabs if slab.void.area]
     if not has_plan and (side := _find_open_side(mesh, slabs, printer.layer_mm)):
         message = f"it lies with its open side {side}: turn it up"
@@ -140,7 +119,7 @@ def _find_open_side(mesh: TriangleMesh, slabs: Sequence[Slab], layer_mm: float) 
         return ""
     for side, rotation in _POSES.items():
         turned = TriangleMesh.weld(mesh.vertices @ rotation.T, mesh.triangles)
-        if is_tray(turned, build_slabs(turned, layer_mm)):
+        if is_tray(turned, surface.build_slabs(turned, layer_mm)):
             return side
     return ""
 
@@ -228,7 +207,7 @@ def _check_bed(mesh: TriangleMesh, printer: PrinterSettings) -> Finding:
 
 def _check_self_intersection(mesh: TriangleMesh, slabs: Sequence[Slab]) -> Finding:
     """Check that no cross section half way up a slab overlaps itself."""
-    overlaps = np.vstack([find_overlaps(mesh, slab.middle_mm) for slab in slabs])
+    overlaps = np.vstack([surface.find_overlaps(mesh, slab.middle_mm) for slab in slabs])
     positions = _deduplicate(overlaps)
     count = len(positions)
     where = f"{count} position{'s' * (count > 1)}"
@@ -283,13 +262,11 @@ def _silicone_area(slab: Slab, cast: Sequence[Slab], limit: float) -> BaseGeomet
 
 
 def _find_narrowest(sections: Sequence[tuple[BaseGeometry, BaseGeometry | None]], limit: float) -> tuple[float, Array]:
-    """Return the minimum width of areas, at most `limit`, and the positions of all narrow parts.
+    """Return the minimum width of areas, at most `limit`, and the positions of all parts below it.
 
-    Args:
-        sections: pairs of an area and of an area to which its narrow parts are clipped, or None.
-        limit: width below which parts are narrow, mm.
+    `sections` are pairs of an area and of an area to which its narrow parts are clipped, or None.
     """
-    parts, widths = zip(*(find_narrow_parts(area, limit, within) for area, within in sections), strict=True)
+    parts, widths = zip(*(surface.find_narrow_parts(area, limit, within) for area, within in sections), strict=True)
     merged = shapely.get_parts(shapely.union_all(np.concatenate(parts)))  # some lie in several slabs
     return min(widths), _deduplicate(shapely.get_coordinates(shapely.point_on_surface(merged)))
 
@@ -300,10 +277,10 @@ def _check_wall_thickness(cast: Sequence[Slab], printer: PrinterSettings, size: 
     if not cast:
         return Finding("wall_thickness", "pass", size, limit, "it has no walls around a casting")
     rim = cast[-1]
-    area = cut_solid(rim.solid, rim.top_mm - min(printer.layer_mm, rim.top_mm - rim.bottom_mm) / 2)
+    area = surface.cut_solid(rim.solid, rim.top_mm - min(printer.layer_mm, rim.top_mm - rim.bottom_mm) / 2)
     width, positions = _find_narrowest([(area, None)], limit)
     if not len(positions):
-        width = compute_min_width(area, limit)
+        width = surface.compute_min_width(area, limit)
     status: Status = "pass" if not len(positions) else "warn" if width > tested_width(printer.line_mm) else "fail"
     message = f"the walls are {width:.2f} mm thick at the rim, {_WALL_LINES} lines of the printer {limit:g} mm"
     return check_result("wall_thickness", status, width, limit, message, positions)
@@ -391,8 +368,8 @@ def _faces_at_silicone(mesh: TriangleMesh, mask: FaceMask, lowest: Slab) -> Face
     has_floor = shapely.contains_xy(lowest.base, x, y)
     for index in largest:
         selected = height == index
-        area = cut_solid(mesh.solid, float(z[selected].min()))
-        is_enclosed = shapely.contains_xy(fill_outline(area), x[selected], y[selected])
+        area = surface.cut_solid(mesh.solid, float(z[selected].min()))
+        is_enclosed = shapely.contains_xy(surface.fill_outline(area), x[selected], y[selected])
         is_solid = shapely.contains_xy(area, x[selected], y[selected])
         result[faces[selected]] = is_enclosed & ~is_solid & has_floor[selected]
     return result

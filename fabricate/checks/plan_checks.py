@@ -40,11 +40,7 @@ def check(pad: Morphology, settings: FabricationSettings = DEFAULTS) -> list[Fin
 
 
 def check_file(source: Path, settings: FabricationSettings = DEFAULTS) -> CheckedMesh:
-    """Run all checks on a mesh (.stl, .3mf), or on the mould of a morphology (.json, .mat).
-
-    Raises:
-        InputError: the file is of another kind or cannot be read, or settings contradict each other.
-    """
+    """Run all checks on a mesh (.stl, .3mf), or on the mould of a morphology (.json, .mat)."""
     kind = source.suffix.lower()
     if kind not in (".stl", ".3mf", ".json", ".mat"):
         raise InputError(f"{source}: no file to check, allowed are a mesh .stl or .3mf, a morphology .json or .mat")
@@ -374,16 +370,13 @@ def _check_keep_outs(plan: Plan) -> Iterator[Finding]:
 
 
 def compute_bending_strains(plan: Plan) -> list[tuple[float, float, Position]]:
-    """Compute the maximum strain of the fibres at every depth of a pad bent to `[pad] bent_radius_mm`.
+    """Compute the maximum strain of the fibres of every layer of a pad bent to `[pad] bent_radius_mm`; [] if flat.
 
     The axis of bending is y, and the pressed face, with the tracks, is outside. The neutral surface of a plate of
     thickness t with an inner radius R has the radius R + t / 2. At a distance z outside of it, lengths along x grow by
     the factor 1 + z / (R + t / 2), and lengths along y are constant. To first order, the strain of an element at an
     angle a to x is cos(a)^2 z / (R + t / 2). The axis of a fibre is half a diameter above the bottom of its track.
-
-    Returns:
-        (depth, strain, position) of every layer, the shallowest first, mm; negative strains are compressive; [] for a
-        flat pad.
+    Each layer, the shallowest first, has its depth, its strain, negative if compressive, and where that is.
     """
     radius = plan.settings.pad.bent_radius_mm
     if radius is None:

@@ -25,15 +25,10 @@ _NEEDLE_MM = 1e-3  # the normal of a triangle of less height is unreliable becau
 
 @dataclass(frozen=True, eq=False)
 class TriangleMesh:
-    """Triangle mesh; derived quantities are computed on first use.
+    """Triangle mesh; derived quantities are computed on first use."""
 
-    Attributes:
-        vertices: different vertices (n, 3), mm.
-        triangles: vertex indices (m, 3), three different ones in each row.
-    """
-
-    vertices: Array
-    triangles: Numbers
+    vertices: Array  # different ones; shape (n, 3), mm
+    triangles: Numbers  # vertex indices, three different ones in each row; shape (m, 3)
 
     @classmethod
     def weld(cls, vertices: ArrayLike, triangles: ArrayLike) -> "TriangleMesh":
@@ -148,28 +143,19 @@ _PRECISION = 0.02  # relative precision of widths, unless `_LINE_MM` is more
 
 @dataclass(frozen=True, eq=False)
 class Slab:
-    """Part of a solid between two heights, with a nearly constant cross section.
-
-    Attributes:
-        bottom_mm: z of the lower end.
-        top_mm: z of the upper end.
-        solid: the manifold3d solid.
-        base: cross section half way up the lowest slab.
-    """
+    """Part of a solid between two heights, with a nearly constant cross section."""
 
     bottom_mm: float
     top_mm: float
-    solid: Any
-    base: BaseGeometry
+    solid: Any  # of manifold3d
+    base: BaseGeometry  # cross section half way up the lowest slab
 
     @property
     def middle_mm(self) -> float:
-        """z of the cross section."""
         return (self.bottom_mm + self.top_mm) / 2
 
     @cached_property
     def cross_section(self) -> BaseGeometry:
-        """Cross section half way up the slab."""
         return cut_solid(self.solid, self.middle_mm)
 
     @cached_property
@@ -274,10 +260,9 @@ def tested_width(limit: float) -> float:
 
 
 def find_narrow_parts(area: BaseGeometry, limit: float, within: BaseGeometry | None = None) -> tuple[Shapes, float]:
-    """Find the parts of an area narrower than `tested_width` of a limit, mm, clipped to another area, if any.
+    """Find the parts (k,) of an area narrower than `tested_width` of a limit, mm, clipped to another area, if any.
 
-    Returns:
-        The parts (k,), and the width of the narrowest, by bisection, mm; `limit` if there is none.
+    The width of the narrowest, by bisection, is returned as well; `limit` if there is none.
     """
     low, high, tip = 0.0, tested_width(limit), _TIP * limit
     parts = narrow = _find_thin_walls(area, high, tip)

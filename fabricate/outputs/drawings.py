@@ -18,10 +18,7 @@ from padforge.fabricate.plan import FAMILIES, FAMILY_COLOURS, Plan, fibre_layers
 
 Bounds = tuple[float, float, float, float]
 
-_NAMESPACES = {
-    "xmlns": "http://www.w3.org/2000/svg",
-    "xmlns:inkscape": "http://www.inkscape.org/namespaces/inkscape",
-}
+_NAMESPACES = {"xmlns": "http://www.w3.org/2000/svg", "xmlns:inkscape": "http://www.inkscape.org/namespaces/inkscape"}
 _NOTE = "#555555"  # colour of notes
 ORIENTATION_FILE = "orientation.svg"
 ORIENTATION_CAPTION = "The pad in its mould, turned over, and in use, from above and from the near side."
@@ -29,6 +26,7 @@ ORIENTATION_LINK = f"![{ORIENTATION_CAPTION}]({ORIENTATION_FILE})"  # link to th
 CROSSING_FILE = "crossing.svg"
 CROSSING_CAPTION = "The two fibres that cross nearest to each other, in section: the pad lies turned over, to scale."
 CROSSING_LINK = f"![{CROSSING_CAPTION}]({CROSSING_FILE})"
+MIRRORED = "Its numbers are mirrored on purpose: on the casting they read the right way."
 _TURNED = (
     "The casting is turned over, left to right, and stays so: the face with the tracks and their numbers lies up, to be"
     " laid and then to be pressed; y runs as in the mould and x the other way (mirrored = true in [rig]); "
@@ -73,30 +71,21 @@ class _Label(NamedTuple):
 
 
 class _TrackSheet:
-    """Layout of the drawing of the tracks, mm, y upwards.
-
-    Attributes:
-        text_mm: text height.
-        sentence: sentence on the orientation.
-        spans: Bezier control points of every fibre and its leads; shape (n, 4, 2).
-        ends: start and end of every fibre at the silicone's edge; shape (F, 2, 2).
-        numbers: the fibres' numbers outside the silicone, at the starts; with leads to one side, at both ends.
-        scale_bar: segments of the scale bar; shape (4, 2, 2).
-        notes: lines of text beside the scale bar and below it.
-        frame: x_min, y_min, x_max and y_max of the drawing.
-    """
+    """Layout of the drawing of the tracks, mm, y upwards."""
 
     def __init__(self, plan: Plan) -> None:
         layout, pairs = plan.pad.layout, plan.leads.pairs
         x_min, y_min, x_max, y_max = plan.silicone.bounds
         self.text_mm = min(_TEXT_MM, 0.6 * plan.min_pitch_mm)
         self.sentence = orientation_sentence(layout.counts, plan.settings.pad.leads)
+        # Bezier control points of every fibre and its leads, each (n, 4, 2)
         self.spans = [
             np.concatenate([start.spans[::-1, ::-1], plan.pad.to_mm(curve), end.spans])
             for (start, end), curve in zip(pairs, beziers(plan.pad), strict=True)
         ]
         self.ends = np.array([[lead.point_past_edge(plan.settings.mould.exit_mm) for lead in pair] for pair in pairs])
 
+        # Outside the silicone, at the starts; with leads to one side, at both ends
         self.numbers: list[_Label] = []
         for ends in self.ends.swapaxes(0, 1)[: 1 + (plan.settings.pad.leads == "one side")].tolist():
             for fibre, (x, y) in enumerate(ends):

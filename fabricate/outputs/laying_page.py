@@ -13,7 +13,7 @@ import numpy as np
 
 from padforge.design.settings import is_hole
 from padforge.fabricate.materials import PLASTICS, PRODUCTS, divider_ohm
-from padforge.fabricate.outputs.drawings import CROSSING_LINK, ORIENTATION_LINK, orientation_sentence
+from padforge.fabricate.outputs.drawings import CROSSING_LINK, MIRRORED, ORIENTATION_LINK, orientation_sentence
 from padforge.fabricate.plan import Plan, fibre_layers, fibre_name, overlap
 from padforge.fabricate.settings import MouldSettings, PrinterSettings
 
@@ -71,22 +71,9 @@ _MAX_ROWS = 24  # of a table of crossings on a page
 
 
 def laying_document(plan: Plan, mould_mm3: float) -> dict[str, Any]:
-    """Build the sections of the fabrication document on casting and laying, as JSON.
+    """Build the sections of the fabrication document on casting and laying, which `Build` describes.
 
-    Args:
-        plan: plan of the finished pad.
-        mould_mm3: volume of the mould without its pins.
-
-    Returns:
-        "silicone": material and amounts to mix.
-        "adhesive": volume of adhesive that seals the tracks, by step of laying.
-        "order": amounts to order, and estimated hours of work.
-        "fibre": material of the fibres.
-        "fibres": one entry per fibre, in the order of their numbers.
-        "laying_order": the numbers laid in each step, the deepest first.
-        "crossings": all crossings, with the thickness of silicone between the fibres.
-        "common_tracks": stretches of tracks over deeper ones, if longer than two crossings at right angles.
-        "exits": with leads to one side, the numbers along it from left to right as the pad lies turned over.
+    `mould_mm3` is the volume of the mould without its pins.
     """
     document = {
         "silicone": _silicone(plan, mould_mm3),
@@ -237,17 +224,15 @@ def _pad_lines(document: Document) -> Iterator[str]:
     yield f"The pad is {width:.5g} x {height:.5g} mm, {thickness_mm:.3g} mm thick, with {n_fibres} fibres."
     keep_outs = document["settings"]["pad"]["keep_out_mm"]
     if holes := [keep_out for keep_out in keep_outs if is_hole(tuple(keep_out))]:
-        yield from ("", "It has these holes:", "")
+        yield "\nIt has these holes:\n"
         rows = []
         for x, y, diameter, *heads in holes:
             sunk = [f"{head:g} mm, {thickness_mm / 2:.3g} mm deep" for head in heads] or ["-"]
             rows.append((f"{x:g} mm", f"{y:g} mm", f"{diameter:g} mm", *sunk))
         yield from _table_lines(("x", "y", "diameter", "screw's head"), rows)
-        yield ""
-        yield (
-            "Positions are from the centre of the pad. As it lies to be used, tracks up, x runs to the left and y away"
-            " from you. The heads of screws sink into the face with the tracks."
-        )
+        yield """
+Positions are from the centre of the pad. As it lies to be used, tracks up, x runs to the left and y away from you. \
+The heads of screws sink into the face with the tracks."""
 
 
 def _order_lines(document: Document) -> Iterator[str]:
@@ -270,14 +255,11 @@ def _order_lines(document: Document) -> Iterator[str]:
     }
     rows = [(kind, amount, *PRODUCTS[kind]) for kind, amount in amounts.items() if amount]
     yield from _table_lines(("kind", "amount", "properties", "for example"), rows)
-    yield ""
-    yield (
-        f"The fibre includes {order['waste_percent']:g} % for waste."
-        f" The mould prints in about {order['print_h']:.1f} h, by rules of thumb; a slicer knows better."
-        f" Laying and sealing by hand takes about {order['laying_h']:.1f} h, an estimate of {LAY_MIN_PER_M:g} minutes"
-        f" a metre and {LAY_MIN_PER_CROSSING:g} minutes a crossing, without the time in which silicone and adhesive"
-        " cure."
-    )
+    yield f"""
+The fibre includes {order["waste_percent"]:g} % for waste. The mould prints in about {order["print_h"]:.1f} h, by \
+rules of thumb; a slicer knows better. Laying and sealing by hand takes about {order["laying_h"]:.1f} h, an estimate \
+of {LAY_MIN_PER_M:g} minutes a metre and {LAY_MIN_PER_CROSSING:g} minutes a crossing, without the time in which \
+silicone and adhesive cure."""
 
 
 def _print_lines(document: Document) -> Iterator[str]:
@@ -287,6 +269,8 @@ def _print_lines(document: Document) -> Iterator[str]:
     plastic, density = PLASTICS[printer.resin]
     yield f"- The mould is {size} mm and takes {volume_ml:.1f} ml, {volume_ml * density:.0f} g of {plastic} if solid."
     yield "- Print it as it lies, open side up, without supports."
+    if mould.number_mm:
+        yield f"- {MIRRORED}"
     if printer.resin:
         pixels = mould.ridge_width_mm / printer.nozzle_mm
         yield _RESIN_SETTINGS.format(
@@ -299,14 +283,13 @@ def _print_lines(document: Document) -> Iterator[str]:
     if mould.lid:
         yield "- Print the lid as well."
     if mould.holder:
-        yield (
-            "- Print the holder last, in the middle of the bed, and leave it there. The finished pad lies in it with"
-            f" its tracks up; {_cut_corner(settings['pad'])} the cut corner."
-        )
+        yield f"""\
+- Print the holder last, in the middle of the bed, and leave it there. The finished pad lies in it with its tracks up; \
+{_cut_corner(settings["pad"])} the cut corner."""
     if mould.conductive:
         yield "- The mould called `conductive` is for casting a conductive material in place of fibres."
     if not printer.resin:
-        yield from ("", "Slicer settings, by the names they have there:", "")
+        yield "\nSlicer settings, by the names they have there:\n"
         yield from _table_lines(PRINT_SETTINGS_HEAD, print_settings_rows(mould, printer))
 
 
@@ -349,16 +332,13 @@ def _mix_lines(silicone: Document) -> Iterator[str]:
     parts = [round(silicone[key], 1) for key in ("part_a_g", "part_b_g")]
     masses = [f"{mass:.1f} g" for mass in (*parts, sum(parts))]
     yield from _table_lines((silicone["name"], "part A", "part B", "together"), [("mass", *masses)])
-    yield ""
-    yield (
-        f"The mould holds {silicone['volume_ml']:.1f} ml, the pad is {silicone['thickness_mm']:.3g} mm thick."
-        f" The masses include {silicone['surplus_percent']:g} % for what stays in the cup."
-    )
+    yield f"""
+The mould holds {silicone["volume_ml"]:.1f} ml, the pad is {silicone["thickness_mm"]:.3g} mm thick. The masses include \
+{silicone["surplus_percent"]:g} % for what stays in the cup."""
     if silicone["shrinkage"]:
-        yield (
-            f"The silicone shrinks by {100 * silicone['shrinkage']:.3g} % as it cures, and the mould is larger by that."
-            " Lengths and positions below are those of the pad."
-        )
+        yield f"""\
+The silicone shrinks by {100 * silicone["shrinkage"]:.3g} % as it cures, and the mould is larger by that. Lengths and \
+positions below are those of the pad."""
 
 
 def _cast_lines(document: Document) -> Iterator[str]:
@@ -371,17 +351,14 @@ def _cast_lines(document: Document) -> Iterator[str]:
     elif mould["lid"]:
         pour += " Lay the lid on: air and surplus leave by its vents."
     around = " and around every pillar" if document["settings"]["pad"]["keep_out_mm"] else ""
-    yield (
-        f"1. Stir part A and part B together for {STIR_MIN:g} minutes, with the sides of the cup. The pot life is"
-        f" {pot_life}: finish pouring within it."
-    )
-    yield (
-        "2. Degas the mix in a vacuum until it has risen, to three or four times its height, and fallen again:"
-        f" {DEGAS_MIN:g} minutes or so."
-    )
-    yield f"3. {pour}"
-    yield f"4. Leave it for {cure} at room temperature."
-    yield f"5. Free the casting all along the walls{around}, then pull it out from a corner."
+    yield f"""\
+1. Stir part A and part B together for {STIR_MIN:g} minutes, with the sides of the cup. The pot life is {pot_life}: \
+finish pouring within it.
+2. Degas the mix in a vacuum until it has risen, to three or four times its height, and fallen again: {DEGAS_MIN:g} \
+minutes or so.
+3. {pour}
+4. Leave it for {cure} at room temperature.
+5. Free the casting all along the walls{around}, then pull it out from a corner."""
 
 
 def _orientation_lines(document: Document) -> Iterator[str]:
@@ -395,12 +372,9 @@ def _orientation_lines(document: Document) -> Iterator[str]:
     yield orientation_sentence(counts, pad["leads"]) + numbers
     for finding in document["findings"]:
         if finding["name"] == "fibre_strain":
-            yield ""
-            yield (
-                "The pad is worn on a cylinder whose axis runs along y, the face with the tracks outwards:"
-                f" {finding['message']}."
-            )
-    yield from ("", ORIENTATION_LINK)
+            worn = "The pad is worn on a cylinder whose axis runs along y, the face with the tracks outwards"
+            yield f"\n{worn}: {finding['message']}."
+    yield f"\n{ORIENTATION_LINK}"
 
 
 def _lay_lines(document: Document) -> Iterator[str]:
@@ -412,21 +386,15 @@ def _lay_lines(document: Document) -> Iterator[str]:
     if fibre["min_bend_radius_mm"] is not None:
         limits.append(f"bends of no less than {fibre['min_bend_radius_mm']:g} mm radius")
     handling = f" Lay them unstretched: {fibre['name']} bears {' and '.join(limits)}." if limits else ""
-    yield f"1. Turn the casting over, as drawn above: the tracks lie on top.{legible}"
-    yield (
-        "2. Cut the fibres and lay them in steps, the deepest first. Press each down to the bottom of its track, with"
-        f" {mould['lead_mm']:g} mm out at both ends.{handling} Measure its resistance: one that is broken is laid again"
-        " now."
-    )
-    yield (
-        f"3. After each step, fill the tracks over the fibres with {adhesive['name']}. Keep the tracks that cross above"
-        " clear. Let it cure before the next step, a day if in doubt."
-    )
-    yield (
-        "4. Measure the resistance of every fibre again, write it down, and measure between all fibres: no two may be"
-        " in contact. Then crimp a wire to each end, and pull gently: the resistance must not change."
-    )
-    yield ""
+    yield f"""\
+1. Turn the casting over, as drawn above: the tracks lie on top.{legible}
+2. Cut the fibres and lay them in steps, the deepest first. Press each down to the bottom of its track, with \
+{mould["lead_mm"]:g} mm out at both ends.{handling} Measure its resistance: one that is broken is laid again now.
+3. After each step, fill the tracks over the fibres with {adhesive["name"]}. Keep the tracks that cross above clear. \
+Let it cure before the next step, a day if in doubt.
+4. Measure the resistance of every fibre again, write it down, and measure between all fibres: no two may be in \
+contact. Then crimp a wire to each end, and pull gently: the resistance must not change.
+"""
     rows = []
     for step, (numbers, volume_ml) in enumerate(zip(document["laying_order"], adhesive["steps_ml"], strict=True), 1):
         for entry in (document["fibres"][number - 1] for number in numbers):
@@ -437,31 +405,26 @@ def _lay_lines(document: Document) -> Iterator[str]:
         ("step", "number", "fibre", "track depth", "in the pad", "cut to", "then seal with up to"), rows
     )
     if "laying.gcode" in document["files"]:
-        yield ""
-        yield (
-            "Or let a machine lay them in this order, on the pad turned over: its toolpath is in `laying.gcode` and"
-            " drawn in `toolpath.svg`. It waits while you fasten and cut each fibre and seal each step."
-        )
+        yield """
+Or let a machine lay them in this order, on the pad turned over: its toolpath is in `laying.gcode` and drawn in \
+`toolpath.svg`. It waits while you fasten and cut each fibre and seal each step."""
 
 
 def _wire_lines(document: Document) -> Iterator[str]:
     fibres, ohm_per_mm = document["fibres"], document["fibre"]["ohm_per_mm"]
     if "exits" in document:
         numbers = ", ".join(map(str, document["exits"]))
-        yield f"Along the near side, from left to right as the pad lies for laying, these fibres end: {numbers}."
-        yield ""
+        yield f"Along the near side, from left to right as the pad lies for laying, these fibres end: {numbers}.\n"
     if ohm_per_mm is None:
-        yield (
-            f"The resistance of the fibre, {document['fibre']['name']}, is unknown: measure 100 mm of it and set"
-            " `[fibre] ohm_per_mm`. The resistances of all fibres and their fixed resistors are then listed here."
-        )
+        yield f"""\
+The resistance of the fibre, {document["fibre"]["name"]}, is unknown: measure 100 mm of it and set `[fibre] \
+ohm_per_mm`. The resistances of all fibres and their fixed resistors are then listed here."""
         return
-    yield (
-        f"At {ohm_per_mm:.3g} Ohm per mm the fibres should have these resistances from end to end, leads included. A"
-        " voltage divider is most sensitive if its fixed resistor is as large as the fibre at rest: here the nearest of"
-        " the E24 series. 1 % more in the fibre then is 1/400 of the supply, 8 mV of 3.3 V."
-    )
-    yield ""
+    yield f"""\
+At {ohm_per_mm:.3g} Ohm per mm the fibres should have these resistances from end to end, leads included. A voltage \
+divider is most sensitive if its fixed resistor is as large as the fibre at rest: here the nearest of the E24 series. \
+1 % more in the fibre then is 1/400 of the supply, 8 mV of 3.3 V.
+"""
     rows = [(f["number"], f["fibre"], *(_ohms(f[key]) for key in ("resistance_ohm", "divider_ohm"))) for f in fibres]
     yield from _table_lines(("number", "fibre", "resistance", "fixed resistor"), rows)
 
@@ -480,25 +443,21 @@ def _crossing_lines(document: Document) -> Iterator[str]:
     gap_mm, is_short = crossings["gap_mm"], crossings["total"] <= _MAX_ROWS
     gaps = f"At least {gap_mm:g} mm lie between two fibres." if gap_mm > 0 else "Some touch."
     yield f"{crossings['total']} crossings, {crossings['same_family']} of them within a family. {gaps}"
-    yield from ("", CROSSING_LINK, "")
+    yield f"\n{CROSSING_LINK}\n"
     if is_short or document["common_tracks"]:
-        yield "Positions are from the centre of the pad. As it lies, x runs to the left and y away from you."
-        yield ""
+        yield "Positions are from the centre of the pad. As it lies, x runs to the left and y away from you.\n"
     if tracks := document["common_tracks"]:
-        yield (
-            "Here a track lies over a deeper one for longer than at two crossings at right angles. It has no floor of"
-            " silicone there: let the adhesive over the deeper fibre cure, and check that it covers it, before you lay"
-            " the upper one."
-        )
-        yield ""
+        yield """\
+Here a track lies over a deeper one for longer than at two crossings at right angles. It has no floor of silicone \
+there: let the adhesive over the deeper fibre cure, and check that it covers it, before you lay the upper one.
+"""
         rows = []
         for track in tracks[:_MAX_ROWS]:
             lengths_mm = (f"{mm:z.1f} mm" for mm in (*track["position_mm"], track["length_mm"]))
             rows.append((f"{track['shallow']} over {track['deep']}", *lengths_mm))
         yield from _table_lines(("tracks", "x", "y", "in common"), rows)
         if len(tracks) > _MAX_ROWS:
-            yield ""
-            yield f"These are the {_MAX_ROWS} longest of {len(tracks)}; `fabrication.json` has them all."
+            yield f"\nThese are the {_MAX_ROWS} longest of {len(tracks)}; `fabrication.json` has them all."
         yield ""
     if is_short:
         number = {fibre["fibre"]: fibre["number"] for fibre in document["fibres"]}
@@ -511,7 +470,7 @@ def _crossing_lines(document: Document) -> Iterator[str]:
     counts = Counter((max(a, b), min(a, b), gap) for *_, a, b, gap in crossings["table"])
     rows = [(_depths(a, b), f"{gap:g} mm", count) for (a, b, gap), count in sorted(counts.items(), reverse=True)]
     yield from _table_lines(("depths", "between the fibres", "crossings"), rows)
-    yield from ("", "`fabrication.json` has the position of each.")
+    yield "\n`fabrication.json` has the position of each."
 
 
 def _depths(first_mm: float, second_mm: float) -> str:

@@ -19,13 +19,7 @@ from padforge.common.plotting import ALARM, FAINT, INK, PAPER
 from padforge.design.morphology import Array
 from padforge.fabricate.checks import Finding
 from padforge.fabricate.fibre_placement import Step, mirror_x
-from padforge.fabricate.outputs.drawings import (
-    CROSSING_CAPTION,
-    ORIENTATION_CAPTION,
-    SCALE_MM,
-    Bounds,
-    orientation_sentence,
-)
+from padforge.fabricate.outputs import drawings
 from padforge.fabricate.plan import (
     FAMILIES,
     FAMILY_COLOURS,
@@ -58,14 +52,8 @@ def draw_mould(plan: Plan, vertices: ArrayLike, triangles: ArrayLike, findings: 
     """Write a picture of a mould from above as PNG, coloured by family and height.
 
     Every fibre has its number on the wall at both ends; the numbers that are cast are mirrored. Rings and further
-    markers show where checks fail, diamonds and further ones where they warn.
-
-    Args:
-        plan: plan of the mould.
-        vertices: vertices (n, 3), mm.
-        triangles: vertex indices (m, 3).
-        findings: results of the checks.
-        path: file to write.
+    markers show where checks fail, diamonds and further ones where they warn. `vertices` (n, 3) are in mm, `triangles`
+    (m, 3) vertex indices.
     """
     from matplotlib.patches import Patch
 
@@ -113,14 +101,13 @@ def draw_tracks(plan: Plan, path: Path) -> None:
     room = 0.06 * (x_max - x_min)
     layers, clashes, layout = fibre_layers(plan), plan.clash_positions_mm, plan.pad.layout
     title = f"Fibres as they lie in the tray, from above: {layout.fibres} fibres, {len(plan.crossings)} crossings"
-    note = orientation_sentence(layout.counts, plan.settings.pad.leads)
+    note = drawings.orientation_sentence(layout.counts, plan.settings.pad.leads)
     bounds = (x_min - room, y_min - room, x_max + room, y_max + room)
     picture = _Picture(bounds, title, len(layers) + (len(clashes) > 0), note)
     pillars = overlap(plan.feet, plan.cavity)
     for area, colour in ((plan.silicone, PAPER), (plan.cavity, PAPER), (pillars, FAINT)):
-        for rings in polygon_rings(area):
-            for ring in rings[:1] if area is pillars else rings:
-                picture.axes.fill(*ring.T, facecolor=colour, edgecolor=_EDGE, linewidth=1, zorder=1)
+        for ring in (ring for rings in polygon_rings(area) for ring in (rings[:1] if area is pillars else rings)):
+            picture.axes.fill(*ring.T, facecolor=colour, edgecolor=_EDGE, linewidth=1, zorder=1)
     handles = [handle for layer in reversed(layers) for handle in _draw_layer(picture, plan, layer)][::-1]
     if len(clashes):
         label = f"{len(clashes)} crossings of one family"
@@ -132,11 +119,7 @@ def draw_tracks(plan: Plan, path: Path) -> None:
 def draw_findings(vertices: ArrayLike, triangles: ArrayLike, findings: Sequence[Finding], path: Path) -> None:
     """Write a picture of any mesh from above as PNG, coloured by height, with the positions of findings.
 
-    Args:
-        vertices: vertices (n, 3), mm, finite.
-        triangles: vertex indices (m, 3), m > 0.
-        findings: results of the checks.
-        path: file to write.
+    `vertices` (n, 3) are in mm and finite, `triangles` (m, 3) vertex indices, m > 0.
     """
     from matplotlib.colors import LinearSegmentedColormap
 
@@ -197,7 +180,8 @@ _PANELS = (
     ("2  Turned over, left to right", "tracks up, numbers read right: lay here"),
     ("3  In use", "tracks up: this face is pressed"),
 )
-_LABEL_MM = 2.6  # text height
+_NUMBER_MM = 3.6  # text height of the numbers of fibres, and minimum height of those that are cast
+_TEXT_MM = 2.7  # other text height
 _SLAB_MM = 6.0  # thickness of the pad in the side views, which are not to scale
 _TRACK_MM = 1.6  # size of a track there
 _WALL_MM = 2.0  # thickness of the mould's walls there
@@ -225,14 +209,14 @@ def draw_orientation(plan: Plan, path: Path) -> None:
     poses = ((False, 0.0), (True, 0.0), (True, TURN_DEG))
     panels = [_Panel((column + 0.5) * _WIDTH_MM, scale, *pose) for column, pose in enumerate(poses)]
     bounds = (0.0, -_HEIGHT_MM / 2 - 19, 3 * _WIDTH_MM, _HEIGHT_MM / 2 + 9)
-    sentence = orientation_sentence(plan.pad.layout.counts, plan.settings.pad.leads)
-    picture = _Picture(bounds, ORIENTATION_CAPTION, 0, sentence)
+    sentence = drawings.orientation_sentence(plan.pad.layout.counts, plan.settings.pad.leads)
+    picture = _Picture(bounds, drawings.ORIENTATION_CAPTION, 0, sentence)
     picture.axes.set_axis_off()
     for panel, (title, note) in zip(panels, _PANELS, strict=True):
         _draw_panel(picture, plan, panel)
         for row, (text, weight) in enumerate(((title, "bold"), (note, "normal"))):
             position = panel.x - _WIDTH_MM / 2 + 4, _HEIGHT_MM / 2 + 6 - 4 * row
-            picture.axes.text(*position, text, size=picture.points(_LABEL_MM), weight=weight)
+            picture.axes.text(*position, text, size=picture.points(_TEXT_MM), weight=weight)
     _draw_arm(picture, panels[2])
     _draw_sides(picture, plan, panels)
     picture.save(path, [])
@@ -240,6 +224,8 @@ def draw_orientation(plan: Plan, path: Path) -> None:
 
 def _draw_panel(picture: "_Picture", plan: Plan, panel: _Panel) -> None:
     """Draw the pad and its axes in a panel, with every fibre's number outside the pad, beside its start."""
+    from matplotlib.patheffects import withStroke
+
     axes = picture.axes
     if not panel.mirrored:
         axes.fill(*panel.project(plan.tray.exterior.coords).T, color=FAINT)
@@ -250,14 +236,17 @@ def _draw_panel(picture: "_Picture", plan: Plan, panel: _Panel) -> None:
         for fibre in layer.fibres:
             line = plan.lines[fibre].simplify(0.05)
             axes.plot(*panel.project(line.coords).T, color=layer.colour, linewidth=1)
-    size = min(_LABEL_MM, 0.6 * plan.min_pitch_mm * panel.scale)
+    size = min(_NUMBER_MM, 0.6 * plan.min_pitch_mm * panel.scale)
+    cast_scale = max(1.0, size / (panel.scale * plan.settings.mould.number_mm)) if plan.numbers else 1.0
+    starts, rim = [start for start, _ in plan.leads.pairs], [withStroke(linewidth=2.5, foreground=PAPER)]
     edges = (plan.silicone if panel.mirrored else plan.tray).bounds
-    for fibre, (lead, cast) in enumerate(zip(plan.ends(0), plan.numbers or repeat(None), strict=False)):
+    for fibre, (lead, cast) in enumerate(zip(starts, plan.numbers or repeat(None), strict=False)):
         colour = FAMILY_COLOURS[plan.family(fibre)]
-        for outer, *holes in polygon_rings(cast) if cast is not None else ():
-            axes.fill(*panel.project(outer).T, color=colour, gid="cast")
+        legible = cast and shapely.affinity.scale(cast, cast_scale, cast_scale)  # larger than it is cast
+        for outer, *holes in polygon_rings(legible) if legible else ():
+            axes.fill(*panel.project(outer).T, color=colour, linewidth=0, gid="cast", zorder=3, path_effects=rim)
             for hole in holes:
-                axes.fill(*panel.project(hole).T, color=PAPER)
+                axes.fill(*panel.project(hole).T, color=PAPER, linewidth=0, zorder=3)
         start = lead.turned_mm.copy()
         start[lead.axis] = edges[lead.axis] - (1.2 + size / 2) / panel.scale  # outside the edge
         picture.write(str(fibre + 1), panel.project([start])[0], size, color=colour, weight="bold")
@@ -265,7 +254,7 @@ def _draw_panel(picture: "_Picture", plan: Plan, panel: _Panel) -> None:
     for axis, tip in zip("xy", np.eye(2) * length, strict=True):
         start, end, label = panel.project([0 * tip, tip, 1.2 * tip])
         picture.arrow(start, end)
-        picture.write(axis, label, _LABEL_MM)
+        picture.write(axis, label, _TEXT_MM)
 
 
 def _draw_arm(picture: "_Picture", panel: _Panel) -> None:
@@ -273,11 +262,11 @@ def _draw_arm(picture: "_Picture", panel: _Panel) -> None:
     corner = np.array([panel.x - _WIDTH_MM / 2 + 4, 2 - _HEIGHT_MM / 2])
     for axis, tip in zip("xy", 9.0 * np.eye(2), strict=True):
         picture.arrow(corner, corner + tip)
-        picture.write(axis, corner + 1.2 * tip, _LABEL_MM)
-    picture.write("arm", corner + np.array([4.5, 2.5]), _LABEL_MM)
+        picture.write(axis, corner + 1.2 * tip, _TEXT_MM)
+    picture.write("arm", corner + np.array([4.5, 2.5]), _TEXT_MM)
     top = 1.25 * _HALF_MM
     picture.axes.plot([panel.x] * 2, [0, top], ":", color=INK, linewidth=0.8)
-    picture.write("pad_angle_deg", (panel.x + 10, top), _LABEL_MM)
+    picture.write("pad_angle_deg", (panel.x + 10, top), _TEXT_MM)
 
 
 def _draw_sides(picture: "_Picture", plan: Plan, panels: Sequence[_Panel]) -> None:
@@ -286,19 +275,15 @@ def _draw_sides(picture: "_Picture", plan: Plan, panels: Sequence[_Panel]) -> No
     bottom, half = top - _SLAB_MM, plan.cavity.bounds[2] * panels[0].scale
     floor = bottom - 1.5  # the underside of the mould
 
-    def box(x: float, y: float, width: float, height: float, colour: str) -> None:
-        corners = [(x, y), (x + width, y), (x + width, y + height), (x, y + height)]
-        picture.axes.fill(*np.transpose(corners), facecolor=colour, edgecolor=_EDGE, linewidth=0.5)
-
-    box(panels[0].x - half - _WALL_MM, floor, 2 * (half + _WALL_MM), top - floor, FAINT)
-    size = min(_LABEL_MM, 0.6 * plan.min_pitch_mm * panels[0].scale)
-    starts = [(fibre, lead.turned_mm[0]) for fibre, lead in enumerate(plan.ends(0)) if lead.axis == 1]
+    picture.box(panels[0].x - half - _WALL_MM, floor, 2 * (half + _WALL_MM), top - floor, FAINT)
+    size = min(_NUMBER_MM, 0.6 * plan.min_pitch_mm * panels[0].scale)
+    starts = [(fibre, lead.turned_mm[0]) for fibre, (lead, _) in enumerate(plan.leads.pairs) if lead.axis == 1]
     for panel, y, colour in zip(panels, (bottom, *[top - _TRACK_MM] * 2), (FAINT, "white", ""), strict=True):
-        box(panel.x - half, bottom, 2 * half, _SLAB_MM, PAPER)
+        picture.box(panel.x - half, bottom, 2 * half, _SLAB_MM, PAPER)
         for fibre, x_mm in starts:
             x = panel.x + (-x_mm if panel.mirrored else x_mm) * panel.scale
             family = FAMILY_COLOURS[plan.family(fibre)]
-            box(x - 0.4, y, 0.8, _TRACK_MM, colour or family)
+            picture.box(x - 0.4, y, 0.8, _TRACK_MM, colour or family)
             picture.write(str(fibre + 1), (x, floor - size), size, color=family)
     x = panels[2].x
     turn = np.linspace(np.pi, 2 * np.pi, 20)
@@ -319,23 +304,14 @@ def draw_crossing(plan: Plan, path: Path) -> None:
     depths = [[(plan.depths_mm[plan.layer_indices[k]], k) for k in (c.first, c.second)] for c in plan.crossings]
     (upper, above), (lower, below) = sorted(min(depths, key=lambda pair: abs(pair[0][0] - pair[1][0])))
     half, bottom = 4 * width, -plan.thickness_mm
-    picture = _Picture((-2 * half, bottom, 2 * half, -bottom / 6), CROSSING_CAPTION, 4)
+    picture = _Picture((-2 * half, bottom, 2 * half, -bottom / 6), drawings.CROSSING_CAPTION, 4)
     axes, seal = picture.axes, "#e9dfb8"
     axes.set(xlabel="along the upper fibre (mm)", ylabel="height over the face (mm)")
-    shapes = {
-        f"silicone, {plan.thickness_mm:g} mm": ((-2 * half, bottom, 4 * half, -bottom), PAPER),
-        "adhesive": ((-2 * half, -upper, 4 * half, upper), seal),
-        "": ((-width / 2, -lower, width, lower), seal),
-        f"fibre {above + 1}, in a track {upper:.3g} mm deep": (
-            (-2 * half, -upper, 4 * half, fibre_mm),
-            FAMILY_COLOURS[plan.family(above)],
-        ),
-    }
-    handles = []
-    for label, ((x, y, wide, high), colour) in shapes.items():
-        corners = [(x, y), (x + wide, y), (x + wide, y + high), (x, y + high)]
-        (area,) = axes.fill(*np.transpose(corners), facecolor=colour, edgecolor=_EDGE, linewidth=0.5, label=label)
-        handles += [area] if label else []
+    handles = picture.box(-2 * half, bottom, 4 * half, -bottom, PAPER, f"silicone, {plan.thickness_mm:g} mm")
+    handles += picture.box(-2 * half, -upper, 4 * half, upper, seal, "adhesive")
+    picture.box(-width / 2, -lower, width, lower, seal)
+    label, colour = f"fibre {above + 1}, in a track {upper:.3g} mm deep", FAMILY_COLOURS[plan.family(above)]
+    handles += picture.box(-2 * half, -upper, 4 * half, fibre_mm, colour, label)
     turn = np.linspace(0, 2 * np.pi, 60)
     round_ = fibre_mm / 2 * np.column_stack([np.cos(turn), np.sin(turn)]) + (0, fibre_mm / 2 - lower)
     label, colour = f"fibre {below + 1}, in a track {lower:.3g} mm deep", FAMILY_COLOURS[plan.family(below)]
@@ -399,11 +375,12 @@ def _remarks(findings: Sequence[Finding]) -> list[Finding]:
 class _Picture:
     """A figure whose axes cover `bounds` (x_min, y_min, x_max, y_max), mm, with a legend and a note below."""
 
-    def __init__(self, bounds: Bounds, title: str, n_entries: int, note: str = "") -> None:
+    def __init__(self, bounds: drawings.Bounds, title: str, n_entries: int, note: str = "") -> None:
         from matplotlib.figure import Figure
 
         x_min, y_min, x_max, y_max = bounds
-        axes_width, axes_height = _count_pixels(bounds)
+        scale = PIXELS / max(x_max - x_min, y_max - y_min)
+        axes_width, axes_height = (max(1, round(scale * side)) for side in (x_max - x_min, y_max - y_min))
         width = _MARGIN_LEFT + max(axes_width, 600) + _MARGIN_RIGHT  # at least 600 pixels for title and legend
         self.note = textwrap.wrap(note, int((width - _MARGIN_LEFT) / 6.2))  # mean width of a letter, pixels
         legend = 21 * math.ceil(n_entries / _COLUMNS) + 6 * (n_entries > 0)  # 21 pixels a row
@@ -419,7 +396,6 @@ class _Picture:
         self.axes.spines[:].set_color(_EDGE)
 
     def points(self, length_mm: float) -> float:
-        """Convert a length to typographic points."""
         x_min, x_max, *_ = self.extent
         return length_mm * self.pixels[0] / (x_max - x_min) * 72 / _DPI
 
@@ -448,24 +424,26 @@ class _Picture:
         return handles
 
     def write(self, text: str, position: Sequence[float] | Array, height_mm: float, **style: Any) -> None:
-        """Write a text centred at a position, mm."""
         x, y = position
         self.axes.text(x, y, text, **{"size": self.points(height_mm), "ha": "center", "va": "center", **style})
 
+    def box(self, x: float, y: float, width: float, height: float, colour: str, label: str = "") -> list[Any]:
+        """Draw a rectangle from its lower left corner, mm; return its entry for the legend."""
+        corners = [(x, y), (x + width, y), (x + width, y + height), (x, y + height)]
+        return self.axes.fill(*np.transpose(corners), facecolor=colour, edgecolor=_EDGE, linewidth=0.5, label=label)
+
     def arrow(self, start: Array, end: Array) -> None:
-        """Draw an arrow with a white rim."""
         for colour, width in (("white", 3.5), (INK, 1.2)):
             style = {"arrowstyle": "->", "color": colour, "linewidth": width, "shrinkA": 0, "shrinkB": 0}
             self.axes.annotate("", (end[0], end[1]), (start[0], start[1]), arrowprops=style)
 
     def scale_bar(self) -> None:
-        """Draw a scale bar under the lower right corner."""
         x_max, y = self.extent[1], -46 / self.pixels[1]
         transform = self.axes.get_xaxis_transform()
         style = {"color": INK, "clip_on": False, "transform": transform}
-        self.axes.plot([x_max - SCALE_MM, x_max], [y, y], "|-", linewidth=1.2, ms=8, **style)
+        self.axes.plot([x_max - drawings.SCALE_MM, x_max], [y, y], "|-", linewidth=1.2, ms=8, **style)
         self.axes.annotate(
-            f"{SCALE_MM:g} mm", (x_max - SCALE_MM, y), (-8, 0), xycoords=transform,
+            f"{drawings.SCALE_MM:g} mm", (x_max - drawings.SCALE_MM, y), (-8, 0), xycoords=transform,
             textcoords="offset points", ha="right", va="center", fontsize=9, color=INK, annotation_clip=False,
         )  # fmt: skip
 
@@ -493,10 +471,3 @@ class _Picture:
             position = _MARGIN_LEFT / 2 / width, (note_height - (row + 0.5) * _LINE) / height
             self.figure.text(*position, line, fontsize=8, color=_GREY, va="center")
         save_figure(self.figure, path, _DPI)
-
-
-def _count_pixels(bounds: Bounds) -> tuple[int, int]:
-    """Return the width and the height of the axes for these bounds, pixels."""
-    x_min, y_min, x_max, y_max = bounds
-    scale = PIXELS / max(x_max - x_min, y_max - y_min)
-    return max(1, round(scale * (x_max - x_min))), max(1, round(scale * (y_max - y_min)))

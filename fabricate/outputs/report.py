@@ -11,34 +11,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from padforge.common import page
 from padforge.common.files import find_unchanged
-from padforge.common.page import (
-    PageSection,
-    collapsible,
-    figures,
-    heading,
-    paragraph,
-    read_resource,
-    render_markdown,
-    table,
-)
 from padforge.common.validation import InputError
 from padforge.fabricate.mesh import read_mesh
-from padforge.fabricate.outputs.drawings import (
-    CROSSING_CAPTION,
-    CROSSING_FILE,
-    CROSSING_LINK,
-    ORIENTATION_CAPTION,
-    ORIENTATION_FILE,
-    ORIENTATION_LINK,
-)
+from padforge.fabricate.outputs import drawings
 from padforge.fabricate.outputs.laying_page import laying_page
 from padforge.fabricate.plan import FAMILIES, FAMILY_COLOURS
 
 MAX_BYTES = 3_000_000  # maximum size of a packed mesh; base64 makes 4 MB of it, half of the maximum of a page
 _STEPS = np.iinfo(np.uint16).max  # steps of a coordinate along a side of the bounding box
 _TOLERANCES_MM = (0.01, 0.02, 0.05, 0.1, 0.2)  # tried in order for a large mesh; the last is half a common nozzle
-_PICTURES = ("mould.stl", "mould.png", "tracks.png", "toolpath.svg", ORIENTATION_FILE, CROSSING_FILE)
+_PICTURES = ("mould.stl", "mould.png", "tracks.png", "toolpath.svg", drawings.ORIENTATION_FILE, drawings.CROSSING_FILE)
 _MAX_POSITIONS = 3
 _VIEW = """\
 <figure class="view" id="mould-view" hidden>
@@ -61,21 +45,13 @@ _HELP = (
 
 @dataclass(frozen=True)
 class PackedMesh:
-    """A mesh in the form that a page embeds.
+    """A mesh in the form that a page embeds."""
 
-    Attributes:
-        low_mm: corner of the box around it; shape (3,).
-        size_mm: sides of the box around it; shape (3,).
-        vertices: positions in the box, 0 to 65535 along each side; shape (n, 3).
-        triangles: vertex indices, of two bytes if these suffice, else of four; shape (m, 3).
-        tolerance_mm: tolerance that it was simplified to; 0 if it was not.
-    """
-
-    low_mm: NDArray[np.float64]
-    size_mm: NDArray[np.float64]
-    vertices: NDArray[np.uint16]
-    triangles: NDArray[np.uint16] | NDArray[np.uint32]
-    tolerance_mm: float
+    low_mm: NDArray[np.float64]  # corner of the box around it; shape (3,)
+    size_mm: NDArray[np.float64]  # sides of the box; shape (3,)
+    vertices: NDArray[np.uint16]  # positions in the box, 0 to 65535 along each side; shape (n, 3)
+    triangles: NDArray[np.uint16] | NDArray[np.uint32]  # of two bytes if these suffice; shape (m, 3)
+    tolerance_mm: float  # that it was simplified to; 0 if it was not
 
     @property
     def nbytes(self) -> int:
@@ -83,11 +59,7 @@ class PackedMesh:
 
 
 def pack_mesh(path: Path) -> PackedMesh | None:
-    """Pack the mesh of a file into `MAX_BYTES`, simplified as far as necessary; None if that does not suffice.
-
-    Raises:
-        InputError: the file is missing, or holds no mesh.
-    """
+    """Pack the mesh of a file into `MAX_BYTES`, simplified as far as necessary; None if that does not suffice."""
     corners, triangles = read_mesh(path)
     # An STL repeats the corners that triangles share.
     vertices, indices = np.unique(corners, axis=0, return_inverse=True)
@@ -151,7 +123,7 @@ def _colour_key(document: Mapping[str, Any]) -> str:
     return f"Tops of {FAMILIES[0]} ridges{first} are blue, of {FAMILIES[1]} ones{second} orange."
 
 
-def fabrication_sections(folder: Path, document: Mapping[str, Any]) -> list[PageSection]:
+def fabrication_sections(folder: Path, document: Mapping[str, Any]) -> list[page.PageSection]:
     """Build the sections on a mould with its checks, and on making the pad with it.
 
     Args:
@@ -170,7 +142,7 @@ def fabrication_sections(folder: Path, document: Mapping[str, Any]) -> list[Page
     return [_mould_section(folder, unchanged, document), _bench_section(folder, unchanged, document)]
 
 
-def _mould_section(folder: Path, names: Collection[str], document: Mapping[str, Any]) -> PageSection:
+def _mould_section(folder: Path, names: Collection[str], document: Mapping[str, Any]) -> page.PageSection:
     """Build the section of the view of the mould, its pictures and checks; `names` are the files to show."""
     solid = folder / "mould.stl"
     mesh = pack_mesh(solid) if solid.name in names else None
@@ -180,41 +152,43 @@ def _mould_section(folder: Path, names: Collection[str], document: Mapping[str, 
     passed = [finding for finding in findings if finding["status"] == "pass"]
     remarks = sorted((f for f in findings if f["status"] != "pass"), key=lambda finding: finding["status"])
     large = f"{solid.name} is too large to be turned on this page, also if simplified; the pictures show it."
+    mirrored = f" {drawings.MIRRORED}" if document["settings"]["mould"]["number_mm"] else ""
     captions = {
-        "mould.png": f"The mould from above, {size} mm: colour stands for family and height.",
-        "tracks.png": "The fibres as they lie in the mould; the deeper one interrupts the other.",
+        "mould.png": f"The mould from above, {size} mm: colour stands for family and height.{mirrored}",
+        "tracks.png": "The fibres in the tray of the mould, from above, with numbers at their starts; where two cross,"
+        " the line of the deeper one is whole.",
         "toolpath.svg": "The toolpath of a needle that lays the fibres, the pad turned over.",
     }
-    return PageSection(
+    return page.PageSection(
         "Mould",
         [
-            *([_draw_view(mesh, document)] if mesh else [paragraph(large)] if solid.name in names else []),
-            figures([(folder / name, caption) for name, caption in captions.items() if name in names]),
-            heading("Printability"),
-            paragraph(f"{len(passed)} of {len(findings)} checks passed."),
+            *([_draw_view(mesh, document)] if mesh else [page.paragraph(large)] if solid.name in names else []),
+            page.figures([(folder / name, caption) for name, caption in captions.items() if name in names]),
+            page.heading("Printability"),
+            page.paragraph(f"{len(passed)} of {len(findings)} checks passed."),
             *([_findings_table(remarks)] if remarks else []),
-            *([collapsible("Checks that pass", [_findings_table(passed)])] if passed else []),
+            *([page.collapsible("Checks that pass", [_findings_table(passed)])] if passed else []),
         ],
         [
             (f"{width:.5g} x {height:.5g} mm", "pad, as it is cast"),
             (f"{len(passed)} / {len(findings)}", "mould checks passed"),
             (f"{document['silicone_volume_ml']:.1f} ml", "silicone to cast"),
         ],
-        read_resource("padforge.fabricate.outputs", "mould_view.js") if mesh else "",
+        page.read_resource("padforge.fabricate.outputs", "mould_view.js") if mesh else "",
     )
 
 
-def _bench_section(folder: Path, names: Collection[str], document: Mapping[str, Any]) -> PageSection:
+def _bench_section(folder: Path, names: Collection[str], document: Mapping[str, Any]) -> page.PageSection:
     """Build the section of `laying.md`, with the drawings in place of their links."""
     guide, _, _ = laying_page(document).partition("\n## Checks\n")  # the mould's section has the full checks
     body = []
     for link, name, caption in (
-        (ORIENTATION_LINK, ORIENTATION_FILE, ORIENTATION_CAPTION),
-        (CROSSING_LINK, CROSSING_FILE, CROSSING_CAPTION),
+        (drawings.ORIENTATION_LINK, drawings.ORIENTATION_FILE, drawings.ORIENTATION_CAPTION),
+        (drawings.CROSSING_LINK, drawings.CROSSING_FILE, drawings.CROSSING_CAPTION),
     ):
         before, _, guide = guide.partition(link)
-        body += [*render_markdown(before), *([figures([(folder / name, caption)])] if name in names else [])]
-    return PageSection("Making the pad", [*body, *render_markdown(guide)])
+        body += [*page.render_markdown(before), *([page.figures([(folder / name, caption)])] if name in names else [])]
+    return page.PageSection("Making the pad", [*body, *page.render_markdown(guide)])
 
 
 def _findings_table(findings: Sequence[Mapping[str, Any]]) -> str:
@@ -226,4 +200,4 @@ def _findings_table(findings: Sequence[Mapping[str, Any]]) -> str:
         name, where = finding["name"].replace("_", " "), " ".join(positions[:_MAX_POSITIONS]) + more
         rows.append([name, finding["status"], finding["message"], where])
     columns = 4 if any(row[-1] for row in rows) else 3
-    return table(["check", "result", "finding", "where (mm)"][:columns], [row[:columns] for row in rows])
+    return page.table(["check", "result", "finding", "where (mm)"][:columns], [row[:columns] for row in rows])

@@ -61,7 +61,6 @@ class FiniteRange(click.FloatRange):
     """A range of finite numbers; click's own accepts NaN and infinity."""
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        """Convert the text of an option."""
         number = super().convert(value, param, ctx)
         if not math.isfinite(number):
             self.fail(f"got {value!r}, expected a finite number", param, ctx)
@@ -71,11 +70,7 @@ class FiniteRange(click.FloatRange):
 def setting_option(name: str, section: str, kind: Any, text: str) -> Callable[..., Any]:
     """Return an option that overrides the setting of its name and is checked when the command line is parsed.
 
-    Args:
-        name: name of the option, such as `--knots`.
-        section: model of the setting, as `module:class`; it is imported when the option is used.
-        kind: type of the value for click.
-        text: help text.
+    `section` is the model of the setting, as `module:class`, which is imported when the option is used.
     """
 
     def check(context: click.Context, param: click.Parameter, value: Any) -> Any:
@@ -97,18 +92,10 @@ class SectionedGroup(click.Group):
         super().__init__(*arguments, **options)
 
     def add_command(self, cmd: click.Command, name: str | None = None, heading: str = "Commands") -> None:
-        """Add a command.
-
-        Args:
-            cmd: the command.
-            name: name in this group; that of the command if None.
-            heading: heading in the help.
-        """
         super().add_command(cmd, name)
         self._headings[name or cmd.name or ""] = heading
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        """Write the commands with their short helps."""
         width = max(map(len, self._headings))
         limit = formatter.width - 6 - width  # click's indent, gap and margin
         for heading in dict.fromkeys(self._headings.values()):
@@ -179,7 +166,6 @@ def progress() -> Iterator["Progress"]:
 
 @contextmanager
 def progress_bar(name: str) -> Iterator["OnProgress"]:
-    """Yield a function that shows progress on stderr."""
     with progress() as bar:
         task = bar.add_task(name, total=None, note="")
 
@@ -210,8 +196,6 @@ def text_table(rows: Sequence[Sequence[str]], text_columns: Collection[int] = (0
 
 
 class _StderrHandler(logging.Handler):
-    """Prints log records on stderr."""
-
     def emit(self, record: logging.LogRecord) -> None:
         # click.echo would bypass the sys.stderr of a progress bar and write into the bar.
         print(printable(self.format(record)), file=sys.stderr)
@@ -222,15 +206,9 @@ INTERRUPTED = 130  # exit code after Ctrl-C, as in shells
 
 
 def run_to_end(command: click.Command, name: str, extras: Mapping[str, str]) -> int:
-    """Run a command line with the arguments of this process; print an error as one line on stderr.
+    """Run a command line with the arguments of this process; errors are one line on stderr; return the exit code.
 
-    Args:
-        command: command or group.
-        name: name of the program.
-        extras: optional dependencies of its subcommands, by name; other subcommands need all of these.
-
-    Returns:
-        The exit code.
+    `extras` are the optional dependencies of its subcommands, by name; other subcommands need all of these.
     """
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, TextIOWrapper):

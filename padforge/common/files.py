@@ -65,11 +65,7 @@ def check_writable(folder: Path) -> None:
 
 @contextmanager
 def locked(folder: Path, busy: str) -> Iterator[None]:
-    """Lock a folder against other processes in the body.
-
-    Raises:
-        InputError: another process has locked it (with the message `busy`), or it cannot be written.
-    """
+    """Lock a folder against other processes in the body; if another one has locked it, `busy` is the error."""
     lock = FileLock(folder / LOCK, thread_local=False)
     try:
         with reraise_write_error(folder):
@@ -90,9 +86,6 @@ def locked_folder(folder: Path) -> Iterator[None]:
     """Lock `folder` against other runs, and remove old temporary files of killed runs.
 
     A missing folder is created, and removed at the end if it is empty.
-
-    Raises:
-        InputError: another run has locked it, or it cannot be written.
     """
     check_writable(folder)
     created = [path for path in (folder, *folder.parents) if not path.exists()]
@@ -242,11 +235,7 @@ def read_bytes(path: Path, max_bytes: int = MAX_BYTES) -> bytes:
 
 
 def read_json(path: Path, *formats: str) -> dict[str, Any]:
-    """Read a JSON document whose `format` is one of `formats`, such as "padforge-morphology/1".
-
-    Raises:
-        InputError: the file cannot be read, is not JSON, or has another format.
-    """
+    """Read a JSON document whose `format` is one of `formats`, such as "padforge-morphology/1"."""
     content = read_bytes(path)
     try:
         document = json.loads(content.decode())
@@ -283,11 +272,8 @@ def provenance(
 ) -> dict[str, Any]:
     """Return the provenance of a result, without time and output folder, so that equal runs give equal bytes.
 
-    Args:
-        command: command that made the result.
-        seed: its seed.
-        inputs: files and folders that it was made from, recorded by their digests.
-        packages: packages to record the version of, besides the usual ones.
+    `inputs` are the files and folders that it was made from, recorded by their digests; versions of `packages` are
+    recorded besides those of the usual ones.
     """
     return {
         "command": command,
@@ -324,16 +310,10 @@ def find_dependents(path: Path, remade: Collection[str] = ()) -> list[str]:
 def check_replaceable(
     path: Path, by: Path | Mapping[str, Any], remade: Collection[str] = (), force: bool = False
 ) -> None:
-    """Check that a file may be replaced: by an equal one, or if no other result in its folder was made from it.
+    """Check that a file, if there is one, may be replaced: by an equal one, or if no other result was made from it.
 
-    Args:
-        path: the file, which may be missing.
-        by: the file that replaces it, or the part of its provenance known in advance.
-        remade: names of files that are replaced together with it.
-        force: whether to skip the check.
-
-    Raises:
-        InputError: other results were made from it; they are named.
+    `by` is the file that replaces it, or the part of its provenance known in advance; `remade` are the names of files
+    that are replaced together with it.
     """
     if force or not path.is_file():
         return

@@ -18,11 +18,7 @@ _OBJECTS = ("cell", "char", "table", "timetable", "string", "datetime", "duratio
 
 
 class Hdf5Reader:
-    """The datasets of an open HDF5 file.
-
-    Attributes:
-        names: paths of the datasets in the file, without links and external data; columns of tables are datasets.
-    """
+    """The datasets of an open HDF5 file, without links and external data; columns of tables are datasets."""
 
     def __init__(self, file: Any) -> None:
         import h5py
@@ -51,7 +47,6 @@ class Hdf5Reader:
         return value.decode() if isinstance(value, bytes) else str(value)
 
     def is_numeric(self, name: str) -> bool:
-        """Return whether a dataset holds real numbers or Booleans."""
         return self._datasets[name].dtype.base.kind in "fiub"
 
     def describe(self, name: str) -> str:
@@ -93,15 +88,10 @@ def open_hdf5(path: Path) -> Iterator[Hdf5Reader]:
 
 
 def load_mat(path: Path, required: tuple[str, ...]) -> dict[str, Any]:
-    """Read the variables of a MATLAB file.
+    """Read the variables of a MATLAB file of any version, which must have those that are `required`, by name.
 
-    Args:
-        path: file of any version.
-        required: names of variables that it must have.
-
-    Returns:
-        Values by name: an array for a full real matrix, in its stored type; a dictionary of its fields for a structure;
-        a description such as "a cell array" for anything else.
+    Values are arrays of full real matrices, in their stored type, dictionaries of the fields of structures, and
+    descriptions, such as "a cell array", of anything else.
     """
     try:
         with check_file(path, MAX_BYTES).open("rb") as file:

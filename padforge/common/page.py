@@ -20,7 +20,6 @@ if TYPE_CHECKING:
 
 
 def read_resource(package: str, name: str) -> str:
-    """Read a text file that a package ships."""
     return resources.files(package).joinpath(name).read_text(encoding="utf-8")
 
 
@@ -41,7 +40,6 @@ class PageSection:
 
     @property
     def anchor(self) -> str:
-        """Id of the heading."""
         return re.sub(r"[^a-z0-9]+", "-", self.title.lower()).strip("-")
 
 
@@ -81,12 +79,10 @@ def _element(kind: str, *content: object) -> str:
 
 
 def heading(text: str) -> str:
-    """Return a heading within a section."""
     return _element("heading", text)
 
 
 def paragraph(text: str) -> str:
-    """Return a paragraph of plain text."""
     return _element("paragraph", text)
 
 

@@ -45,11 +45,11 @@ def run_tasks(
 ) -> Iterator[tuple[Key, Result]]:
     """Run tasks in parallel, and yield their results as they complete, each with the key of its task.
 
-    Tasks start only while the caller iterates. After an exception or Ctrl-C in the caller no further task starts, and
-    running ones are not waited for; an exception in a task is raised here at once.
+    Tasks, picklable for a cluster, start only while the caller iterates. After an exception or Ctrl-C in the caller no
+    further task starts, and running ones are not waited for; an exception in a task is raised here at once.
 
     Args:
-        tasks: functions by key, in the order in which they start; for a cluster they must be picklable.
+        tasks: functions by key, in the order in which they start.
         executor: executor of `concurrent.futures`; daemon threads of this machine if None.
         max_parallel: maximum number of running tasks; by default the number of cores, or no limit with an executor.
         follow_up: returns the next task of a key, or None; called after the caller has used a result.
@@ -78,7 +78,6 @@ class _DaemonThreads(Executor):
     """A daemon thread for each task; unlike `ThreadPoolExecutor`, it does not delay the end of the program."""
 
     def submit(self, work: Callable[..., Any], /, *arguments: Any, **keywords: Any) -> Future[Any]:
-        """Start a task at once."""
         future: Future[Any] = Future()
 
         def run() -> None:
@@ -106,12 +105,7 @@ def makespan(parts: Sequence[float], workers: int) -> float:
 
 @contextmanager
 def cluster(address: str | None) -> Iterator[Executor | None]:
-    """Connect to the Dask cluster at `address` and yield its executor; None for this machine.
-
-    Raises:
-        InputError: Dask is not installed, or no scheduler answers.
-        Fault: the scheduler is lost in the body, or a task has ended several workers.
-    """
+    """Connect to the Dask cluster at `address` and yield its executor; None for this machine."""
     if address is None:
         yield None
         return
@@ -178,9 +172,7 @@ def one_thread() -> Iterator[None]:
 class Checkpoints:
     """Checkpoints of the tasks of a search, each a small file of arrays, from which a killed search resumes.
 
-    Args:
-        folder: folder for the files, created with the first state.
-        settings: settings by section and key; states of other settings are refused.
+    The folder is created with the first state. States of other `settings`, by section and key, are refused.
     """
 
     def __init__(self, folder: Path, settings: dict[str, Any]) -> None:
@@ -188,11 +180,7 @@ class Checkpoints:
         self._file = folder / "search.json"
 
     def begin(self, resume: bool) -> dict[int, State]:
-        """Return the states of an earlier run by number if `resume`, otherwise remove them.
-
-        Raises:
-            InputError: the states belong to other settings, or cannot be read.
-        """
+        """Return the states of an earlier run by number if `resume`, otherwise remove them."""
         if not (resume and self._file.exists()):
             self.clear()
             return {}
@@ -207,18 +195,13 @@ class Checkpoints:
         return {number: self._read(paths[number]) for number in sorted(paths)}
 
     def save(self, number: int, state: State) -> None:
-        """Write the state of a task atomically."""
         if not self._file.exists():
             files.write_json(self._file, {"format": FORMAT, "settings": self.settings})
         with files.atomic_file(self.folder / f"start_{number:04d}.npz") as temporary:
             np.savez(temporary, allow_pickle=False, **state)
 
     def clear(self) -> None:
-        """Remove all states, and the folder if it is then empty.
-
-        Raises:
-            InputError: its search.json is not that of a search.
-        """
+        """Remove all states, and the folder if it is then empty."""
         if self._file.exists():
             try:
                 files.read_json(self._file, FORMAT)

@@ -50,7 +50,6 @@ def new_figure(width_in: float, height_in: float) -> "tuple[Figure, Any]":
 
 
 def style_axes(axes: Any) -> None:
-    """Apply the common style to axes."""
     axes.set_axisbelow(True)
     axes.spines[["top", "right"]].set_visible(False)
     axes.spines[["left", "bottom"]].set_color(FAINT)
@@ -60,7 +59,6 @@ def style_axes(axes: Any) -> None:
 
 
 def add_title(figure: "Figure", text: str) -> None:
-    """Add a title over all axes of a figure."""
     figure.suptitle(text, x=0.01, ha="left", color=INK, fontsize=11)
 
 

@@ -34,7 +34,6 @@ class Profile:
         self._since = now
 
     def lines(self) -> list[str]:
-        """Format the profile as text."""
         self.attribute_time()
         total_s = sum(self.seconds.values())
         lines = [f"where {total_s:.2f} s went"]

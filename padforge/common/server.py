@@ -48,16 +48,10 @@ class ConnectionServer(socketserver.ThreadingTCPServer):
     def __init__(
         self, address: tuple[str, int], handler: type[socketserver.BaseRequestHandler], token: str, option: str
     ) -> None:
-        """Bind the port.
+        """Bind the port of an address, 0 for any free one.
 
-        Args:
-            address: host and port, 0 for any free one.
-            handler: handler of requests.
-            token: token of clients; required if other machines can connect.
-            option: option of the command line that sets the port, for messages.
-
-        Raises:
-            InputError: the address cannot be used, or the token is missing or too short.
+        Clients need the `token`, which is required if other machines can connect. `option` is that of the command line
+        that sets the port, for messages.
         """
         host, port = address
         if token and not (len(token) >= MIN_TOKEN and token.isascii() and token.isprintable()):
@@ -94,23 +88,21 @@ class ConnectionServer(socketserver.ThreadingTCPServer):
         raise NotImplementedError
 
     def verify_request(self, request: Any, client_address: Any) -> bool:
-        """Register a connection."""
         with self._lock:
             self._connections.add(request)
         return True
 
     def close_request(self, request: Any) -> None:
-        """Unregister and close a connection."""
         with self._lock:
             self._connections.discard(request)
         super().close_request(request)
 
     def server_close(self) -> None:
-        """Stop listening, and close all connections."""
         super().server_close()
         with self._lock:
             for connection in self._connections:
-                _cut_off(connection)
+                with suppress(OSError):  # sent data still arrive, and the thread that waits for it wakes up
+                    connection.shutdown(socket.SHUT_RDWR)
 
     def handle_error(self, request: Any, client_address: Any) -> None:
         """Report an error, unless it is that of a connection closed by its client."""
@@ -127,12 +119,6 @@ def is_this_machine(host: str, port: int) -> bool:
     return name in (HOST, "localhost") and (number or str(HTTP_PORT)) == str(port)
 
 
-def _cut_off(connection: socket.socket) -> None:
-    """Shut a connection down: sent data still arrive, and the thread that waits for the connection wakes up."""
-    with suppress(OSError):
-        connection.shutdown(socket.SHUT_RDWR)
-
-
 class LocalPage(ConnectionServer):
     """A page that is served in the `with` block, with its latest message for every browser."""
 
@@ -146,15 +132,10 @@ class LocalPage(ConnectionServer):
         host: str = HOST,
         token: str = "",
     ) -> None:
-        """Bind the port.
+        """Bind the port, 0 for any free one.
 
-        Args:
-            port: port, 0 for any free one.
-            page: page with one <script> and one <style>, see `page_text`.
-            handlers: handlers of posts by address; called from several threads.
-            max_post_bytes: maximum size of a post.
-            host: address.
-            token: see `ConnectionServer`.
+        The page has one <script> and one <style>, see `page_text`. Handlers of posts, by address, are called from
+        several threads.
         """
         self.page, self.handlers, self.max_post_bytes = page.encode(), handlers, max_post_bytes
         self.policy = "default-src 'none'; connect-src 'self'; img-src data:; base-uri 'none'; form-action 'none'"

@@ -9,14 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar, cast
 
-from pydantic import (
-    BaseModel,
-    BeforeValidator,
-    ConfigDict,
-    PlainSerializer,
-    ValidationError,
-    model_validator,
-)
+from pydantic import BaseModel, BeforeValidator, ConfigDict, PlainSerializer, ValidationError, model_validator
 
 from padforge.common.files import read_bytes
 from padforge.common.validation import InputError, check_mapping, check_path, check_type, short_repr
@@ -246,9 +239,6 @@ def settings_schema(models: Mapping[str, type[Settings]]) -> dict[str, Any]:
     """Return the JSON Schema of a `pad.toml`, with which editors complete and check it.
 
     It uses draft 7, the latest one that editors for TOML support. It has no rules on several keys.
-
-    Args:
-        models: models of the sections, by name.
     """
     from pydantic.json_schema import models_json_schema  # slow to import, and needed by one command only
 

@@ -25,11 +25,7 @@ def printable(text: str) -> str:
 
 
 class InputError(ValueError):
-    """An error of the user: a file, setting or argument that cannot be used.
-
-    Args:
-        message: one line with the name, the value and what is allowed.
-    """
+    """An error of the user: a file, setting or argument that cannot be used, in one line that says what is allowed."""
 
     exit_code = 2  # of the command line, which prints the message without a traceback
 
@@ -47,13 +43,9 @@ def naming_file(path: Path | str) -> Iterator[None]:
 
 
 class Fault(Exception):  # noqa: N818  not an error of the program
-    """A fault outside the program that needs the user's attention, such as a robot that was stopped.
+    """A fault outside the program that needs the user's attention, such as a robot that was stopped."""
 
-    Attributes:
-        exit_code: exit code of the command line.
-    """
-
-    exit_code = 1
+    exit_code = 1  # of the command line
 
 
 # Distributions by their module, if the names differ.
@@ -65,9 +57,7 @@ _DISTRIBUTIONS |= dict.fromkeys(("rtde_control", "rtde_receive"), "ur-rtde")
 def missing_extra(error: ModuleNotFoundError, wanted: str = "") -> str | None:
     """Return advice in one line on how to install a missing library; None if it belongs to no extra of padforge.
 
-    Args:
-        error: error of the import.
-        wanted: extras, separated by commas, that the command needs in any case.
+    `wanted` are the extras, separated by commas, that the command needs in any case.
     """
     from importlib.metadata import PackageNotFoundError, requires
 

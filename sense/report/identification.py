@@ -147,8 +147,8 @@ def _draw_plan(result: Identification, path: Path) -> None:
         colour = VERTICAL if vertical else HORIZONTAL
         x, y = pad.to_mm(built.path(row)[0]).T
         plan.plot(x, y, color=colour, linewidth=1.6)
-        end = (x[-1], top + margin) if vertical else (right + margin, y[-1])
-        plan.text(*end, str(fibre + 1), color=colour, fontsize=9, ha="center", va="center")
+        start = (x[0], -top - margin) if vertical else (-right - margin, y[0])
+        plan.text(*start, str(fibre + 1), color=colour, fontsize=9, ha="center", va="center")
         along, visible = np.linspace(0, 100, len(offset)), np.where(within, offset, np.nan)
         offsets.plot(along, visible, color=colour, linewidth=1.2)
         offsets.fill_between(along, visible - std, visible + std, color=colour, alpha=0.12, linewidth=0)

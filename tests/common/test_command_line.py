@@ -2,9 +2,7 @@
 
 import logging
 import re
-from contextlib import nullcontext
 from pathlib import Path
-from unittest.mock import Mock
 
 import click
 import pytest
@@ -66,17 +64,6 @@ def test_results_without_out_go_beside_their_pad(tmp_path: Path) -> None:
     assert command_line.pad_folder() == Path("out/pad")
     (tmp_path / "pad").mkdir()
     assert command_line.pad_folder(tmp_path / "pad") == tmp_path
-
-
-def test_progress_counts_what_is_done(monkeypatch: pytest.MonkeyPatch) -> None:
-    bar = Mock()
-    monkeypatch.setattr(command_line, "progress", lambda: nullcontext(bar))
-    with command_line.progress_bar("presses") as show:
-        show(3, 8, "pressing")
-        show(0, 0, "waiting")
-    first, second = (each.kwargs for each in bar.update.call_args_list)
-    assert (first["completed"], first["total"], first["note"]) == (3, 8, "3 of 8  pressing")
-    assert (second["total"], second["note"]) == (None, "waiting")
 
 
 @pytest.mark.parametrize(

@@ -3,14 +3,12 @@
 import errno
 import json
 import logging
-import math
 import os
 import re
 import subprocess
 import sys
 import zipfile
 from collections.abc import Iterator
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -31,26 +29,13 @@ from padforge.fabricate.cad import model, step_file
 from padforge.fabricate.export import FORMATS, Build, build
 from padforge.fabricate.mould import LID_MM, Body, Prism
 from padforge.fabricate.outputs import pictures
-from padforge.fabricate.settings import DEFAULTS, DispenserSettings
 from tests.fabricate.planted import level_pad, with_settings
 from tests.helpers.less import small_pictures
 
 PAD = Morphology.random((1, 2), 2, seed=7, pitch_mm=(12.0, 10.0))
-FILES = {
-    *(f"{body}.{suffix}" for body in ("mould", "lid", "conductive", "holder") for suffix in ("stl", "3mf")),
-    "mould.step",
-    *(
-        "tracks.svg",
-        "tracks.dxf",
-        "mould.png",
-        "tracks.png",
-        "laying.md",
-        "orientation.svg",
-        "crossing.svg",
-        "fabrication.json",
-    ),
-    *("laying.gcode", "toolpath.svg"),
-}
+FILES = {f"{body}.{suffix}" for body in ("mould", "lid", "conductive", "holder") for suffix in ("stl", "3mf")}
+FILES |= {"mould.step", "mould.png", "tracks.svg", "tracks.dxf", "tracks.png", "laying.gcode", "toolpath.svg"}
+FILES |= {"fabrication.json", "laying.md", "orientation.svg", "crossing.svg"}
 SETTINGS = with_settings({"lid": True, "pins": True, "conductive": True, "holder": True})
 
 
@@ -146,14 +131,6 @@ def test_step_reads_back_as_valid_solids_of_the_volumes_of_the_meshes(built, gol
     assert re.fullmatch(r"16 solids, .* of the mesh's, curves within 2 µm", finding.message)
 
 
-def test_sizes_follow_from_pitch_and_walls(built):
-    _, result = built
-    walls = 2 * (2 + 2 + 6 * math.tan(math.radians(2)))
-    sides = [3 * 12 + walls, 2 * 10 + walls]
-    assert result.size_mm == pytest.approx([*sides, 8.0 + 2.0], abs=1e-4)  # pins stand above the walls
-    assert result.sizes["tray_mm"] == pytest.approx(sides)
-
-
 def test_shrinkage_enlarges_the_mould_and_keeps_the_pad(tmp_path):
     pad, mould = Morphology.straight(2, 12.0), {"holder": True, "number_mm": 0.0, "exit_mm": 0.0}
     kept = build(pad, tmp_path / "kept", ["stl"], with_settings(mould))
@@ -170,17 +147,6 @@ def test_shrinkage_enlarges_the_mould_and_keeps_the_pad(tmp_path):
     for key in ("in_pad_mm", "cut_mm"):
         assert [fibre[key] for fibre in grown.fibres] == [fibre[key] for fibre in kept.fibres]
     assert [row[2:4] for row in grown.crossings["table"]] == [row[2:4] for row in kept.crossings["table"]]
-
-
-def test_toolpath_findings_only_with_a_program(tmp_path):
-    settings = replace(DEFAULTS, dispenser=DispenserSettings(origin_mm=(10.0, 110.0)))
-    by_hand, by_machine = build(PAD, tmp_path, [], settings), build(PAD, tmp_path, ["gcode"], settings)
-    found = {finding.name: finding.status for finding in by_machine.findings}
-    assert (found.pop("dispenser_box"), found.pop("dispenser_tip")) == ("fail", "pass")
-    assert [*found] == [finding.name for finding in by_hand.findings]
-    assert "dispenser" not in by_hand.settings
-    assert by_machine.settings["dispenser"]["origin_mm"] == [10.0, 110.0]
-    assert by_machine.files == ["laying.gcode", "toolpath.svg"]
 
 
 def other_solid(monkeypatch, solid) -> None:
@@ -240,7 +206,7 @@ def test_interrupted_build_keeps_the_old_mould(tmp_path, monkeypatch):
     def stopped(*_):
         raise OSError(errno.ENOSPC, "full")
 
-    monkeypatch.setattr(export, "write_json", stopped)
+    monkeypatch.setattr(export.files, "write_json", stopped)
     with pytest.raises(InputError):
         build(Morphology.straight(2), tmp_path, ["stl", "svg"])
     assert contents(tmp_path) == before
@@ -261,15 +227,6 @@ def test_build_deletes_earlier_files_unless_they_were_changed(tmp_path, caplog):
         *(f"{tmp_path / name} {gone}" for name in ("mould.3mf", "tracks.svg")),
         f"{tmp_path / 'tracks.dxf'} is left from the mould before this one: it is not as it was written",
     ]
-
-
-def test_build_deletes_nothing_without_digests(tmp_path, caplog):
-    caplog.set_level(logging.INFO, "padforge")
-    (tmp_path / "fabrication.json").write_text('{"format": "padforge-fabrication/1", "sha256": ["mould.step"]}')
-    (tmp_path / "mould.step").write_text("somebody's own")
-    build(PAD, tmp_path, [])
-    assert not caplog.messages
-    assert (tmp_path / "mould.step").exists()
 
 
 def test_provenance_is_of_the_input_at_the_start(tmp_path, monkeypatch):

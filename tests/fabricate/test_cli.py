@@ -9,7 +9,6 @@ import ezdxf
 import pytest
 from click.testing import CliRunner
 
-from padforge.common.validation import InputError
 from padforge.design.morphology import Morphology
 from padforge.fabricate import export
 from padforge.fabricate.cli import fabricate, mould_lines
@@ -162,21 +161,3 @@ def test_json_of_a_build_is_its_document(tmp_path):
     Morphology.straight(1).save(tmp_path / "morphology.json")
     result = invoke(tmp_path / "morphology.json", "--formats", "svg", "--json")
     assert json.loads(result.stdout) == json.loads((tmp_path / "fabrication.json").read_text())
-
-
-@pytest.mark.parametrize(
-    ("file", "table", "line"),
-    [
-        ("pad.json", "[pad]\nfibre_diameter_mm = 0.4", "[pad] fibre_diameter_mm: no such key, allowed are grid"),
-        ("pad.json", '[mould]\nlevels = "two"', "2 crossings"),
-        ("absent.json", "", "absent.json"),
-    ],
-)
-def test_build_refuses_in_one_line_and_leaves_nothing(tmp_path, file, table, line):
-    level_pad(1.8, 1.2).save(tmp_path / "pad.json")
-    (tmp_path / "pad.toml").write_text(table, encoding="utf-8")
-    with pytest.raises(InputError) as refusal:
-        invoke(tmp_path / file, "--out", tmp_path / "out", "--spec", tmp_path / "pad.toml")
-    assert line in str(refusal.value)
-    assert "\n" not in str(refusal.value)
-    assert not (tmp_path / "out").exists()

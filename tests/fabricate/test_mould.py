@@ -14,13 +14,13 @@ from padforge.fabricate.mould import (
     Body,
     Prism,
     bed_frame,
-    conductive_body,
     conductive_plan,
     holder_body,
     lid_body,
     mould_body,
     registration_pins,
     sizes,
+    well_outlines,
 )
 from padforge.fabricate.plan import Plan
 from padforge.fabricate.settings import WELL_MM
@@ -58,10 +58,7 @@ def height_at(solid: trimesh.Trimesh, x: float, y: float) -> float:
 
 @pytest.mark.parametrize(
     "pad",
-    [
-        *((2, 10, 2), (1, 30, 1032)),
-        *(pytest.param(each, marks=pytest.mark.slow) for each in ((4, 30, 1032), "20para")),
-    ],
+    [*((2, 10, 2), (1, 30, 1032)), *(pytest.param(each, marks=pytest.mark.slow) for each in ((4, 30, 1032), "20para"))],
 )
 def test_random_and_published_moulds_are_closed(request, pad):
     if isinstance(pad, str):
@@ -158,19 +155,19 @@ def test_lid_has_holes_for_pins_vents_and_spout():
 
 
 @pytest.mark.parametrize(
-    ("tapered", "knots", "layer_mm"),
-    [(17.0, 1, 0.3), pytest.param(5.0, 4, 0.1, marks=pytest.mark.slow)],
+    ("tapered", "knots", "layer_mm"), [(17.0, 1, 0.3), pytest.param(5.0, 4, 0.1, marks=pytest.mark.slow)]
 )
 def test_tapered_moulds_with_wells_are_closed(tapered, knots, layer_mm):
     tapers = with_settings({"ridge_draft_deg": tapered, "pins": True}, printer={"layer_mm": layer_mm})
     plan = Plan(Morphology.random(1, knots, seed=3), tapers)
-    for body in (mould_body(plan), conductive_body(conductive_plan(plan))):
+    wells = conductive_plan(plan)
+    for body in (mould_body(plan), mould_body(wells, well_outlines(wells))):
         assert_one_closed_body(as_read(body))
 
 
 def test_conductive_mould_has_a_well_at_every_ridge_end():
     plan = conductive_plan(Plan(Morphology.straight(2, pitch_mm=15.0), with_settings({"number_mm": 0.0})))
-    read = as_read(conductive_body(plan))
+    read = as_read(mould_body(plan, well_outlines(plan)))
     assert_one_closed_body(read)
     edge = 1.5 * 15
     for x in (-edge - 2.5, edge + 2.5):

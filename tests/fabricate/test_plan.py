@@ -11,14 +11,13 @@ from hypothesis import strategies as st
 from shapely import affinity
 from shapely.geometry.base import BaseGeometry
 
-from padforge.common.plotting import HORIZONTAL, VERTICAL
 from padforge.common.settings import Spec
 from padforge.common.validation import InputError
 from padforge.design.morphology import Morphology
 from padforge.design.paths.curves import Crossing
 from padforge.design.settings import FIBRE_MM, read_contact
 from padforge.fabricate.mould import mould_body
-from padforge.fabricate.plan import COVER_MM, INTO_WALL_MM, Plan, assign_layers, draw_number, fibre_layers
+from padforge.fabricate.plan import COVER_MM, INTO_WALL_MM, Plan, assign_layers, draw_number
 from padforge.sense.rig.config import RobotFrame
 from padforge.sense.settings import RigSettings
 from tests.fabricate.planted import exact_fibre, level_pad, with_settings
@@ -122,18 +121,6 @@ def test_require_levels_refuses_crossings_of_a_family():
     Plan(Morphology.straight(3), settings).require_levels()
 
 
-@pytest.mark.parametrize(("height", "width"), [(1.5, 0.2), (5.0, 0.8)])
-def test_numbers_are_one_centred_piece_with_strokes_of_their_width(height, width):
-    for number in (8, 23, 96, 117):
-        outline = draw_number(number, height, width)
-        assert isinstance(outline, shapely.Polygon)
-        opened = outline.buffer(-0.49 * width).buffer(0.49 * width, join_style="mitre")
-        assert opened.area == pytest.approx(outline.area, rel=0.03)
-        left, low, right, high = outline.bounds
-        assert height < high - low <= 1.1 * (height + width)
-        assert (left + right, low + high) == pytest.approx((0, 0), abs=1e-9)
-
-
 def test_digits_turned_over_or_upside_down_are_no_other_digits():
     """Mirror images of two digits share no more than the digits as they are read; a seven-segment 2 is a 5."""
     digits = [draw_number(number, 2.5, 0.4) for number in range(10)]
@@ -167,12 +154,6 @@ def test_numbers_are_next_to_the_start_of_their_fibre():
         assert int(np.argmin(np.linalg.norm(starts - middle, axis=1))) == fibre
 
 
-def test_numbers_absent_or_without_room():
-    assert Plan(Morphology.straight(2), with_settings({"number_mm": 0.0})).numbers == []
-    crowded = Plan(Morphology.straight(2, pitch_mm=4.0), with_settings({"number_mm": 6.0, "exit_mm": 0.0}))
-    assert crowded.numbers == [None] * 4
-
-
 def test_numbers_of_the_mould_are_legible_on_the_pad():
     """The mould's floor, which the tracks' side of the pad is cast from, as an arm sees the pad: upright."""
     plan, mould = Plan(Morphology.random(5, 3, seed=2)), with_settings({}).mould
@@ -193,14 +174,6 @@ def bays(outline: BaseGeometry) -> np.ndarray:
     x_min, y_min, x_max, y_max = outline.bounds
     grid = np.stack(np.meshgrid(np.linspace(x_min, x_max, 25), np.linspace(y_min, y_max, 25)), axis=-1).reshape(-1, 2)
     return grid[shapely.distance(outline, shapely.points(grid)) > 0.1]
-
-
-def test_layers_of_a_family_are_the_paler_the_shallower():
-    layers = fibre_layers(Plan(level_pad(1.8, 1.2)))
-    assert [(layer.family, layer.depth_mm) for layer in layers] == [(0, 2.0), (0, 1.2), (1, 0.4)]
-    white = 0.7 / 2  # of the most, as one of two layers is deeper
-    red, green, blue = (round(part + white * (255 - part)) for part in bytes.fromhex(HORIZONTAL[1:]))
-    assert [layer.colour for layer in layers] == [HORIZONTAL, f"#{red:02x}{green:02x}{blue:02x}", VERTICAL]
 
 
 @pytest.mark.parametrize("step", [0.05, 1.0])

@@ -13,11 +13,10 @@ from hypothesis import strategies as st
 from padforge.design.morphology import Morphology
 from padforge.design.settings import PadSettings
 from padforge.fabricate.cad.model import body_solid
-from padforge.fabricate.checks.plan_checks import check_mould, check_plan
+from padforge.fabricate.checks.plan_checks import check_mould
 from padforge.fabricate.leads import lead_spacing
 from padforge.fabricate.mesh import build_mesh, mould_mesh
-from padforge.fabricate.mould import bed_frame, holder_body, lid_body, sizes, tray_body
-from padforge.fabricate.outputs.drawings import orientation_sentence
+from padforge.fabricate.mould import bed_frame, holder_body, lid_body, tray_body
 from padforge.fabricate.plan import Plan
 from padforge.fabricate.settings import DEFAULTS, FabricationSettings, MouldSettings
 from tests.fabricate.planted import with_settings
@@ -25,34 +24,9 @@ from tests.fabricate.planted import with_settings
 PAD = Morphology.straight((3, 6), (8.0, 15.0))
 
 
-HOLE = ((-2.5, 3.0), (2.5, 3.0), (2.5, 11.0), (-2.5, 11.0))
-"""Between fibres of `PAD`."""
-
-
 def settings(pad: Morphology, mould: dict | None = None, **more) -> FabricationSettings:
     own = PadSettings(**{**pad.layout.settings, **more})
     return replace(DEFAULTS, mould=MouldSettings(**{"number_mm": 0.0, **(mould or {})}), pad=own)
-
-
-def test_tray_has_the_width_and_height_of_the_pad():
-    plan = Plan(PAD, settings(PAD))
-    assert sizes(plan)["pad_mm"] == [56.0, 60.0]
-    left, low, right, high = plan.tray.bounds
-    assert (right - left) - (high - low) == pytest.approx(56 - 60)
-    starts = np.array([lead.point_past_edge(0) for lead in plan.ends(0)])
-    assert starts[:3] == pytest.approx(np.array([[-28.0, y] for y in (-15.0, 0.0, 15.0)]))
-    assert starts[3:] == pytest.approx(np.array([[x, -30.0] for x in (-20.0, -12.0, -4.0, 4.0, 12.0, 20.0)]))
-
-
-def test_keep_out_is_a_pillar_of_the_mould():
-    with_hole, without = (Plan(PAD, settings(PAD, keep_out_mm=hole)) for hole in ((HOLE,), ()))
-    found = {finding.name: finding for finding in check_mould(with_hole)[-1]}
-    assert all(found[name].status == "pass" for name in ("watertight", "bodies", "genus", "keep_out", "pillars"))
-    more = mould_mesh(with_hole).volume() - mould_mesh(without).volume()
-    assert more == pytest.approx(5 * 8 * DEFAULTS.mould.silicone_mm, rel=1e-6)
-    rim = DEFAULTS.mould.floor_mm + DEFAULTS.mould.silicone_mm
-    section = [shapely.Polygon(ring) for ring in mould_mesh(with_hole).slice(rim - 1e-3).to_polygons()]
-    assert min(ring.symmetric_difference(shapely.Polygon(HOLE)).area for ring in section) < 1e-2
 
 
 def test_round_holes_are_round_pillars_whose_feet_are_the_heads_of_screws():
@@ -71,33 +45,12 @@ def test_round_holes_are_round_pillars_whose_feet_are_the_heads_of_screws():
     assert sorted(face.area for face in round_) == pytest.approx(sorted(areas), rel=1e-3)
 
 
-def test_tracks_keep_clear_of_the_head_of_a_screw():
-    holes = [[0.0, 7.0, 3.0, 9.0]]  # verticals run at x = -4 and 4
-    found = {finding.name: finding for finding in check_plan(Plan(PAD, settings(PAD, keep_out_mm=holes)))}
-    assert found["keep_out"].message == "tracks of fibres 6, 7 run into keep-outs"
-
-
 def test_keep_out_at_the_edge_joins_the_wall():
     notch = ((20.0, 20.0), (28.0, 20.0), (28.0, 30.0), (20.0, 30.0))
     plan = Plan(Morphology.straight((1, 1), (28.0, 30.0)), settings(PAD, keep_out_mm=(notch,)))
     rim = DEFAULTS.mould.floor_mm + DEFAULTS.mould.silicone_mm
     free = [ring for ring in mould_mesh(plan).slice(rim - 1e-3).to_polygons() if len(ring)]
     assert len(free) == 2  # the walls' outside and inside: no film between pillar and wall
-
-
-@pytest.mark.parametrize(
-    ("hole", "name", "status"),
-    [
-        (((-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0)), "keep_out", "fail"),
-        (((0.0, 3.0), (0.6, 3.0), (0.6, 9.0), (0.0, 9.0)), "pillars", "warn"),
-        (((0.0, 3.0), (0.3, 3.0), (0.3, 9.0), (0.0, 9.0)), "pillars", "fail"),
-        (((-1.0, -40.0), (1.0, -40.0), (1.0, 40.0), (-1.0, 40.0)), "one_piece", "fail"),
-    ],
-)
-def test_check_plan_detects_harmful_keep_outs(hole, name, status):
-    found = {finding.name: finding for finding in check_plan(Plan(PAD, settings(PAD, keep_out_mm=(hole,))))}
-    assert found[name].status == status
-    assert found[name].positions_mm
 
 
 def test_lid_bores_are_clear_of_pillars():
@@ -162,19 +115,6 @@ def test_holder_slots_are_at_the_mirrored_leads():
         assert solid.distance(shapely.Point(-x, y)) > 1
     low, high = plan.tray.bounds[1], plan.tray.bounds[3]
     assert bed_frame(plan)["centre_mm"] == pytest.approx([110.0, 110.0 - (low + high) / 2])
-
-
-@pytest.mark.parametrize(
-    ("fibres", "leads", "says"),
-    [
-        ((2, 3), "edges", "horizontal fibres count from near to far and start on the right, vertical ones"),
-        ((0, 3), "edges", "all fibres are vertical: they count from right to left and start at the near side."),
-        ((2, 0), "edges", "all fibres are horizontal: they count from near to far and start on the right."),
-        ((2, 3), "one side", "all leads leave at the near side: horizontal fibres"),
-    ],
-)
-def test_orientation_sentence_states_the_order_of_fibres(fibres, leads, says):
-    assert says in orientation_sentence(fibres, leads)
 
 
 def test_leads_to_one_side_leave_two_printed_lines_between_their_slots():

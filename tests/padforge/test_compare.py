@@ -1,6 +1,5 @@
 """`padforge design compare`: which pad to make."""
 
-import re
 from types import SimpleNamespace
 
 import pytest
@@ -12,29 +11,6 @@ from padforge.design.settings import read_contact
 from padforge.fabricate import FabricationSettings
 from tests.helpers.door import called, refused
 from tests.helpers.less import blank_pictures, compare_little
-
-
-def test_comparison_is_a_table_in_metres_with_straight_fibres_below_a_pad_that_differs():
-    plain = {"name": "plain", "fibres": [2, 3], "knots": 0, "length_mm": 1234.0, "crossings": 6, "mould_ml": 12.34}
-    flat = {"errors_mm": [0.4, 2.0], "straight_mm": [0.8, 1.0]}
-    plain |= {"errors_mm": [1.0, 1.5], "straight_mm": [1.0, 1.5], "others": {"flat": flat}}
-    bent = plain | {"name": "bent", "knots": 4, "errors_mm": [0.5, 0.75], "half_width_mm": 5.678}
-    bent |= {"force_n": 1.234, "strain_percent": 45.6, "straight_length_mm": 900.0, "straight_crossings": 5}
-    lines = comparison.comparison_lines({"rows": [plain, bent]})
-    assert max(map(len, lines)) <= 100
-    assert [re.split(r"\s\s+", line.strip()) for line in lines] == [
-        ["pad", "fibres", "knots", "fibre", "crossings", "width", "force", "strain", "mould"],
-        ["m", "mm", "N", "%", "ml"],
-        ["plain", "2 + 3", "0", "1.23", "6", "-", "-", "-", "12.3"],
-        ["bent", "2 + 3", "4", "1.23", "6", "5.68", "1.23", "45.6", "12.3"],
-        ["straight fibres", "0.90", "5"],
-        [""],
-        ["error (mm) with failed fibres", "0", "1"],
-        ["plain", "1.00", "1.50"],
-        ["bent", "0.50", "0.75"],
-        ["straight fibres", "1.00", "1.50"],
-        ["flat", "0.40 / 0.80", "2.00 / 1.00"],
-    ]
 
 
 def test_compare_designs_every_variant_in_its_folder(tmp_path, monkeypatch):

@@ -9,8 +9,6 @@ from pathlib import Path
 
 import pytest
 
-import padforge
-from padforge import design, fabricate, sense
 from padforge.common import compilation
 from tests.helpers.door import called, refused
 
@@ -117,21 +115,6 @@ def test_only_the_genetic_search_needs_pymoo(tmp_path: Path, monkeypatch: pytest
     ended = called("design", cwd=tmp_path)
     assert ended.code in (0, 1), ended
     assert (tmp_path / "out" / "pad" / "morphology.json").is_file()
-
-
-def test_package_exports_a_dozen_names_of_the_stages() -> None:
-    names = [name for package in (design, fabricate, sense) for name in package.__all__]
-    assert len(names) == len(set(names))
-    exported = set(dir(padforge)) - {"design", "fabricate", "sense"}
-    assert 10 <= len(exported) <= 16
-    for name in exported - {"Fault", "InputError", "Spec"}:  # of all stages
-        package = next(package for package in (design, fabricate, sense) if name in package.__all__)
-        assert getattr(padforge, name) is getattr(package, name), name
-    with pytest.raises(AttributeError, match="nothing"):
-        padforge.nothing  # noqa: B018  # pyright: ignore[reportAttributeAccessIssue]
-    for name in ("padforge.nothing", "padforge.design.nothing"):
-        with pytest.raises(ModuleNotFoundError, match="nothing"):
-            __import__(name)
 
 
 def test_processes_and_tests_import_one_padforge(tmp_path: Path) -> None:

@@ -49,11 +49,7 @@ def contents(folder: Path) -> dict[str, bytes]:
 
 @pytest.mark.parametrize(
     "words",
-    [
-        f"{DESIGN} --seed 1",
-        "design import plan.svg --out pad",
-        "design edit other.json --out pad/morphology.json",
-    ],
+    [f"{DESIGN} --seed 1", "design import plan.svg --out pad", "design edit other.json --out pad/morphology.json"],
 )
 def test_pad_in_use_is_not_replaced(pad: Path, words: str) -> None:
     before = contents(pad)

@@ -7,7 +7,6 @@ import re
 import signal
 import threading
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 import trimesh
@@ -15,11 +14,9 @@ from safetensors.numpy import load_file
 
 from padforge.common.files import sha256
 from padforge.common.parallel import Checkpoints
-from padforge.common.settings import Spec
 from padforge.design import Contact, SearchSettings
 from padforge.design.contact_set import judged_contacts
 from padforge.design.report import press_sections
-from padforge.run import Run
 from padforge.sense.report.calibration import calibrate_into
 from tests.helpers.door import called, refused
 from tests.helpers.less import blank_pictures, compare_little, small_pictures
@@ -154,17 +151,6 @@ def test_resume_continues_interrupted_search_and_calibration(
     assert digests(tmp_path, *VOLATILE) == digests(finished[0], *VOLATILE)
 
 
-@pytest.mark.slow
-def test_resume_does_not_reuse_pad_of_other_search(folder: Path) -> None:
-    """One that was made in the folder meanwhile, with other settings than the run has."""
-    before = digests(folder)
-    (folder / "other.toml").write_text(SMALL.replace("starts = 1", "starts = 1\nseed = 5"))
-    assert called("design", "--spec", "other.toml", "--force", cwd=folder).code == 0
-    assert digests(folder)["morphology.json"] != before["morphology.json"]
-    assert resumed(folder) == "mould, recording, contacts, calibration"
-    assert digests(folder)["morphology.json"] == before["morphology.json"]
-
-
 def test_interrupted_run_keeps_earlier_recording(folder: Path) -> None:
     """Whose mould and recording are of another pad than what was found so far, as the report then tells."""
     recording = folder / "out" / "pad" / "recording" / "readings.bin"
@@ -233,15 +219,6 @@ def test_run_trains_nothing_in_a_time_budget_that_is_spent(folder: Path, monkeyp
     ended = called("run", "--resume", "--time-budget", "5", cwd=folder)
     assert (ended.code, ended.err) == (2, f"padforge: {said}\n"), ended
     assert not (folder / "out" / "pad" / "localizer.json").exists()
-
-
-def test_remaining_time_counts_from_the_start_of_the_run(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A share is of the whole budget, whatever was spent before; 30 s are."""
-    monkeypatch.setattr("padforge.run.time", SimpleNamespace(monotonic=lambda: 130.0))
-    run = Run(Spec({}), Path("pad"), time_budget=100.0, started_s=100.0)
-    assert (run.remaining_s(), run.remaining_s(0.5), run.remaining_s(reserve_s=12.0)) == (70.0, 20.0, 58.0)
-    assert run.remaining_s(0.25) == 0.0
-    assert Run(Spec({}), Path("pad"), started_s=100.0).remaining_s(0.5) is None
 
 
 @pytest.mark.parametrize("stages", ["", ', "stages": {"sense": {"files": 3}}'])

@@ -69,12 +69,6 @@ def test_commands_say_once_that_a_layer_is_strained_too_much(
     assert ended.err.count("[contact] strains the silicone by up to 1.0") == 1
 
 
-def test_run_says_once_that_a_layer_is_strained_too_much(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    check_run(Run(Spec({"contact": {"base": "bonded"}}), tmp_path / "out"))
-    (message,) = caplog.messages
-    assert message.startswith("[contact] strains the silicone by up to 1.0")
-
-
 def test_studies_press_the_pad_as_it_will_be_cast(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     contacts = []
 

@@ -101,30 +101,6 @@ def test_ring_curves_of_a_circle_are_two_arcs(clockwise):
     assert turns(pieces).max() < 1e-4
 
 
-@pytest.mark.parametrize("corners", [3, 12])
-def test_ring_curves_of_a_polygon_are_its_edges(corners):
-    polygon = shapely.Point(0, 0).buffer(5.0).boundary.interpolate(np.arange(corners) / corners, normalized=True)
-    drawn = shapely.Polygon(polygon.tolist())
-    pieces = list(ring_curves(ring(drawn), {}, FIT_MM))
-    assert len(pieces) == corners
-    assert all(piece.arc is None and piece.spline is None for piece in pieces)
-    assert sum(length(piece) for piece in pieces) == pytest.approx(drawn.length)
-    assert sorted(turns(pieces)) == pytest.approx([360 / corners] * corners, abs=0.5)
-
-
-def test_ring_curves_of_an_ellipse_are_closed_splines():
-    t = np.linspace(0, 2 * np.pi, 3000, endpoint=False)
-    drawn = np.stack([8 * np.cos(t), 3 * np.sin(t)], axis=1)
-    pieces = list(ring_curves(drawn, {}, FIT_MM))
-    assert all(piece.spline for piece in pieces)
-    for piece in pieces:
-        x, y = at(piece, np.linspace(0, length(piece), 500)).T
-        slope = np.hypot(x / 64, y / 9)
-        assert np.abs((x**2 / 64 + y**2 / 9 - 1) / 2 / slope).max() < FIT_MM + FINE_MM
-    assert gaps(pieces).max() < 1e-9
-    assert turns(pieces).max() < 0.1
-
-
 @pytest.mark.parametrize(("knots", "seed"), [(1, 0), (8, 2), pytest.param(20, 3, marks=pytest.mark.slow)])
 def test_track_outlines_close_and_turn_at_corners_only(knots, seed):
     plan = Plan(Morphology.random(1, knots, seed), with_settings({"border_mm": 2.0}))
@@ -153,11 +129,6 @@ def test_track_outlines_are_half_a_width_from_exact_fibres(grid, knots, seed, mo
         off, count = deviation(plan, fibre)
         assert off < 3e-3
         assert count > 500
-
-
-def test_track_outlines_with_a_finer_fit_are_nearer():
-    plan = Plan(Morphology.random(1, 3, seed=6))
-    assert deviation(plan, 0, fit_mm=1e-4)[0] < 5e-4
 
 
 @pytest.mark.parametrize("far", [[19, 5], [10, 10, 10], [25]])

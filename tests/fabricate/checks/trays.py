@@ -1,6 +1,7 @@
 """Trays and blocks as triangle meshes, built without a plan, and their findings."""
 
 import math
+from collections.abc import Iterable
 
 import numpy as np
 import shapely
@@ -64,12 +65,16 @@ def check_body(solid: Manifold | trimesh.Trimesh, **arguments: object) -> dict[s
     return {finding.name: finding for finding in check_triangles(vertices, triangles, **arguments)}  # pyright: ignore
 
 
-def failures(findings: dict[str, Finding]) -> dict[str, str]:
-    return {name: finding.status for name, finding in findings.items() if finding.status != "pass"}
-
-
-def has_position_near(finding: Finding, x: float, y: float, within: float = 1.0) -> bool:
-    return any(math.hypot(px - x, py - y) <= within for px, py in finding.positions_mm)
+def finding_lines(findings: Iterable[Finding], passed: bool = False) -> list[str]:
+    """A line for each finding; those that pass only if they are asked for."""
+    lines = []
+    for finding in findings:
+        if passed or finding.status != "pass":
+            values = f"{finding.measured} / {finding.limit}"
+            places = "".join(f" ({x:z.1f}, {y:z.1f})" for x, y in finding.positions_mm[:4])
+            more = f" and {len(finding.positions_mm) - 4} more" if len(finding.positions_mm) > 4 else ""
+            lines.append(f"  {finding.status} {finding.name} {values}: {finding.message};{places}{more}")
+    return lines
 
 
 CROSS = [ridge(spanning(3.0), 1.2), ridge(spanning(-3.0), 1.2), ridge(shapely.affinity.rotate(spanning(1), 90, (0, 0)))]

@@ -7,7 +7,7 @@ import pytest
 
 from padforge.design.morphology import Morphology
 from padforge.fabricate.export import Fabrication
-from padforge.fabricate.fibre_placement import gcode, plan_toolpath
+from padforge.fabricate.fibre_placement import gcode
 from padforge.fabricate.outputs.laying_page import laying_document
 from padforge.fabricate.plan import Plan
 from tests.fabricate.fibre_placement.machines import Run, exact_path, max_distance, run_gcode
@@ -79,33 +79,3 @@ def test_fibre_settings_set_depth_and_speed():
 
     assert seconds(max_strain=0.05) > 1.2 * seconds(max_strain=2.0)
     assert seconds(diameter_mm=0.2) < seconds(diameter_mm=0.39)
-
-
-@pytest.mark.parametrize(
-    ("counts", "leads", "where"),
-    [
-        ((2, 3), "edges", "fibre 1 starts on the right, nearest"),
-        ((0, 3), "edges", "fibre 1 starts on the right, at the near side"),
-        ((2, 3), "one side", "fibre 1 starts at the near edge"),
-    ],
-)
-def test_gcode_says_where_the_first_fibre_starts(counts, leads, where):
-    """In words; by its positions all other fibres of its family start farther left or farther away."""
-    plan = Plan(Morphology.straight(counts), with_settings(pad={"leads": leads}))
-    assert any(line.endswith(where) for line in program(plan).splitlines())
-    starts = {stroke.fibre: stroke.positions_mm[0] for step in plan_toolpath(plan, 0.3) for stroke in step.strokes}
-    family = [starts[fibre] for fibre in range(counts[0] or counts[1])]
-    if "right" in where:
-        assert starts[0][0] == max(x for x, _ in family)
-    assert starts[0][1] == pytest.approx(min(y for _, y in family))
-
-
-def test_head_of_gcode_has_lengths_times_and_depths() -> None:
-    """Of straight fibres 20 mm apart: sides of three and two pitches, borders, tongues and leads."""
-    mould: dict[str, object] = {"border_mm": 2.0, "exit_mm": 3.0, "lead_mm": 40.0}
-    settings = with_settings(mould, fibre={"diameter_mm": 0.3}, dispenser={"feed_mm_s": 5.0, "tip_mm": 0.35})
-    lines = program(Plan(Morphology.straight((1, 2), 20.0), settings)).splitlines()
-    length_m = (3 * 20 + 2 * 2 * 20 + 3 * (2 * 5 + 2 * 40)) / 1000
-    assert lines[1] == f"; 3 fibres in 2 layers, {length_m:.2f} m; {1000 * length_m / 5 / 60:.1f} minutes of laying"
-    assert lines[4] == "; z is 0 where the needle touches the upper face; it goes down to -0.900 mm"  # 0.3 - 1.2
-    assert lines[5] == "; needle of at most 0.35 mm, pad 6 mm thick"

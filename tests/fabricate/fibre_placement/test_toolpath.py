@@ -8,7 +8,7 @@ import pytest
 from scipy.interpolate import PchipInterpolator
 
 from padforge.design.morphology import Morphology
-from padforge.fabricate.fibre_placement import Stroke, check_toolpath, plan_toolpath
+from padforge.fabricate.fibre_placement import Stroke, plan_toolpath
 from padforge.fabricate.outputs.laying_page import laying_document
 from padforge.fabricate.plan import Plan
 from tests.fabricate.planted import with_settings
@@ -77,49 +77,3 @@ def test_strokes_have_the_cut_length_of_the_laying_page():
     cut = [fibre["cut_mm"] for fibre in laying_document(plan, 1.0)["fibres"]]
     for stroke in strokes(plan):
         assert stroke.steps_mm.sum() == pytest.approx(cut[stroke.fibre], abs=0.02)
-
-
-PAD = Morphology.straight(2)  # 33.75 mm, with leads 97.75 mm
-
-
-EDGE = 33.75 / 2 + 2 + 30
-
-
-def findings(mould: dict[str, object] | None = None, pad: Morphology = PAD, **dispenser: object):
-    plan = Plan(pad, with_settings(mould, dispenser=dispenser))
-    return {finding.name: finding for finding in check_toolpath(plan, plan_toolpath(plan, 0.3))}
-
-
-@pytest.mark.parametrize(
-    ("keys", "room", "places"),
-    [
-        ({"origin_mm": [EDGE, EDGE]}, 0.0, None),
-        ({"origin_mm": [EDGE - 0.5, 110.0]}, -0.5, [(EDGE, -5.625), (EDGE, 5.625)]),
-        ({"box_mm": [0.0, 220.0, 0.0, 110 + EDGE - 2, -5.0, 9.0]}, -2.0, [(-5.625, EDGE), (5.625, EDGE)]),
-        ({"box_mm": [0.0, 220.0, 0.0, 220.0, -0.5, 9.0]}, -0.4, [(-EDGE, -5.625), (-EDGE, 5.625)]),
-        ({"travel_height_mm": 10.0, "box_mm": [0.0, 220.0, 0.0, 220.0, -5.0, 9.0]}, -1.0, None),
-    ],
-)
-def test_dispenser_box_finding_has_margin_and_positions(keys, room, places):
-    found = findings(**keys)["dispenser_box"]
-    assert found.measured == pytest.approx(room, abs=1e-9)
-    assert found.status == ("pass" if room == 0 else "fail")
-    if places is not None:
-        assert np.array(sorted(found.positions_mm)) == pytest.approx(np.array(places))
-    else:
-        assert len(found.positions_mm) == (4 if room else 0)
-
-
-@pytest.mark.parametrize(
-    ("tip", "mould", "status"),
-    [
-        (0.37, {}, "pass"),
-        (0.41, {}, "fail"),
-        (0.64, {"ridge_width_mm": 0.7}, "pass"),
-    ],
-)
-def test_dispenser_tip_fails_if_wider_than_a_track(tip, mould, status):
-    found = findings(mould, tip_mm=tip)["dispenser_tip"]
-    assert (found.status, found.measured) == (status, tip)
-    assert bool(found.positions_mm) == (status == "fail")
-    assert all(max(map(abs, place)) < EDGE - 29 for place in found.positions_mm)  # leads lie outside

@@ -1,31 +1,19 @@
-from pathlib import Path
-
 import numpy as np
 import pytest
 from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
-from PIL import Image
 
-from padforge.common.plotting import ALARM, FAINT, HORIZONTAL, PAPER, VERTICAL
+from padforge.common.plotting import FAINT, HORIZONTAL, PAPER, VERTICAL
 from padforge.design.morphology import Morphology
 from padforge.fabricate.checks import Finding
 from padforge.fabricate.mesh import mould_mesh
-from padforge.fabricate.outputs.pictures import (
-    TURN_DEG,
-    draw_findings,
-    draw_mould,
-    draw_orientation,
-    draw_tracks,
-)
+from padforge.fabricate.outputs.pictures import TURN_DEG, draw_findings, draw_mould, draw_orientation, draw_tracks
 from padforge.fabricate.plan import Plan, fibre_layers
 from padforge.sense.rig.config import RobotFrame
 from padforge.sense.settings import RigSettings
 from tests.fabricate.planted import level_pad, with_settings
-from tests.helpers.less import small_pictures
 
 PLAN = Plan(level_pad(1.8, 1.2))
-SMALL = 200_000
-"""Bytes that a picture may have: it goes into git."""
 
 
 def make_finding(status, *positions: tuple[float, float], name: str = "wall") -> Finding:
@@ -35,16 +23,6 @@ def make_finding(status, *positions: tuple[float, float], name: str = "wall") ->
 def mesh_of(plan: Plan) -> tuple[np.ndarray, np.ndarray]:
     mesh = mould_mesh(plan).to_mesh()
     return np.asarray(mesh.vert_properties, dtype=float), np.asarray(mesh.tri_verts, dtype=np.intp)
-
-
-def pixels_of(path: Path) -> np.ndarray:
-    with Image.open(path) as image:
-        return np.asarray(image.convert("RGB"), np.int16)
-
-
-def count_colour(picture: np.ndarray, colour: str) -> int:
-    """Return how many pixels have this colour, as nearly as a palette of 256 gives it."""
-    return int((np.abs(picture - np.array([*bytes.fromhex(colour[1:])])).max(axis=2) <= 10).sum())
 
 
 def faces_of(figure: Figure) -> tuple[np.ndarray, list[str]]:
@@ -94,27 +72,6 @@ def test_mesh_picture_has_upper_faces_on_top(tmp_path, figures):
     assert [text.get_text() for text in figures[0].axes[1].texts] == ["0 mm", "10 mm above the lowest point"]
 
 
-def test_pictures_are_small_and_show_layers_and_marks(tmp_path, monkeypatch):
-    """By pixels, of a mesh that is closed, and of one that is invisible from above."""
-    small_pictures(monkeypatch, 300)
-    draw_mould(PLAN, *mesh_of(PLAN), [make_finding("fail", (0, 0))], tmp_path / "mould.png")
-    mould = pixels_of(tmp_path / "mould.png")
-    for colour in (*(layer.colour for layer in fibre_layers(PLAN)), PAPER, FAINT, ALARM):
-        assert count_colour(mould, colour) > 20
-    draw_findings([[100, 0, 3], [130, 0, 3], [130, 0, 3.0]], [[0, 1, 2]], [], tmp_path / "mesh.png")
-    assert not count_colour(pixels_of(tmp_path / "mesh.png"), ALARM)
-
-
-@pytest.mark.slow
-def test_pictures_of_a_dense_pad_are_small(tmp_path, published):
-    plan = Plan(Morphology.load(published / "20para.mat"))
-    findings = [make_finding("fail", *map(tuple, plan.clash_positions_mm.tolist()))]
-    draw_mould(plan, *mesh_of(plan), findings, tmp_path / "mould.png")
-    draw_tracks(plan, tmp_path / "tracks.png")
-    draw_findings(*mesh_of(plan), findings, tmp_path / "mesh.png")
-    assert all(path.stat().st_size < SMALL for path in tmp_path.iterdir())
-
-
 # Orientation
 
 POSES = {0: (False, 0.0), 1: (True, 0.0), 2: (True, TURN_DEG)}
@@ -149,19 +106,13 @@ def test_panels_match_frame_of_rig(tmp_path, figures):
             expected = scale * np.array(frame.pose(np.array(plan.lines[fibre].coords[0]), 0.0)[:2])
             assert track[0] - ((panel + 0.5) * WIDTH_MM, 0) == pytest.approx(expected, abs=1e-6)
             number = texts[str(fibre + 1)]
-            assert np.hypot(*(number - expected)) < 4
+            assert np.hypot(*(number - expected)) < 5
             assert np.hypot(*number) > np.hypot(*expected)
         for axis, unit in zip("xy", np.eye(2), strict=True):
             if panel < 2:  # in the last one there are the axes of the arm as well
                 assert texts[axis] / np.hypot(*texts[axis]) == pytest.approx(
                     np.array(frame.pose(unit, 0.0)[:2]), abs=0.01
                 )
-
-
-def test_side_views_number_fibres_as_panels(tmp_path, figures):
-    draw_orientation(Plan(Morphology.straight(4)), tmp_path / "orientation.svg")
-    views = [texts_in(figures[0], panel, -60, -36) for panel in POSES]
-    assert ["".join(sorted(view, key=lambda text: view[text][0])) for view in views] == ["5678", "8765", "8765"]
 
 
 def test_fibres_are_drawn_as_wide_as_they_are(tmp_path, figures):
