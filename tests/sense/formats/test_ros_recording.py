@@ -1,6 +1,7 @@
 """Recordings from and to bags of ROS 2, also as another reader (`mcap` with `mcap-ros2-support`) sees them."""
 
 import operator
+import sys
 from collections import defaultdict
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -19,6 +20,7 @@ from rosbags.rosbag2 import Reader
 
 from padforge.common.validation import InputError
 from padforge.sense import Recording
+from padforge.sense.formats import ros_recording
 from padforge.sense.formats.annotations import FaultAnnotation, ModelAnnotations
 from padforge.sense.formats.import_export import export_file, import_file
 from padforge.sense.formats.ros_messages import choose_epoch, to_stamps
@@ -112,7 +114,8 @@ def test_export_bag_refuses_what_cannot_be_read_or_written(
     with pytest.raises(InputError, match=r"there\.mcap: is a folder, expected a file or nothing"):
         export_bag(eight, tmp_path / "there.mcap")
     assert [file.name for file in tmp_path.iterdir()] == ["there.mcap"]
-    monkeypatch.setitem(__import__("sys").modules, "rosbags.typesys", None)
+    ros_recording._typestore.cache_clear()
+    monkeypatch.setitem(sys.modules, "rosbags.typesys", None)
     for run in (lambda: export_bag(eight, tmp_path / "r.mcap"), lambda: import_bag(tmp_path / "r.mcap")):
         with pytest.raises(InputError, match=r"r\.mcap: .* needs rosbags: pip install 'padforge\[formats\]'"):
             run()
