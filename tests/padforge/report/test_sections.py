@@ -3,7 +3,6 @@
 import json
 import re
 import shutil
-from collections.abc import Sequence
 from contextlib import nullcontext
 from pathlib import Path
 
@@ -12,15 +11,14 @@ import pytest
 from markupsafe import escape
 
 from padforge.common.validation import Fault, InputError
-from padforge.design.contact import FIBRE_BLUR_MM, contact_press, half_widths_mm
+from padforge.design.contact import contact_press
 from padforge.design.morphology import Morphology
-from padforge.design.report import draw_press, press_sections
+from padforge.design.report import draw_press
 from padforge.design.settings import Contact
 from padforge.fabricate import build
 from padforge.report import write_report
 from padforge.sense.recording.recording import Recording
 from padforge.sense.recording.run_directory import Recorder
-from padforge.sense.report.sections import loss_chart
 from tests.helpers.less import blank_pictures
 from tests.padforge.report.conftest import HOSTILE, design_document, study_document, written
 
@@ -188,50 +186,3 @@ def test_drawn_tool_touches_the_face_within_its_contact() -> None:
     for at, height in zip(x, 6.0 + rise, strict=True):
         if edge_mm < abs(at) and height < drawn[:, 1].max():
             assert np.isclose(drawn[np.isclose(drawn[:, 0], at), 1], height).any()
-
-
-def test_loss_chart_has_two_failed_fibres_in_the_column_of_the_first_and_the_row_of_the_second() -> None:
-    """The labels of columns stand below them, those of rows to their left."""
-    single, pairs = {(fibre,): 1.0 + fibre for fibre in range(3)}, {(0, 1): 4.0, (0, 2): 5.0, (1, 2): 6.0}
-    text = loss_chart(single | pairs, 3)
-    cells = re.findall(r'<rect x="(\d+)" y="(\d+)" width="38".*?<title>without (.*?): ', text)
-    corners = {name: (int(x), int(y)) for x, y, name in cells}
-    assert corners["1 and 3"] == (corners["1"][0], corners["3"][1])
-    assert corners["2 and 3"] == (corners["2"][0], corners["3"][1])
-    assert corners["1"][1] < corners["3"][1]
-    labels = re.findall(r'<text x="([\d.]+)" y="([\d.]+)" font-size="14">(\d)</text>', text)
-    rows, columns = labels[::2], labels[1::2]
-    for number, (row, column) in enumerate(zip(rows, columns, strict=True), 1):
-        x, y = corners[str(number)]
-        assert (row[2], column[2]) == (str(number), str(number))
-        assert y < float(row[1]) < y + 40
-        assert float(row[0]) < corners["1"][0]
-        assert float(column[0]) == pytest.approx(x + 19)
-        assert float(column[1]) > corners["3"][1] + 40
-
-
-def words(body: Sequence[str]) -> str:
-    """Return the text of HTML elements, with a bar where one ends."""
-    return re.sub(r"\s*(<[^>]*>\s*)+", "|", "".join(body))
-
-
-def test_press_section_states_what_the_press_does_to_each_family(monkeypatch: pytest.MonkeyPatch) -> None:
-    blank_pictures(monkeypatch)
-    document = design_document()
-    contact = Contact(depth_mm=2.0, thickness_mm=8.0, tool_radius_mm=10.0, fibre_depths_mm=(1.5, 0.5))
-    document["provenance"]["settings"]["contact"] = contact.model_dump(mode="json")
-    press = contact_press(contact)
-    [section] = press_sections(document, 0.5)
-    text = words(section.body)
-    assert (
-        f"A dome of 10 mm, pressed 2 mm deep into silicone of 8 mm, touches it within {press.contact_radius_mm:.1f} mm"
-        f" and takes {press.force_n():.1f} N on Ecoflex 00-20."
-    ) in text
-    r_mm = np.linspace(0, 2 * press.contact_radius_mm, 100)
-    for name, depth, width in zip(("horizontal", "vertical"), (1.5, 0.5), half_widths_mm(contact), strict=True):
-        strains = press.strains(r_mm, 8 - depth, FIBRE_BLUR_MM)
-        squeeze, stretch = strains.compressive.max(), max(strains.radial.max(), strains.hoop.max())
-        assert f"|{name}|{depth:g}|{width:.1f}|{squeeze:.0%}|{stretch:.0%}|50%|pass|" in text
-    assert "|-|-|" in words(press_sections(document, None)[0].body)
-    stiffer = words(press_sections(document, 0.5, ("Dragon Skin 30", 550))[0].body)
-    assert f"takes {10 * press.force_n():.1f} N on Dragon Skin 30." in stiffer

@@ -23,23 +23,6 @@ def matched(mapping: str, names: list[str] = NAMES) -> dict[str, list[str]]:
     return columns
 
 
-def test_parse_columns_reads_names_and_units() -> None:
-    assert parse_columns("time=t_ms:ms, fibres = ch* : 0.005 ,fibres=ü:uV,x=px:cm,y=py,press=contact") == [
-        ColumnEntry("time", "t_ms", 1e-3),
-        ColumnEntry("fibres", "ch*", 0.005),
-        ColumnEntry("fibres", "ü", 1e-6),
-        *(ColumnEntry("x", "px", 10), ColumnEntry("y", "py", None), ColumnEntry("press", "contact", None)),
-    ]
-    factors = [entry.factor for entry in parse_columns("time=t,fibres=adc*:0.000806,x=px:-1,y=py:-2e1")]
-    assert factors == [None, 0.000806, -1, -20]  # an axis may point the other way
-
-
-def test_match_columns_by_name_and_pattern() -> None:
-    assert matched("time=t_ms,fibres=ch*") == {"time": ["t_ms"], "fibres": ["ch1", "ch2"]}
-    assert matched("time=a?b,fibres=ch?", ["a,b", "ch1", "ch22"]) == {"time": ["a,b"], "fibres": ["ch1"]}
-    assert matched("time=T*,fibres=*,x=px,y=py", ["px", "c", "Time", "py"])["fibres"] == ["c"]
-
-
 def test_match_columns_orders_fibres_by_their_numbers() -> None:
     def order(*names: str, mapping: str = "time=t,fibres=*") -> list[str]:
         return matched(mapping, ["t", *names])["fibres"]
@@ -117,16 +100,6 @@ def test_assemble_recording_accepts_fibres_as_rows_or_columns() -> None:
     several = assemble_recording(ForeignArrays(Path("f"), arrays, {}))
     assert np.array_equal(several.readings, np.column_stack([VOLTS[:, 1], 2 * VOLTS]))
     assert several.fibre_names == ("one", "two[0]", "two[1]")
-
-
-def test_assemble_recording_converts_units_and_allows_for_rounded_times() -> None:
-    arrays = {"time": 1000 * TIMES, "fibres": (1000 * VOLTS).astype(np.int32), "positions": POSITIONS / 10}
-    commands = {"down_command": np.array([150, 601]), "up_command": np.array([500, 801])}
-    milli = dict.fromkeys(("time", "fibres", "down_command", "up_command"), 1e-3)
-    recording = assembled(arrays | commands, **milli, positions=10)
-    expected = assembled(COMMANDS | {"positions": POSITIONS})
-    for name in ("times_s", "readings", "presses_mm", "down_command", "up_command"):
-        np.testing.assert_allclose(getattr(recording, name), getattr(expected, name), rtol=1e-12)
 
 
 def test_assemble_recording_detects_presses_in_the_readings(recording: Recording) -> None:

@@ -45,8 +45,8 @@ def test_import_hdf5_refuses_other_files(tmp_path: Path) -> None:
     assert "cannot be read" in refusal_of(tmp_path / "absent.h5")
 
 
-def lab(folder: Path, **changes: np.ndarray | None) -> dict[str, Any]:
-    """Write a foreign file; a change to None leaves a dataset out."""
+def lab(folder: Path, **changes: np.ndarray) -> dict[str, Any]:
+    """Write a foreign file."""
     content: dict[str, Any] = {
         "t": np.arange(40.0) * 100,
         "data/volts": np.random.default_rng(0).integers(900, 1100, (3, 40)).astype(np.int16),
@@ -56,8 +56,7 @@ def lab(folder: Path, **changes: np.ndarray | None) -> dict[str, Any]:
     } | changes
     with h5py.File(folder / "lab.h5", "w") as file:
         for name, values in content.items():
-            if values is not None:
-                file[name] = values
+            file[name] = values
         file["note"] = "bench 2"
     return content
 
@@ -74,12 +73,6 @@ def test_import_hdf5_by_columns(tmp_path: Path) -> None:
     assert recording.source == {"kind": "hdf5", "file": "lab.h5", "columns": mapping, **names}
     lab(tmp_path, on=content["t"][content["on"]], off=content["t"][content["off"]])
     assert import_hdf5(tmp_path / "lab.h5", mapping.replace("/on", "/on:ms").replace("off", "/off:ms")) == recording
-    channels = {f"data/ch{i}": np.full_like(content["t"], i, dtype=float) for i in range(1, 13)}
-    lab(tmp_path, **{"data/volts": None}, **channels)
-    wide = import_hdf5(tmp_path / "lab.h5", mapping.replace("volts:mV", "ch*"))
-    assert wide.readings[0].tolist() == list(range(1, 13))  # HDF5 lists ch10 before ch2
-    assert wide.fibre_names[1] == "data/ch2"
-    lab(tmp_path)
     present = "there are 'data/volts', 'note', 'off', 'on', 't', 'xy'"
     assert f"(--columns) say what other datasets hold, {present}" in refusal_of(tmp_path / "lab.h5")
     assert "note holds object values" in refusal_of(tmp_path / "lab.h5", "time=t,fibres=note")

@@ -53,26 +53,6 @@ def test_import_mat_notes_incomplete_presses(
     assert recording.source.get("note") == note
 
 
-def write_hdf5_mat(path: Path, content: dict[str, np.ndarray]) -> Path:
-    """Write a file of MATLAB 7.3: HDF5 behind 512 bytes of text, all arrays transposed."""
-    import h5py
-
-    with h5py.File(path, "w", userblock_size=512) as file:
-        for name, values in content.items():
-            file.create_dataset(name, data=np.atleast_2d(values).T, chunks=True, compression="gzip")
-        file["name"] = np.frombuffer("pad".encode("utf-16-le"), np.uint16)[:, None]
-        file["cells"] = np.array([[file["name"].ref]], dtype=h5py.ref_dtype)
-    with path.open("r+b") as file:
-        file.write(b"MATLAB 7.3 MAT-file".ljust(116) + b"\0" * 8 + b"\x00\x02IM")
-    return path
-
-
-def test_import_mat_reads_matlab_7_3(tmp_path: Path) -> None:
-    scipy.io.savemat(tmp_path / "old.mat", published_content())
-    new = write_hdf5_mat(tmp_path / "new.mat", published_content())
-    assert import_mat(new) == import_mat(tmp_path / "old.mat")
-
-
 @pytest.mark.parametrize(
     ("name", "value", "message"),
     [

@@ -1,11 +1,11 @@
 """Recordings from and to bags of ROS 2, also as another reader (`mcap` with `mcap-ros2-support`) sees them."""
 
 import operator
-import sys
 from collections import defaultdict
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from fractions import Fraction
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -43,10 +43,6 @@ def read_by_mcap(path: Path) -> tuple[dict[str, list[tuple[int, Any]]], dict[str
     return topics, types
 
 
-def xyz(point: Any) -> list[float]:
-    return [point.x, point.y, point.z]
-
-
 def test_export_bag_is_read_by_mcap(eight: Recording, bag: Path) -> None:
     topics, types = read_by_mcap(bag)
     assert set(types) == {f"/pad/{name}" for name in ("readings", "pressed", "place", "reached", "force", "recording")}
@@ -54,16 +50,9 @@ def test_export_bag_is_read_by_mcap(eight: Recording, bag: Path) -> None:
     assert np.abs(np.array(stamps) - eight.times_s * 1e9).max() <= 1
     np.testing.assert_array_equal([message.data for message in messages], eight.readings)
     assert [stamp for stamp, _ in topics["/pad/pressed"]][::2] == [stamps[at] for at in eight.down_command]
-    known = eight.has_position
-    places = [xyz(place.pose.pose.position) for _, place in topics["/pad/place"]]
-    expected_mm = np.column_stack([eight.presses_mm, -np.nan_to_num(eight.depths_mm)])[known]
+    places = [[point.x, point.y, point.z] for point in (each.pose.pose.position for _, each in topics["/pad/place"])]
+    expected_mm = np.column_stack([eight.presses_mm, -np.nan_to_num(eight.depths_mm)])[eight.has_position]
     np.testing.assert_allclose(places, expected_mm / 1000, rtol=1e-15)
-    unknown = [place.pose.covariance[14] for _, place in topics["/pad/place"]]
-    assert unknown == (-1.0 * np.isnan(eight.depths_mm[known])).tolist()
-    reached = [content.point.z for _, content in topics["/pad/reached"]]
-    np.testing.assert_allclose(reached, -np.delete(eight.reached_mm, 3) / 1000, rtol=1e-15)
-    forces = [content.wrench.force.z for _, content in topics["/pad/force"]]
-    np.testing.assert_array_equal(forces, np.delete(eight.forces_n, 4))
 
 
 def test_export_bag_round_trip_is_reproducible(eight: Recording, bag: Path, tmp_path: Path) -> None:
@@ -114,8 +103,7 @@ def test_export_bag_refuses_what_cannot_be_read_or_written(
     with pytest.raises(InputError, match=r"there\.mcap: is a folder, expected a file or nothing"):
         export_bag(eight, tmp_path / "there.mcap")
     assert [file.name for file in tmp_path.iterdir()] == ["there.mcap"]
-    ros_recording._typestore.cache_clear()
-    monkeypatch.setitem(sys.modules, "rosbags.typesys", None)
+    monkeypatch.setattr(ros_recording, "_typestore", lambda: import_module("no_rosbags"))
     for run in (lambda: export_bag(eight, tmp_path / "r.mcap"), lambda: import_bag(tmp_path / "r.mcap")):
         with pytest.raises(InputError, match=r"r\.mcap: .* needs rosbags: pip install 'padforge\[formats\]'"):
             run()
@@ -167,14 +155,8 @@ def test_z_points_into_a_mirrored_pad(eight: Recording, tmp_path: Path) -> None:
     mirrored = replace(eight, source={"rig": {"mirrored": True}})
     export_bag(mirrored, tmp_path / "r.mcap")
     assert import_bag(tmp_path / "r.mcap").mirrored
-    heights: list[float] = []
-
-    def collect(topic: str, _: float, message: Any) -> bool:
-        heights.extend([message.pose.pose.position.z] if topic == PLACE else [])
-        return topic != "/pad/recording"
-
-    check_close(import_bag(changed(tmp_path / "r.mcap", tmp_path / "bag", collect)), eight)
-    np.testing.assert_allclose(heights, np.nan_to_num(eight.depths_mm[eight.has_position]) / 1000)
+    without = changed(tmp_path / "r.mcap", tmp_path / "bag", lambda topic, *_: topic != "/pad/recording")
+    check_close(import_bag(without), eight)
 
 
 def test_import_bag_of_a_cut_or_edited_bag(eight: Recording, bag: Path, tmp_path: Path) -> None:

@@ -74,34 +74,6 @@ def test_calibration_is_kept_whole(
         golden(f"sense/calibration/{name}.txt", figure, rtol=1e-2)
 
 
-def test_numbers_of_a_calibration_are_those_of_its_presses(
-    kept: tuple[LocalizerModel, Evaluation], few: Recording
-) -> None:
-    """Recomputed from positions and radii that the document lists, and from predictions without each set of fibres."""
-    model, evaluation = kept
-    test = evaluation.test
-    assert test["press"] == list(TEST)
-    assert test["pressed_mm"] == few.presses_mm[list(TEST)].tolist()
-    errors = np.hypot(*(np.array(test["predicted_mm"]) - test["pressed_mm"]).T)
-    row = evaluation.errors[0]
-    assert (row["mean_mm"], row["median_mm"]) == pytest.approx((errors.sum() / 5, sorted(errors)[2]))
-    assert row["within_r90"] == sum(errors <= test["r90_mm"]) / 5
-    cells = evaluation.by_position
-    assert sum(cell["presses"] * cell["mean_mm"] for cell in cells) == pytest.approx(errors.sum())
-    assert max(cell["max_mm"] for cell in cells) == pytest.approx(max(errors))
-    for each in evaluation.by_subset:
-        found = model.predict(few, each["failed"])
-        away = np.hypot(*(found.positions_mm - few.presses_mm)[list(TEST)].T)
-        assert each["mean_mm"] == pytest.approx(away.mean(), rel=1e-4)
-    for row in evaluation.errors:
-        means = [each["mean_mm"] for each in evaluation.by_subset if len(each["failed"]) == row["n_failed"]]
-        assert len(means) == row["subsets"]
-        assert (row["mean_mm"], row["max_mm"]) == pytest.approx((sum(means) / len(means), max(means)))
-    focused = TEST.index(evaluation.focus["press"])
-    assert evaluation.focus["pressed_mm"] == test["pressed_mm"][focused]
-    assert evaluation.focus["moments"][-1]["predicted_mm"] == pytest.approx(test["predicted_mm"][focused], abs=0.5)
-
-
 def test_places_are_kept_whole(
     kept: tuple[LocalizerModel, Evaluation], few: Recording, golden: Any, tmp_path: Path
 ) -> None:
