@@ -12,7 +12,7 @@ Short gaps (NaN) are interpolated; a fibre with too few readings in a press is m
 """
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -143,29 +143,35 @@ def windows_from_rest(
     return np.stack(means, axis=2) - baseline[:, :, None]
 
 
-def compute_history(readings: Array, down_command: Indices) -> Array:
+def compute_history(readings: Any, down_command: Any, xp: Any = np) -> Any:
     """Return the history (Q, C, J) before the presses, V, relative to the baseline: windows, then slow medians.
 
     It includes all readings, whether or not a press is known there. So the baseline is the mean of all readings in
-    `REST`, also of those before the end of the previous press, which `mean_at_rest` does not use.
+    `REST`, also of those before the end of the previous press, which `mean_at_rest` does not use. All arrays are of the
+    module `xp`, numpy or torch.
     """
     offset = readings[0]  # subtracted so that long sums keep their digits
-    sums = np.vstack([np.zeros((1, readings.shape[1])), np.cumsum(readings - offset, axis=0)])
+    sums = xp.cumsum(readings - offset, axis=0)
+    sums = xp.concat([xp.zeros_like(sums[:1]), sums])
 
-    def mean(window: Window) -> Array:
-        first = np.maximum(down_command + window[0], 0)
-        end = np.maximum(down_command + window[1], first + 1)
+    def mean(window: Window) -> Any:
+        first = xp.clip(down_command + window[0], 0, None)
+        end = xp.maximum(down_command + window[1], first + 1)
         return (sums[end] - sums[first]) / (end - first)[:, None] + offset
 
     means = [mean(window) for window in HISTORY_WINDOWS]
-    medians = [_slow_median(readings, down_command, length) for length in SLOW]
+    medians = [_slow_median(readings, down_command, length, xp) for length in SLOW]
     baseline = mean(REST)
-    return np.stack([*means, *medians], axis=2) - baseline[:, :, None]
+    return xp.stack([*means, *medians], axis=2) - baseline[:, :, None]
 
 
-def _slow_median(readings: Array, down_command: Indices, length: int) -> Array:
+def _slow_median(readings: Any, down_command: Any, length: int, xp: Any) -> Any:
     """Return the (Q, C) medians of `N_MEDIAN_SAMPLES` of the `length` readings before each press."""
-    offsets = np.arange(-length, 0, length // N_MEDIAN_SAMPLES)
+    offsets = xp.arange(-length, 0, length // N_MEDIAN_SAMPLES)
+    if xp is not np:  # the median of torch is the lower one of two
+        samples = xp.sort(readings[xp.clip(down_command[:, None] + offsets, 0, None)], axis=1).values
+        n = samples.shape[1]
+        return samples[:, (n - 1) // 2 : n // 2 + 1].mean(axis=1)
     out = np.empty((len(down_command), readings.shape[1]))
     for first in range(0, len(down_command), 1024):  # in chunks, since a press takes kilobytes
         index = np.maximum(down_command[first : first + 1024, None] + offsets, 0)
