@@ -1,7 +1,7 @@
 """Files as other labs' programs write them, by the mapping that their page of errors suggests."""
 
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from datetime import datetime, timedelta
 from pathlib import Path
 from typing import Any
@@ -12,7 +12,7 @@ import pytest
 import scipy.io
 
 from padforge.common.validation import InputError
-from padforge.sense import Recording, import_bag, import_csv, import_hdf5, import_mat
+from padforge.sense import Recording, import_bag, import_csv
 from padforge.sense.formats.csv_recording import read_presses
 from padforge.sense.formats.import_export import import_file
 from padforge.sense.recording.doubts import find_doubts
@@ -46,6 +46,11 @@ def check(recording: Recording) -> None:
     assert len(recording.down_command) == 6
 
 
+def name_missing(values: np.ndarray) -> str:
+    rows = np.argwhere(np.isnan(values)).tolist()
+    return f"missing {rows if len(rows) < 6 else len(rows)}"
+
+
 def outcome(path: Path, mapping: str, **options: Any) -> str:
     """What is read of a file, in a line for each quantity, or the one line of its refusal."""
     try:
@@ -54,7 +59,7 @@ def outcome(path: Path, mapping: str, **options: Any) -> str:
         return f"refused: {error}"
     readings, steps = recording.readings, np.diff(recording.times_s)
     as_written = readings.shape == VOLTS.shape and np.allclose(readings, VOLTS, atol=1e-9)
-    volts = f"mean {np.nanmean(readings, axis=0).round(6).tolist()}, missing {np.argwhere(np.isnan(readings)).tolist()}"
+    volts = f"of {np.nansum(readings, axis=0).round(4).tolist()} V in all, {name_missing(readings)}"
     lines = [f"{len(readings)} readings {'as written' if as_written else volts}"]
     lines[0] += f", from {steps.min():.4f} to {steps.max():.4f} s apart, {recording.times_s[-1]:.3f} s at last"
     lines.append(f"presses {recording.down_command.tolist()} to {recording.up_command.tolist()}")
@@ -310,22 +315,6 @@ def mat73(path: Path, content: dict[str, Any], kind: str = "double") -> Path:
     return path
 
 
-def test_import_mat_reads_structures_and_columns(tmp_path: Path) -> None:
-    old, new = tmp_path / "old.mat", tmp_path / "new.mat"
-    scipy.io.savemat(old, {"data": {"t": TIMES, "in": {"v": VOLTS}}, "x": MATRIX})
-    mat73(new, {"data/t": TIMES[:, None], "data/in/v": VOLTS, "x": MATRIX})
-    for path in (old, new):
-        check(import_mat(path, "time=data.t,fibres=data.in.v"))
-        check(import_mat(path, "time=/data/t,fibres=/data/in/v"))
-        check(import_mat(path, "time=x[0],fibres=x[1:5],press=x[5]"))
-        check(import_mat(path, "time=x[:,0],fibres=x[:,1:5]"))
-        with pytest.raises(InputError, match=r"no variable voltage, tim .*'x'.*; --columns says what others hold"):
-            import_mat(path)
-        with pytest.raises(InputError, match=r"press is x\[7\], expected columns from 0 to 5"):
-            import_mat(path, "time=x[0],fibres=x[1:5],press=x[7]")
-    assert import_mat(new, "time=x[0],fibres=x[1:5]").fibre_names == ("x[1]", "x[2]", "x[3]", "x[4]")
-
-
 def opaque(path: Path, name: bytes, kind: bytes) -> Path:
     """Write a MATLAB 5 file with an object of a class that only MATLAB reads."""
 
@@ -340,33 +329,86 @@ def opaque(path: Path, name: bytes, kind: bytes) -> Path:
     return path
 
 
-def test_import_mat_names_timetables_and_cells(tmp_path: Path) -> None:
-    new = mat73(tmp_path / "new.mat", {"data": np.ones((1, 6), np.uint32)}, "timetable")
-    for path in (new, opaque(tmp_path / "old.mat", b"data", b"timetable")):
-        for mapping in ("", "rate=20,fibres=data", "time=data.Time,fibres=data.v"):
-            message = r"data is a timetable, which only MATLAB reads: writetimetable\(data, 'data.csv'\)"
-            with pytest.raises(InputError, match=message):
-                import_mat(path, mapping)
+def published(**changes: Any) -> dict[str, Any]:
+    """Return the variables of a published file of three presses, with changes; None leaves one out."""
+    rng = np.random.default_rng(0)
+    content = {
+        "voltage": rng.uniform(1, 2, (120, 4)),
+        "pos": rng.uniform(-9, 9, (2, 3)),
+        "tim": np.arange(120.0)[None] / 13,
+    }
+    return {name: value for name, value in (content | changes).items() if value is not None}
+
+
+def test_what_is_said_of_files_of_matlab(golden: Golden, tmp_path: Path) -> None:
+    """Structures, columns of a matrix, objects that only MATLAB reads, and files as published."""
+    content = {"data": {"t": TIMES, "in": {"v": VOLTS}}, "x": MATRIX}
+    scipy.io.savemat(tmp_path / "old.mat", content)
+    mat73(tmp_path / "new.mat", {"data/t": TIMES[:, None], "data/in/v": VOLTS, "x": MATRIX})
+    opaque(tmp_path / "opaque.mat", b"data", b"timetable")
+    mat73(tmp_path / "timetable.mat", {"data": np.ones((1, 6), np.uint32)}, "timetable")
     scipy.io.savemat(tmp_path / "cells.mat", {"t": TIMES, "v": np.array([VOLTS, 1], dtype=object)})
-    with pytest.raises(InputError, match="v is a cell array, expected a full matrix"):
-        import_mat(tmp_path / "cells.mat", "time=t,fibres=v")
+    volts, positions, times = (published()[name] for name in ("voltage", "pos", "tim"))
+    holed = volts.astype(np.float32)
+    holed[:, 2] = holed[50:55] = np.nan
+    for name, changes in {
+        "published": {},
+        "cut": {"voltage": volts[:111], "tim": times[:, :111]},
+        "more": {"voltage": volts[:100], "tim": times[:, :100], "pos": positions[:, :2]},
+        "short": {"voltage": volts[:79]},
+        "sparse": {"voltage": scipy.sparse.csc_matrix(volts)},
+        "counts": {"voltage": np.rint(volts * 200).astype(np.uint16)},
+        "holed": {"voltage": holed, "tim": times.T, "pos": positions.T},
+        "blind": {"pos": None},
+        "partly": {"pos": np.where([True, False, True], positions, np.nan)},
+    }.items():
+        scipy.io.savemat(tmp_path / f"{name}.mat", published(**changes))
+    columns = (
+        "time=x[0],fibres=x[1:5],press=x[5]",
+        "time=x[:,0],fibres=x[:,1:5]",
+        "time=x[0],fibres=x[1:5],press=x[7]",
+    )
+    structure = ("time=data.t,fibres=data.in.v", "time=/data/t,fibres=/data/in/v", *columns, "")
+    table = ("", "rate=20,fibres=data", "time=data.Time,fibres=data.v")
+    mappings = dict.fromkeys(("old", "new"), structure) | dict.fromkeys(("opaque", "timetable"), table)
+    golden("formats/matlab.txt", outcomes(tmp_path, "*.mat", mappings | {"cells": ("time=t,fibres=v",)}))
 
 
-def test_import_hdf5_reads_columns_of_tables_and_frames(tmp_path: Path) -> None:
+def outcomes(folder: Path, pattern: str, mappings: Mapping[str, Sequence[str]]) -> str:
+    """Return what is read of the files in a folder by their mappings, or without one."""
+    lines = []
+    for path in sorted(folder.glob(pattern)):
+        for mapping in mappings.get(path.stem, ("",)):
+            lines += [f"-- {path.name} {mapping}", outcome(path, mapping)]
+    return "\n".join(lines)
+
+
+def test_what_is_said_of_hdf5_files(golden: Golden, tmp_path: Path) -> None:
+    """Columns of tables, frames along either axis, and commands as indices or as times."""
+    begin = np.flatnonzero(np.diff(PRESSED, prepend=0) == 1)
     with h5py.File(tmp_path / "lab.h5", "w") as file:
         kinds = [("t", "f8"), *((f"c{i}", "f4" if i else "f8") for i in range(4)), ("on", "u1")]
-        records = np.array([tuple(row) for row in MATRIX], kinds)
-        file["log/table"] = records
-        file["data"], file["t_ns"] = MATRIX, (TIMES * 1e9).astype(np.int64)
-        file["frames"] = VOLTS.reshape(N, 2, 2)
-        file["last"] = np.moveaxis(VOLTS.reshape(N, 2, 2), 0, -1)
-    path = tmp_path / "lab.h5"
-    tabled = import_hdf5(path, "time=log/table/t,fibres=log/table/c*,press=log/table/on")
-    np.testing.assert_allclose(tabled.readings, VOLTS, rtol=1e-6)
-    check(import_hdf5(path, "time=/data[0],fibres=/data[1:5]"))
-    check(import_hdf5(path, "time=t_ns:ns,fibres=frames"))
-    check(import_hdf5(path, "time=t_ns:1e-9,fibres=last"))
-    check(import_hdf5(path, "rate=20,fibres=frames"))
+        file["log/table"] = np.array([tuple(row) for row in MATRIX], kinds)
+        file["data"], file["t_ns"], file["note"] = MATRIX, (TIMES * 1e9).astype(np.int64), "bench 2"
+        file["frames"], file["last"] = VOLTS.reshape(N, 2, 2), np.moveaxis(VOLTS.reshape(N, 2, 2), 0, -1)
+        file["tenths_of_mv"], file["xy"] = (1e4 * VOLTS.T).round().astype(np.int16), SPOTS[begin] / 10
+        file["on"], file["off"] = begin, begin + 12
+        file["on_ms"], file["off_ms"] = 50 * begin, 50 * begin + 600
+    with h5py.File(tmp_path / "other.h5", "w") as file:
+        file["x"] = np.arange(3)
+    pressed = "time=/t_ns:ns,fibres=/tenths_of_mv:1e-4,positions=/xy:cm,down_command=/on{0},up_command=off{0}"
+    mappings = (
+        "",
+        "time=log/table/t,fibres=log/table/c*,press=log/table/on",
+        "time=/data[0],fibres=/data[1:5]",
+        "time=t_ns:ns,fibres=frames",
+        "time=t_ns:1e-9,fibres=last",
+        "rate=20,fibres=frames",
+        pressed.format(""),
+        pressed.format("_ms:ms"),
+        "time=t_ns:ns,fibres=note",
+    )
+    golden("formats/hdf5.txt", outcomes(tmp_path, "*.h5", {"lab": mappings}))
 
 
 @pytest.mark.parametrize("kind", ["csv", "h5", "mat", "mat73", "mcap"])
@@ -409,42 +451,41 @@ def test_import_bag_holds_late_poses_and_spreads_bursts(tmp_path: Path) -> None:
     np.testing.assert_allclose(recording.presses_mm[3], [-10, 10], atol=0.1)
 
 
-def test_import_bag_reads_fields_of_messages(tmp_path: Path) -> None:
-    messages = []
-    for i in range(N):
-        place = make("Pose", make("Point", *SPOTS[i] / 1000, 0.0), make("Quaternion", *VOLTS[i]))
-        messages.append(("/all", TIMES[i], place))
-    path = write_bag(tmp_path / "bag", messages)
-    with pytest.raises(InputError, match=r"fibres is '/all' of .*name one of its fields as /all.FIELD: 'position.x'"):
-        import_bag(path, "fibres=/all")
-    mapping = ",".join(f"fibres=/all.orientation.{axis}" for axis in "xyzw")
-    recording = import_bag(path, f"{mapping},positions=/all.position")
-    check(recording)
-    np.testing.assert_allclose(recording.presses_mm[4], [0, 5], atol=1e-9)
-    with pytest.raises(InputError, match=r"'position\.q' is no field"):
-        import_bag(path, "fibres=/all.position.q")
-
-
-def test_import_bag_finds_a_position_below_other_fields(tmp_path: Path) -> None:
+def test_what_is_said_of_bags(golden: Golden, tmp_path: Path) -> None:
+    """Fields of messages, a position below other fields, several numbers for one, and lengths that change."""
     still = make("TwistWithCovariance", make("Twist", *[make("Vector3", 0.0, 0.0, 0.0)] * 2), np.zeros(36))
-    messages = []
-    for i in range(N):
-        place = make("Pose", make("Point", *SPOTS[i] / 1000, 0.0), make("Quaternion", 0.0, 0.0, 0.0, 1.0))
-        odometry = make("Odometry", header(), "base", make("PoseWithCovariance", place, np.zeros(36)), still)
-        messages += [("/odom", TIMES[i], odometry), ("/skin", TIMES[i], array("Float64MultiArray", VOLTS[i]))]
-    recording = import_bag(write_bag(tmp_path / "bag", messages), "fibres=/skin,positions=/odom")
-    check(recording)
-    np.testing.assert_allclose(recording.presses_mm[4], [0, 5], atol=1e-9)
-
-
-def test_import_bag_refuses_several_numbers_for_one(tmp_path: Path) -> None:
     channels = [make("ChannelFloat32", "c", np.ones(n, np.float32)) for n in (2, 3)]
-    topics = {"/f": array("Float64MultiArray", np.ones(2)), "/cloud": make("PointCloud", header(), [], channels)}
-    path = write_bag(tmp_path / "bag", [(name, i / 20, topics[name]) for i in range(9) for name in topics])
-    with pytest.raises(InputError, match=r"depth is '/f' of .*MultiArray', name one .* /f.FIELD: .*'data'"):
-        import_bag(path, "fibres=/f.data,depth=/f")
-    with pytest.raises(InputError, match=r"fibres is '/cloud' of .*, name one of its fields as /cloud.FIELD: 'header"):
-        import_bag(path, "fibres=/cloud")
+    numbers: dict[str, list[Any]] = {"some": [array("Float64MultiArray", np.ones(2))] * 9}
+    numbers["lengths"] = [numbers["some"][0], array("Float64MultiArray", np.ones(3))]
+    numbers["none"] = [numbers["some"][0], array("Float64MultiArray", np.ones(0))]
+    messages: dict[str, list[Any]] = {
+        name: [("/f", i / 20, m) for i, m in enumerate(each)] for name, each in numbers.items()
+    }
+    messages["some"] += [
+        ("/cloud", 0.0, make("PointCloud", header(), [], channels)),
+        ("/words", 0.0, make("String", "a")),
+    ]
+    messages["some"] += [("/never", 0.2, make("Bool", False)), ("/before", 0.0, make("Bool", True))]
+    messages["some"] += [("/before", 0.01, make("Bool", False))]
+    messages["poses"], messages["odometry"] = [], []
+    for time, volts, spot in zip(TIMES, VOLTS, SPOTS / 1000, strict=True):
+        messages["poses"].append(("/all", time, make("Pose", make("Point", *spot, 0.0), make("Quaternion", *volts))))
+        place = make("Pose", make("Point", *spot, 0.0), make("Quaternion", 0.0, 0.0, 0.0, 1.0))
+        odometry = make("Odometry", header(), "base", make("PoseWithCovariance", place, np.zeros(36)), still)
+        messages["odometry"] += [("/odom", time, odometry), ("/skin", time, array("Float64MultiArray", volts))]
+    for name, each in messages.items():
+        write_bag(tmp_path / f"{name} bag", each).rename(tmp_path / f"{name}.mcap")
+    axes = ",".join(f"fibres=/all.orientation.{axis}" for axis in "xyzw")
+    mappings = {
+        "poses": ("fibres=/all", f"{axes},positions=/all.position", "fibres=/all.position.q"),
+        "odometry": ("fibres=/skin,positions=/odom",),
+        "some": (
+            *("fibres=/f.data,depth=/f", "fibres=/cloud", "fibres=/words", "fibres=/nowhere"),
+            *("fibres=/f,press=/never", "fibres=/f,press=/before", ""),
+        ),
+        **dict.fromkeys(("lengths", "none"), ("fibres=/f",)),
+    }
+    golden("formats/bags.txt", outcomes(tmp_path, "*.mcap", mappings))
 
 
 def test_import_bag_reads_bags_of_ros_1(tmp_path: Path) -> None:

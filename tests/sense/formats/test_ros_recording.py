@@ -239,19 +239,6 @@ def test_import_bag_holds_values_of_scalar_topics(tmp_path: Path) -> None:
     np.testing.assert_allclose(imported.presses_mm, np.column_stack([middle - 1, 1000 * (middle // 2 % 7)]))
 
 
-def test_import_bag_refuses_changing_lengths_and_empty_topics(tmp_path: Path) -> None:
-    messages = {"other": array("Float64MultiArray", np.ones(3)), "none": array("Float64MultiArray", np.ones(0))}
-    for name, message in messages.items():
-        bag = write_bag(tmp_path / name, [("/f", 0.1, array("Float64MultiArray", np.ones(2))), ("/f", 0.2, message)])
-        with pytest.raises(InputError, match=r"fibres is '/f': (data has 2 values in some|message 1 has no data)"):
-            import_bag(bag, "fibres=/f")
-    readings = [("/f", 0.1 * step, array("Float64MultiArray", np.ones(2))) for step in range(9)]
-    for name, pressed in (("never", [(0.2, False)]), ("before", [(0.0, True), (0.1, False)])):
-        bag = write_bag(tmp_path / name, [*readings, *(("/down", time, make("Bool", on)) for time, on in pressed)])
-        with pytest.raises(InputError, match="press is nowhere true after the first reading"):
-            import_bag(bag, "fibres=/f,press=/down")
-
-
 def test_import_file_refuses_folders_without_a_bag(tmp_path: Path, folder: Path) -> None:
     with pytest.raises(InputError, match=r"ends in '', allowed are \.mat, \.csv, .*or a rosbag2 folder"):
         import_file(tmp_path)

@@ -209,21 +209,6 @@ def test_a_tap_that_its_release_shows_is_estimated_from_then_on(recording, hasty
     assert_as_a_whole(part, hasty, events)
 
 
-def test_radii_shrink_as_a_press_goes_on(recording, localizer) -> None:
-    _, events = replay(first_presses(recording, 6), localizer)
-    by_moment = {
-        (since, readings): np.mean([e.r90_mm for e in events if (e.since, e.readings) == (since, readings)])
-        for since, readings in (("touch", 3), ("touch", 20), ("lift", RELEASE))
-    }
-    first, settled, last = by_moment.values()
-    assert first > settled > last
-    inside = [
-        np.hypot(e.x_mm - recording.presses_mm[e.press, 0], e.y_mm - recording.presses_mm[e.press, 1]) < e.r90_mm
-        for e in events
-    ]
-    assert np.mean(inside) > 0.7  # at any moment
-
-
 def test_live_handles_a_press_that_is_held_for_hours(recording, hasty, monkeypatch) -> None:
     """So long that old readings are dropped for the second time within the press."""
     history, slack, held = 120, 40, 2
