@@ -18,7 +18,7 @@ from padforge.sense.formats.import_export import import_file
 from padforge.sense.recording.doubts import find_doubts
 from tests.helpers.golden import Golden
 
-from .foreign import array, header, make, pose, write_bag, write_ros1_bag
+from .foreign import LAB_COLUMNS, array, header, lab, make, pose, write_bag, write_ros1_bag
 
 N = 156
 TIMES = np.arange(N) / 20
@@ -229,6 +229,14 @@ REMARKABLE: dict[str, tuple[str, str]] = {
     "own, a word in a column": (own(*OWN, *["6,1,two,,"] * 4), ""),
     "own, one of x and y": (own(*OWN, "# here", "6,1,2,3,"), ""),
     "own, lines torn": (own(*OWN, *["6,1"] * 4), ""),
+    "own, presses detected": (table("time_s,a,b,c,d"), ""),
+    "own, presses detected, no positions": (table("time_s,a,b,c,d,x_mm,y_mm", [f"{line},," for line in rows()]), ""),
+    "no mapping": (table(), ""),
+    "a mapping without a quantity": (table(), "t"),
+    "x without y": (table(), f"{MAPPING},x=c3"),
+    "a unit that is none": (table(), "time=t:volt,fibres=c*"),
+    "a column twice": (table(), "time=c1,fibres=c1"),
+    "no such column": (table(), "time=t_ms,fibres=c*"),
     "own, no press": (own("0,1", "1,1", header="time_s,a"), ""),
     **{
         f"own, {cell!r} for a number": (own(*OWN[:2], f"2,1,{cell},3,4", *OWN[3:]), "") for cell in ("1_0", "1 2", "1e")
@@ -329,7 +337,7 @@ def opaque(path: Path, name: bytes, kind: bytes) -> Path:
     return path
 
 
-def published(**changes: Any) -> dict[str, Any]:
+def published_variables(**changes: Any) -> dict[str, Any]:
     """Return the variables of a published file of three presses, with changes; None leaves one out."""
     rng = np.random.default_rng(0)
     content = {
@@ -348,7 +356,7 @@ def test_what_is_said_of_files_of_matlab(golden: Golden, tmp_path: Path) -> None
     opaque(tmp_path / "opaque.mat", b"data", b"timetable")
     mat73(tmp_path / "timetable.mat", {"data": np.ones((1, 6), np.uint32)}, "timetable")
     scipy.io.savemat(tmp_path / "cells.mat", {"t": TIMES, "v": np.array([VOLTS, 1], dtype=object)})
-    volts, positions, times = (published()[name] for name in ("voltage", "pos", "tim"))
+    volts, positions, times = (published_variables()[name] for name in ("voltage", "pos", "tim"))
     holed = volts.astype(np.float32)
     holed[:, 2] = holed[50:55] = np.nan
     for name, changes in {
@@ -362,7 +370,7 @@ def test_what_is_said_of_files_of_matlab(golden: Golden, tmp_path: Path) -> None
         "blind": {"pos": None},
         "partly": {"pos": np.where([True, False, True], positions, np.nan)},
     }.items():
-        scipy.io.savemat(tmp_path / f"{name}.mat", published(**changes))
+        scipy.io.savemat(tmp_path / f"{name}.mat", published_variables(**changes))
     columns = (
         "time=x[0],fibres=x[1:5],press=x[5]",
         "time=x[:,0],fibres=x[:,1:5]",
@@ -473,6 +481,7 @@ def test_what_is_said_of_bags(golden: Golden, tmp_path: Path) -> None:
         place = make("Pose", make("Point", *spot, 0.0), make("Quaternion", 0.0, 0.0, 0.0, 1.0))
         odometry = make("Odometry", header(), "base", make("PoseWithCovariance", place, np.zeros(36)), still)
         messages["odometry"] += [("/odom", time, odometry), ("/skin", time, array("Float64MultiArray", volts))]
+    messages["lab"] = list(lab())
     for name, each in messages.items():
         write_bag(tmp_path / f"{name} bag", each).rename(tmp_path / f"{name}.mcap")
     axes = ",".join(f"fibres=/all.orientation.{axis}" for axis in "xyzw")
@@ -484,6 +493,7 @@ def test_what_is_said_of_bags(golden: Golden, tmp_path: Path) -> None:
             *("fibres=/f,press=/never", "fibres=/f,press=/before", ""),
         ),
         **dict.fromkeys(("lengths", "none"), ("fibres=/f",)),
+        "lab": (LAB_COLUMNS, "fibres=/skin/?:0.01,press=/down,x=/at/x:mm,y=/at/y", "fibres=/camera"),
     }
     golden("formats/bags.txt", outcomes(tmp_path, "*.mcap", mappings))
 
@@ -491,3 +501,13 @@ def test_what_is_said_of_bags(golden: Golden, tmp_path: Path) -> None:
 def test_import_bag_reads_bags_of_ros_1(tmp_path: Path) -> None:
     bag = write_ros1_bag(tmp_path / "lab.bag", "/skin", TIMES + 1.7e9, VOLTS)
     check(import_bag(bag, "fibres=/skin"))
+
+
+def test_import_mat_reads_the_published_recording(published: Path) -> None:
+    recording = import_file(published / "para5_long_first4500.mat")
+    content = scipy.io.loadmat(published / "para5_long_first4500.mat")
+    assert np.array_equal(recording.readings, content["voltage"])
+    assert np.array_equal(recording.presses_mm, content["pos"].T)
+    assert np.array_equal(recording.times_s, content["tim"].ravel())
+    assert recording.down_command[:3].tolist() == [20, 60, 100]
+    assert recording.up_command[:3].tolist() == [40, 80, 120]

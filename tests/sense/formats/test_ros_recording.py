@@ -26,7 +26,7 @@ from padforge.sense.formats.import_export import export_file, import_file
 from padforge.sense.formats.ros_messages import choose_epoch, to_stamps
 from padforge.sense.formats.ros_recording import export_bag, import_bag
 
-from .foreign import STORE, Message, array, make, pose, wrench, write_bag
+from .foreign import LAB_COLUMNS, STORE, Message, lab, write_bag
 
 READINGS, PLACE = "/pad/readings", "/pad/place"
 
@@ -192,51 +192,11 @@ def test_import_bag_of_a_cut_or_edited_bag(eight: Recording, bag: Path, tmp_path
     assert imported.source["note"] == "readings are not those that were exported"
 
 
-def lab() -> Iterator[Message]:
-    """Yield readings at 50 Hz; from 1 s on a press every second, 0.4 s long, at (n, -n) cm and with 2 n N."""
-    yield "/camera", 0.0, make("String", "no picture")
-    for step in range(300):
-        time = step / 50
-        number = step // 50
-        if step % 50 == 0 and number:
-            yield "/probe", time - 0.001, pose(number / 100, -number / 100)
-            yield "/wrench", time - 0.001, wrench(0.0, 1.2 * number, -1.6 * number)
-        if step % 50 in (0, 20) and number:
-            yield "/down", time - 0.001, make("Bool", step % 50 == 0)
-        yield "/skin/all", time, array("Float32MultiArray", np.array([number, step, 512], np.float32))
-        yield "/skin/1", time, make("Int16", number)
-        yield "/skin/2", time + 0.001, make("Float64", step / 2)
-        if step % 2 == 0:
-            yield "/at/y", time, make("UInt8", step // 2 % 7)
-        yield "/at/x", time + 0.001, make("Float32", step)
-
-
-ALL = "fibres=/skin/all:mV,positions=/probe,force=/wrench,press=/down"
-
-
-@pytest.mark.parametrize("form", ["mcap", "sqlite3", "packed mcap", "mcap folder", "packed sqlite3 folder"])
-def test_import_bag_by_columns(tmp_path: Path, form: str) -> None:
+@pytest.mark.parametrize("form", ["sqlite3", "packed mcap", "mcap folder", "packed sqlite3 folder"])
+def test_bags_of_all_forms_are_read_alike(tmp_path: Path, form: str) -> None:
     bag = write_bag(tmp_path / "lab", lab(), "sqlite3" if "sqlite3" in form else "mcap", "packed" in form)
-    imported = import_file(bag.parent if "folder" in form else bag, ALL)
-    n = np.arange(1, 6)
-    np.testing.assert_allclose(imported.times_s, np.arange(300) / 50)
-    np.testing.assert_allclose(imported.readings[123], [0.002, 0.123, 0.512])
-    np.testing.assert_allclose(imported.presses_mm, np.column_stack([10 * n, -10 * n]))
-    np.testing.assert_allclose(imported.forces_n, 2 * n)
-    assert imported.down_command.tolist() == (50 * n).tolist()
-    assert imported.up_command.tolist() == (50 * n + 20).tolist()
-    assert imported.source["columns"] == ALL
-
-
-def test_import_bag_holds_values_of_scalar_topics(tmp_path: Path) -> None:
-    bag = write_bag(tmp_path / "lab", lab())
-    with pytest.raises(InputError, match=r"fibres is '/camera' of 'std_msgs/msg/String', which holds no numbers"):
-        import_bag(bag, "fibres=/camera")
-    imported = import_bag(bag, "fibres=/skin/?:0.01,press=/down,x=/at/x:mm,y=/at/y")
-    np.testing.assert_allclose(imported.readings[60], [0.01, 59 / 200])  # the second one comes after the first
-    assert np.isnan(imported.readings[0, 1])
-    middle = (imported.down_command + imported.up_command) // 2
-    np.testing.assert_allclose(imported.presses_mm, np.column_stack([middle - 1, 1000 * (middle // 2 % 7)]))
+    recording = import_file(bag.parent if "folder" in form else bag, LAB_COLUMNS)
+    assert recording == import_file(write_bag(tmp_path / "plain", lab()), LAB_COLUMNS)
 
 
 def test_import_file_refuses_folders_without_a_bag(tmp_path: Path, folder: Path) -> None:
@@ -245,11 +205,11 @@ def test_import_file_refuses_folders_without_a_bag(tmp_path: Path, folder: Path)
     bag = write_bag(tmp_path / "lab", lab())
     bag.unlink()
     with pytest.raises(InputError, match=r"lab: no bag, or cut off or damaged .*files are missing"):
-        import_file(bag.parent, ALL)
+        import_file(bag.parent, LAB_COLUMNS)
 
 
 def test_import_bag_sorts_messages_by_their_stamps(tmp_path: Path) -> None:
     messages = list(lab())
     mixed = [messages[at] for at in np.random.default_rng(0).permutation(len(messages))]
-    expected = import_file(write_bag(tmp_path / "all", messages), ALL)
-    assert import_file(write_bag(tmp_path / "mixed", mixed), ALL) == expected
+    expected = import_file(write_bag(tmp_path / "all", messages), LAB_COLUMNS)
+    assert import_file(write_bag(tmp_path / "mixed", mixed), LAB_COLUMNS) == expected

@@ -273,25 +273,6 @@ def test_live_without_readings_says_anywhere(recording, hasty) -> None:
     assert live.view()["fibres"] == [{"swing": None, "state": "missing"}] * 4
 
 
-def test_view_follows_the_pad(recording, hasty, monkeypatch) -> None:
-    part = first_presses(recording, 3)
-    monkeypatch.setattr("padforge.sense.live.pipeline.PressDetector", ScriptedDetector(part))
-    live = Live(hasty, rate_hz=part.rate_hz)
-    missing = [{"swing": None, "state": "missing"}] * 4
-    assert live.view() == {"pressed": False, "fibres": missing, "presses": [], "track": [], "faults": []}
-    down, up = int(part.down_command[0]) + 15, int(part.up_command[0]) + 18
-    swings = []
-    for first, end in ((0, 15), (15, down), (down, up)):
-        live.feed(part.times_s[first:end], part.readings[first:end])
-        swings.append(max(abs(fibre["swing"]) for fibre in live.view()["fibres"]))
-        assert live.pressed == (end == down)
-    assert swings[0] < 0.1 < 0.3 < swings[1]
-    assert swings[2] < 0.75 * swings[1]  # what remains of a press is half of it
-    (press,) = live.view()["presses"]
-    assert press["moment_text"] == f"{press['since_s']:.2f} s after the lift"
-    assert press["text"].endswith(f" mm at 90 % ({press['moment_text']})")
-
-
 def test_faults_wait_while_the_pad_is_taken_for_another(recording, hasty, monkeypatch) -> None:
     """They are reported once with the next press of this pad, from which their fibre is masked."""
     part, monitor, verdicts = first_presses(recording, 9), ScriptedMonitor(), iter([0, 0, 0, 0, 1, 1, 1, 0, 0])
