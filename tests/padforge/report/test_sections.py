@@ -146,15 +146,6 @@ def test_report_omits_mould_of_other_checks(
         write_report(pad)
 
 
-def test_report_names_the_first_of_several_changed_files(pad: Path) -> None:
-    names = [name for name in ("mould.stl", "mould.png", "tracks.png", "orientation.svg") if (pad / name).exists()]
-    assert len(names) > 2
-    for name in names:
-        (pad / name).write_bytes(b"")
-    with pytest.raises(InputError, match=f"{names[0]}: is not the one"):
-        write_report(pad)
-
-
 def test_report_compares_strain_of_fibres_with_what_they_bear(pad: Path) -> None:
     design, mould = design_document(), json.loads((pad / "fabrication.json").read_text())
     design["provenance"]["settings"]["contact"] = Contact(depth_mm=2.0, thickness_mm=8.0).model_dump(mode="json")

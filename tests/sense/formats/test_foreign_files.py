@@ -229,6 +229,10 @@ REMARKABLE: dict[str, tuple[str, str]] = {
     "own, a word in a column": (own(*OWN, *["6,1,two,,"] * 4), ""),
     "own, one of x and y": (own(*OWN, "# here", "6,1,2,3,"), ""),
     "own, lines torn": (own(*OWN, *["6,1"] * 4), ""),
+    "other units": (
+        table("t,c0,c1,c2,c3,on,y", [f"{line},{int(PRESSED[i])},{1000 * i}" for i, line in enumerate(rows())]),
+        "time=t:min,fibres=c0:uV,fibres=c1:0.5,x=c2:m,y=y:um,depth=c3:cm,press=on",
+    ),
     "own, presses detected": (table("time_s,a,b,c,d"), ""),
     "own, presses detected, no positions": (table("time_s,a,b,c,d,x_mm,y_mm", [f"{line},," for line in rows()]), ""),
     "no mapping": (table(), ""),
