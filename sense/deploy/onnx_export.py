@@ -28,7 +28,13 @@ from padforge.common.validation import Fault, InputError
 from padforge.sense.arrays import Array, Indices
 from padforge.sense.localizer import moments
 from padforge.sense.localizer.bayes import PREFIX, BayesianLocalizer
-from padforge.sense.localizer.features import compute_features, compute_history, interpolate_gaps
+from padforge.sense.localizer.features import (
+    compute_features,
+    compute_history,
+    interpolate_gaps,
+    mean_at_rest,
+    windows_from_rest,
+)
 from padforge.sense.localizer.model import MEASURE_COLUMNS, UNIFORM, LocalizerModel
 from padforge.sense.localizer.network import Weights, combine_members
 from padforge.sense.localizer.scaler import MAX_INPUT
@@ -89,17 +95,9 @@ class _FeatureModule(nn.Module):
         n_readings = torch.ones_like(readings[:, 0], dtype=torch.int64).sum()[None]  # a shape would be traced as fixed
         previous_end = torch.cat([torch.zeros_like(up_command[:1]), up_command[:-1]])
         until = torch.cat([down_command[1:], n_readings])
-        held = torch.minimum(up_command, until)
-
-        def mean(origin: Tensor, window: moments.Window, low: Tensor, high: Tensor) -> Tensor:
-            index = torch.maximum(origin[:, None] + torch.arange(*window), low[:, None])
-            return readings[torch.minimum(index, torch.minimum(high, n_readings)[:, None] - 1)].mean(dim=1)
-
-        means = [mean(down_command, each, down_command, held) for each in moments.PRESS_WINDOWS]
-        means += [mean(up_command, each, down_command, until) for each in moments.RELEASE_WINDOWS]
-        means += [mean(held, each, down_command, held) for each in moments.LATEST_WINDOWS]
-        baseline = mean(down_command, moments.REST, previous_end, down_command)
-        windows = functional.pad(torch.stack(means, dim=2) - baseline[:, :, None], (0, len(moments.MODULATED)))
+        baseline = mean_at_rest(readings, down_command, previous_end, torch)
+        windows = windows_from_rest(readings, baseline, down_command, up_command, until, torch)
+        windows = functional.pad(windows, (0, len(moments.MODULATED)))
         history = compute_history(readings, down_command, torch) - self.history_mean_v
         effect = (history.transpose(0, 1) @ self.history_coef).transpose(0, 1)
         scaled = torch.clip((windows - effect - self.mean_v) / self.scale_v, -MAX_INPUT, MAX_INPUT).float()

@@ -126,21 +126,27 @@ def window_means(readings: Array, down_command: Indices, up_command: Indices, un
     return windows_from_rest(readings, baseline, down_command, up_command, until)
 
 
-def mean_at_rest(readings: Array, down_command: Indices, previous_end: Indices) -> Array:
-    """Return the baselines (Q, C), V: means before the presses, after the ends (Q,) of the previous ones."""
-    return _gather(readings, down_command, REST, previous_end, down_command).mean(axis=1)
+def mean_at_rest(readings: Any, down_command: Any, previous_end: Any, xp: Any = np) -> Any:
+    """Return the baselines (Q, C), V: means before the presses, after the ends (Q,) of the previous ones.
+
+    All arrays are of the module `xp`, numpy or torch.
+    """
+    return _gather(readings, down_command, REST, previous_end, down_command, xp).mean(axis=1)
 
 
 def windows_from_rest(
-    readings: Array, baseline: Array, down_command: Indices, up_command: Indices, until: Indices
-) -> Array:
-    """Return the windows of `window_means`, relative to a known baseline (Q, C)."""
-    hold_end = np.minimum(up_command, until)
+    readings: Any, baseline: Any, down_command: Any, up_command: Any, until: Any, xp: Any = np
+) -> Any:
+    """Return the windows of `window_means`, relative to a known baseline (Q, C).
+
+    All arrays are of the module `xp`, numpy or torch.
+    """
+    hold_end = xp.minimum(up_command, until)
     spans = [(down_command, window, hold_end) for window in PRESS_WINDOWS]
     spans += [(up_command, window, until) for window in RELEASE_WINDOWS]
     spans += [(hold_end, window, hold_end) for window in LATEST_WINDOWS]
-    means = [_gather(readings, origin, window, down_command, high).mean(axis=1) for origin, window, high in spans]
-    return np.stack(means, axis=2) - baseline[:, :, None]
+    means = [_gather(readings, origin, window, down_command, high, xp).mean(axis=1) for origin, window, high in spans]
+    return xp.stack(means, axis=2) - baseline[:, :, None]
 
 
 def compute_history(readings: Any, down_command: Any, xp: Any = np) -> Any:
@@ -188,7 +194,7 @@ def _running_medians(readings: Array, down_command: Indices, up_command: Indices
         (down_command + MEDIAN_OFFSET, down_command, up_command),
         (up_command + MEDIAN_OFFSET, down_command, next_begin),
     )
-    medians = [np.median(_gather(readings, middle, window, low, high), axis=1) for middle, low, high in ranges]
+    medians = [np.median(_gather(readings, middle, window, low, high, np), axis=1) for middle, low, high in ranges]
     return np.stack(medians, axis=2)
 
 
@@ -197,7 +203,7 @@ def _neighbours(down_command: Indices, up_command: Indices, n_readings: int) -> 
     return np.concatenate([[0], up_command[:-1]]), np.concatenate([down_command[1:], [n_readings]])
 
 
-def _gather(readings: Array, origin: Indices, window: Window, low: Indices, high: Indices) -> Array:
-    """(Q, W, C) readings in `origin` + window, clipped to low <= index < high."""
-    last = np.minimum(high, len(readings))[:, None] - 1
-    return readings[np.clip(origin[:, None] + np.arange(*window), low[:, None], last)]
+def _gather(readings: Any, origin: Any, window: Window, low: Any, high: Any, xp: Any) -> Any:
+    """(Q, W, C) readings in `origin` + window, clipped to low <= index < high, which is at most their number."""
+    index = xp.maximum(origin[:, None] + xp.arange(*window), low[:, None])
+    return readings[xp.minimum(index, high[:, None] - 1)]
