@@ -213,11 +213,7 @@ class RigSettings(Settings):
 
 
 def read_rig(spec: Spec, **overrides: Any) -> RigSettings:
-    """Read `[rig]` with the depth of `[contact]`, if it states none.
-
-    Args:
-        spec: settings file.
-        **overrides: values that replace those of the file, unless None.
+    """Read `[rig]` with the depth of `[contact]`, if it states none; overrides replace its values, unless None.
 
     Raises:
         InputError: an unknown key or a value out of range, or a press as deep as the pad is thick.

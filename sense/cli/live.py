@@ -15,8 +15,9 @@ from padforge.sense.cli.options import FOLDER, redrawn_lines
 from padforge.sense.cli.rig import check_rig, rig_option
 
 if TYPE_CHECKING:
-    from padforge.sense.live.outputs import OutputStream
+    from padforge.sense.live.outputs import JsonLines
     from padforge.sense.live.pipeline import Estimate, Event
+    from padforge.sense.live.viewers import FoxgloveOutput, RerunOutput
     from padforge.sense.rig.streams import ReadingStream
 
 PORT = 8321
@@ -79,7 +80,7 @@ def live(
     Fibres are numbered from 1; in JSON "fibres" and "failed" hold indices, from 0.
     """
     from padforge.sense.formats.import_export import open_recording
-    from padforge.sense.live.outputs import LivePage, MessageBuilder, broadcast
+    from padforge.sense.live.outputs import LivePage, MessageBuilder
     from padforge.sense.live.pad_sensor import load_health, open_board
     from padforge.sense.live.pipeline import Live
     from padforge.sense.localizer.model import LocalizerModel
@@ -127,8 +128,9 @@ def live(
                     printer.print(events)
                 else:
                     draw(view_lines(view))
-                if outputs:
-                    broadcast(outputs, builder.build(times_s, readings, events))
+                for message in builder.build(times_s, readings, events) if outputs else ():
+                    for each in outputs:
+                        each.send(message)
     return int(pipeline.is_other_pad)
 
 
@@ -141,12 +143,12 @@ def _open_outputs(
     rerun: str | None,
     host: str,
     token: str,
-) -> "tuple[list[OutputStream], list[str]]":
+) -> "tuple[list[JsonLines | FoxgloveOutput | RerunOutput], list[str]]":
     """Return the requested outputs, which `stack` closes, and lines with the addresses of servers."""
     from padforge.sense.live.outputs import JsonLines
     from padforge.sense.live.viewers import FoxgloveOutput, RerunOutput
 
-    outputs: list[OutputStream] = []
+    outputs: list[JsonLines | FoxgloveOutput | RerunOutput] = []
     addresses: list[str] = []
     if tcp is not None:
         lines = stack.enter_context(JsonLines(host, tcp, token))

@@ -26,11 +26,17 @@ from padforge.common.files import atomic_file
 from padforge.common.parallel import one_thread
 from padforge.common.validation import Fault, InputError
 from padforge.sense.arrays import Array, Indices
-from padforge.sense.localizer import features, moments
+from padforge.sense.localizer import moments
 from padforge.sense.localizer.bayes import PREFIX, BayesianLocalizer
-from padforge.sense.localizer.features import compute_features, interpolate_gaps
+from padforge.sense.localizer.features import (
+    compute_features,
+    compute_history,
+    interpolate_gaps,
+    mean_at_rest,
+    windows_from_rest,
+)
 from padforge.sense.localizer.model import MEASURE_COLUMNS, UNIFORM, LocalizerModel
-from padforge.sense.localizer.network import MAX_LOG_ERROR, MIN_LOG_ERROR, Weights
+from padforge.sense.localizer.network import Weights, combine_members
 from padforge.sense.localizer.scaler import MAX_INPUT
 from padforge.sense.localizer.torch_network import EnsembleMlp, network_inputs
 from padforge.sense.recording.frames import frame_rate_hz, framed
@@ -89,50 +95,13 @@ class _FeatureModule(nn.Module):
         n_readings = torch.ones_like(readings[:, 0], dtype=torch.int64).sum()[None]  # a shape would be traced as fixed
         previous_end = torch.cat([torch.zeros_like(up_command[:1]), up_command[:-1]])
         until = torch.cat([down_command[1:], n_readings])
-        held = torch.minimum(up_command, until)
-
-        def mean(origin: Tensor, window: moments.Window, low: Tensor, high: Tensor) -> Tensor:
-            index = torch.maximum(origin[:, None] + torch.arange(*window), low[:, None])
-            return readings[torch.minimum(index, torch.minimum(high, n_readings)[:, None] - 1)].mean(dim=1)
-
-        means = [mean(down_command, each, down_command, held) for each in moments.PRESS_WINDOWS]
-        means += [mean(up_command, each, down_command, until) for each in moments.RELEASE_WINDOWS]
-        means += [mean(held, each, down_command, held) for each in moments.LATEST_WINDOWS]
-        baseline = mean(down_command, moments.REST, previous_end, down_command)
-        windows = functional.pad(torch.stack(means, dim=2) - baseline[:, :, None], (0, len(moments.MODULATED)))
-        history = _history(readings, down_command) - self.history_mean_v
+        baseline = mean_at_rest(readings, down_command, previous_end, torch)
+        windows = windows_from_rest(readings, baseline, down_command, up_command, until, torch)
+        windows = functional.pad(windows, (0, len(moments.MODULATED)))
+        history = compute_history(readings, down_command, torch) - self.history_mean_v
         effect = (history.transpose(0, 1) @ self.history_coef).transpose(0, 1)
         scaled = torch.clip((windows - effect - self.mean_v) / self.scale_v, -MAX_INPUT, MAX_INPUT).float()
-        return scaled, _complete_windows(down_command, up_command, until)
-
-
-def _complete_windows(down_command: Tensor, up_command: Tensor, until: Tensor) -> Tensor:
-    """Return whether each window is complete (Q, K), as `moments.complete_windows` does."""
-    down_end, up_end = (
-        torch.tensor([end for _, end in each]) for each in (moments.PRESS_WINDOWS, moments.RELEASE_WINDOWS)
-    )
-    released = (until > up_command)[:, None]
-    down = (down_command[:, None] + down_end <= until[:, None]) | released
-    return torch.cat([down, released & (up_command[:, None] + up_end <= until[:, None])], dim=1)
-
-
-def _history(readings: Tensor, down_command: Tensor) -> Tensor:
-    """Return the history features (Q, C, J), V, as `features.compute_history` does."""
-    sums = torch.cumsum(readings - readings[:1], dim=0)
-    sums = torch.cat([torch.zeros_like(sums[:1]), sums])
-
-    def mean(window: moments.Window) -> Tensor:
-        first = torch.clamp(down_command + window[0], min=0)
-        end = torch.maximum(down_command + window[1], first + 1)
-        return (sums[end] - sums[first]) / (end - first)[:, None] + readings[:1]
-
-    means = [mean(window) for window in features.HISTORY_WINDOWS]
-    for length in features.SLOW:
-        offsets = torch.arange(-length, 0, length // features.N_MEDIAN_SAMPLES)
-        samples = torch.sort(readings[torch.clamp(down_command[:, None] + offsets, min=0)], dim=1).values
-        n = samples.shape[1]
-        means.append(samples[:, (n - 1) // 2 : n // 2 + 1].mean(dim=1))  # the median
-    return torch.stack(means, dim=2) - mean(moments.REST)[:, :, None]
+        return scaled, moments.complete_windows(down_command, up_command, until, torch)
 
 
 class _BayesModule(nn.Module):
@@ -215,10 +184,10 @@ class _LocalizerModule(nn.Module):
             network = self.networks[name]
             answers = (n_complete >= phase.first) & (n_complete < phase.first + len(phase.shares))
             outputs = torch.where(answers[:, None], network(x.expand(network.n_members, -1, -1)), outputs)
-        combined = _combine_members(outputs)
+        combined = combine_members(outputs, torch)
         if self.bayes is None:
             return combined
-        corrected = _combine_members(torch.cat([outputs, self.bayes(scaled, fibre_mask, x, n_complete)]))
+        corrected = combine_members(torch.cat([outputs, self.bayes(scaled, fibre_mask, x, n_complete)]), torch)
         is_corrected = (n_complete >= moments.BAYES_STAGES[0])[:, None]
         targets, std = (torch.where(is_corrected, *pair) for pair in zip(corrected, combined, strict=True))
         return targets, std
@@ -229,7 +198,7 @@ class _LocalizerModule(nn.Module):
 
         def predict_from(scaled: Tensor, n_complete: int) -> tuple[Tensor, Tensor]:
             x = network_inputs(scaled, fibre_mask, complete & (torch.arange(n_timed) < n_complete))
-            return _combine_members(network(x.expand(network.n_members, -1, -1)))
+            return combine_members(network(x.expand(network.n_members, -1, -1)), torch)
 
         targets, std = predict_from(scaled, moments.N_PRESS_WINDOWS)
         now = [
@@ -243,17 +212,6 @@ class _LocalizerModule(nn.Module):
         )
         distance, expected = (torch.linalg.vector_norm(each[:, :2], dim=1) for each in (targets - soon, soon_std))
         return targets, std, distance / torch.clamp(expected, min=1e-9)
-
-
-def _combine_members(outputs: Tensor) -> tuple[Tensor, Tensor]:
-    """Return targets (Q, N) and their standard deviations from outputs (E, Q, 2 N); see `network.combine_members`."""
-    targets, log_errors = outputs.chunk(2, dim=2)
-    variance = 2 * torch.exp(2 * torch.clip(log_errors, MIN_LOG_ERROR, MAX_LOG_ERROR))
-    pooled = variance[:, :, :2].mean(dim=2, keepdim=True)
-    precision = 1 / torch.cat([pooled, pooled, variance[:, :, 2:]], dim=2)
-    weight = precision / precision.sum(dim=0)
-    mean = (weight * targets).sum(dim=0)
-    return mean, torch.sqrt((weight * (variance + (targets - mean) ** 2)).sum(dim=0))
 
 
 def _build_graph(model: LocalizerModel, digest: str) -> onnx.ModelProto:

@@ -104,11 +104,10 @@ def _assemble(content: ForeignArrays, presses: Arrays) -> Recording:
                 is_held = True
                 columns |= {name: _hold(values) for name, values in with_values.items()}
             notes.append(f"{(~keep).sum()} lines without any reading are no readings")
-    times, is_timed = repair_times(np.where(keep, times, np.nan), notes, content.line_number, keep)
-    rows = np.flatnonzero(is_timed)
-    if len(rows) < len(is_timed):
-        readings, times = readings[rows], times[rows]
-        columns = {name: values[rows] if len(values) == len(is_timed) else values for name, values in columns.items()}
+    rows, times = _repair_times(np.where(keep, times, np.nan), keep, notes, content.line_number)
+    if len(rows) < len(keep):
+        readings = readings[rows]
+        columns = {name: values[rows] if len(values) == len(keep) else values for name, values in columns.items()}
     # 2. Find the presses.
     timed = {entry.quantity for entry, _ in arrays if entry.factor is not None}
     for name in timed & {"down_command", "up_command"}:
@@ -191,19 +190,13 @@ def _hold(values: Array) -> Array:
     return np.where((last < 0).reshape(-1, *[1] * (values.ndim - 1)), np.nan, values[np.maximum(last, 0)])
 
 
-def repair_times(
-    times_s: Array, notes: list[str], line_number: Callable[[int], int] | None, readings: Mask
-) -> tuple[Array, Mask]:
-    """Correct times that do not ascend; return them (n,) and whether each is the time of a reading (n,).
+def _repair_times(
+    times_s: Array, is_reading: Mask, notes: list[str], line_number: Callable[[int], int] | None
+) -> tuple[Indices, Array]:
+    """Return the rows (n,) of readings with a time, and their times (n,), which ascend, from those of all rows (R,), s.
 
-    The wrap of a clock is added; readings whose times are missing or go back are left out if they are few, otherwise
-    InputError is raised; equal times are spread between their neighbours. Each correction adds to the `notes`.
-
-    Args:
-        times_s: times, NaN where missing; shape (n,), s.
-        notes: notes of the recording.
-        line_number: returns the number of the line of a row.
-        readings: whether each row is a reading; shape (n,).
+    The wrap of a clock is added; readings whose times are missing (NaN) or go back are left out if they are few,
+    otherwise InputError is raised; equal times are spread between their neighbours. Each correction adds to the notes.
     """
 
     def name_rows(rows: Indices) -> str:
@@ -212,14 +205,14 @@ def repair_times(
         return f"readings {', '.join(map(str, rows[:5]))}{' and more' if len(rows) > 5 else ''} are"
 
     rows = np.flatnonzero(~np.isnan(times_s))
-    if n_untimed := int(readings.sum()) - len(rows):
-        notes.append(f"{name_rows(np.flatnonzero(readings & np.isnan(times_s)))} left out: no time")
+    if n_untimed := int(is_reading.sum()) - len(rows):
+        notes.append(f"{name_rows(np.flatnonzero(is_reading & np.isnan(times_s)))} left out: no time")
         if n_untimed > max(3, MAX_UNTIMED_SHARE * len(times_s)):
-            raise InputError(f"time is missing in {n_untimed} of {int(readings.sum())} readings, expected it in each")
+            raise InputError(f"time is missing in {n_untimed} of {int(is_reading.sum())} readings, expected it in each")
     times = times_s[rows]
     steps = np.diff(times)
     if not (steps <= 0).any():
-        return times_s, np.isin(np.arange(len(times_s)), rows) if len(rows) < len(times_s) else readings
+        return rows, times
     # 1. Add the wraps of clocks.
     usual = float(np.median(steps[steps > 0])) if (steps > 0).any() else 0.0
     offsets, n_wraps = np.zeros(len(times)), 0
@@ -256,9 +249,7 @@ def repair_times(
         ends_s = times[0] - interval * middles[0], times[-1] + interval * (len(times) - 1 - middles[-1])
         knots = np.concatenate([[-1e-9], middles, [len(times) - 1 + 1e-9]])
         times = np.interp(np.arange(len(times)), knots, np.concatenate([ends_s[:1], times[starts], ends_s[1:]]))
-    repaired, is_kept = np.full(len(times_s), np.nan), np.zeros(len(times_s), bool)
-    repaired[rows], is_kept[rows] = times, True
-    return repaired, is_kept
+    return rows, times
 
 
 def _longest_ascent(values: Array) -> Indices:
@@ -289,7 +280,7 @@ def _within(columns: Mapping[str, Array], n_readings: int, notes: list[str]) -> 
 
 def _upright(entry: ColumnEntry, values: Array, notes: list[str]) -> Array:
     """Return depths or forces of presses; a force little below 0 becomes 0, and a sign that is inverted is refused."""
-    if np.nanmedian(np.append(values, np.nan) if np.isnan(values).all() else values) < 0:
+    if 2 * (values < 0).sum() > (~np.isnan(values)).sum():
         factor = -1 if entry.factor is None else -entry.factor
         what = f"{entry.quantity} is below 0 in most presses, such as {np.nanmin(values):g}"
         raise InputError(f"{what}; does it point the other way ({entry.quantity}={entry.name}:{factor:g})?")
@@ -310,10 +301,12 @@ def _join_positions(columns: Mapping[str, Array]) -> Array | None:
         if len(x) != len(y):
             raise InputError(f"x has {len(x)} values and y {len(y)}, expected as many")
         return np.column_stack([x, y])
-    positions = columns.get("positions")
-    if positions is not None and (positions.ndim != 2 or 2 not in positions.shape):
+    if "positions" not in columns:
+        return None
+    positions = columns["positions"]
+    if positions.ndim != 2 or 2 not in positions.shape:
         raise InputError(f"positions have shape {positions.shape}, expected (n, 2) or (2, n)")
-    return positions if positions is None or positions.shape[1] == 2 else positions.T
+    return positions if positions.shape[1] == 2 else positions.T
 
 
 def _find_presses(

@@ -15,13 +15,16 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from padforge.common.validation import InputError, check_float
-from padforge.sense.arrays import MAX_S, Array, Indices, Mask
+from padforge.common.validation import InputError
+from padforge.sense.arrays import Array, Indices, Mask
 from padforge.sense.formats.annotations import ModelAnnotations
 from padforge.sense.recording.recording import Recording
 
 if TYPE_CHECKING:
     from rosbags.typesys.store import Typestore
+
+Stamped = tuple[int, memoryview]
+"""Stamp of a message, ns, and the message as CDR."""
 
 FORMAT = "padforge-ros/1"
 READINGS, PRESSED, PLACE = "/pad/readings", "/pad/pressed", "/pad/place"
@@ -176,7 +179,7 @@ def arm_poses(states: Array, epoch_s: float) -> TopicSeries:
     )
 
 
-def encode(store: "Typestore", topic: str, series: TopicSeries) -> list[memoryview]:
+def encode(store: "Typestore", topic: str, series: TopicSeries) -> list[Stamped]:
     """Serialize the messages of a topic."""
     msgtype, _, paths = TOPICS[topic]
     message = _empty(store, msgtype)
@@ -199,7 +202,7 @@ def encode(store: "Typestore", topic: str, series: TopicSeries) -> list[memoryvi
         for column, (parent, name, takes_array) in enumerate(zip(parents, names, is_array, strict=True)):
             # An array is at the last path, and takes the rest of the row.
             setattr(parent, name, row[column:] if takes_array else float(row[column]))
-        encoded.append(store.serialize_cdr(message, msgtype))
+        encoded.append((stamp, store.serialize_cdr(message, msgtype)))
     return encoded
 
 
@@ -265,36 +268,30 @@ def encode_recording(store: "Typestore", recording: Recording, epoch_s: float, t
     return store.serialize_cdr(_empty(store, TOPICS[RECORDING].msgtype, data=text), TOPICS[RECORDING].msgtype)
 
 
-def decode_recording(raw: RawMessages, readings: Array) -> tuple[Recording, float, str] | None:
-    """Return the recording in RECORDING, its epoch and digest; None if it does not fit the readings (R, C)."""
-    try:
-        document = json.loads(raw.decode(-1).data)
-        if document["format"] != FORMAT:
-            return None
-        arrays: dict[str, Any] = {name: np.array(document[name], np.float64) for name in (*_NUMBERS, *_INDICES)}
-        recording = Recording(readings=readings, **arrays, source=document["source"])
-        return recording, check_float("epoch_s", document["epoch_s"], -MAX_S, MAX_S), str(document["digest"])
-    except (InputError, KeyError, TypeError, ValueError):
-        return None
+def decode_recording(raw: RawMessages, readings: Array) -> tuple[Recording, float, str]:
+    """Return the recording in RECORDING, its epoch and digest; raise an error if it does not fit readings (R, C)."""
+    document = json.loads(raw.decode(-1).data)
+    arrays: dict[str, Any] = {name: np.array(document[name], np.float64) for name in (*_NUMBERS, *_INDICES)}
+    recording = Recording(readings=readings, **arrays, source=document["source"])
+    return recording, float(document["epoch_s"]), str(document["digest"])
 
 
 def encode_health(
     store: "Typestore", recording: Recording, annotations: ModelAnnotations, stamps: Indices
-) -> tuple[Indices, list[memoryview]]:
-    """Return stamps (n,) and messages of HEALTH: all fibres at the first reading, and when a fault was detected."""
+) -> list[Stamped]:
+    """Serialize HEALTH: the state of all fibres at the first reading, and whenever a fault was detected."""
     faults: dict[int, tuple[str, str]] = dict.fromkeys(
         annotations.dead, ("dead", "was dead in the recording that health was learnt from")
     )
-    states = [(int(stamps[0]), faults)]
+    messages = [_encode_states(store, recording.fibres, faults, int(stamps[0]))]
     ends = stamps_at(stamps, recording.up_command).tolist()
     for fault in annotations.faults or ():
         faults = faults | dict.fromkeys(fault.fibres, (fault.kind, fault.text))
-        states.append((ends[min(fault.press, len(ends) - 1)], faults))
-    messages = [_health_message(store, recording.fibres, faults, stamp) for stamp, faults in states]
-    return np.array([stamp for stamp, _ in states], np.int64), messages
+        messages.append(_encode_states(store, recording.fibres, faults, ends[min(fault.press, len(ends) - 1)]))
+    return messages
 
 
-def _health_message(store: "Typestore", fibres: int, faults: Mapping[int, tuple[str, str]], stamp: int) -> memoryview:
+def _encode_states(store: "Typestore", fibres: int, faults: Mapping[int, tuple[str, str]], stamp: int) -> Stamped:
     message = _empty(store, TOPICS[HEALTH].msgtype)
     message.header.frame_id = FRAME
     message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp, 10**9)
@@ -304,4 +301,4 @@ def _health_message(store: "Typestore", fibres: int, faults: Mapping[int, tuple[
         level, name = (2 if kind else 0), f"pad: fibre {fibre + 1}"  # ERROR or OK
         about = {"level": level, "name": name, "message": text, "hardware_id": "pad", "values": values}
         message.status.append(_empty(store, "diagnostic_msgs/msg/DiagnosticStatus", **about))
-    return store.serialize_cdr(message, TOPICS[HEALTH].msgtype)
+    return stamp, store.serialize_cdr(message, TOPICS[HEALTH].msgtype)

@@ -9,8 +9,6 @@ from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import replace
 from functools import cache, partial
-from heapq import merge
-from itertools import repeat
 from operator import itemgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -20,7 +18,7 @@ from numpy.typing import NDArray
 
 from padforge.common.files import UNFINISHED, atomic_files, check_file, reraise_write_error
 from padforge.common.validation import InputError, naming_file, short_repr
-from padforge.sense.arrays import MAX_BYTES, Array, Indices, check_numbers
+from padforge.sense.arrays import MAX_BYTES, Array, Indices
 from padforge.sense.formats import ros_messages as ros
 from padforge.sense.formats.annotations import ModelAnnotations, check_export
 from padforge.sense.formats.assembly import Arrays, ForeignArrays, assemble_recording
@@ -37,7 +35,6 @@ from padforge.sense.formats.columns import (
 )
 from padforge.sense.formats.hdf5_mat import check_no_presses
 from padforge.sense.recording.recording import NOTE, Recording
-from padforge.sense.recording.run_directory import STATE_COLUMNS
 
 if TYPE_CHECKING:
     from rosbags.interfaces import Connection
@@ -55,21 +52,20 @@ _FIELDS = dict.fromkeys(QUANTITIES, "data") | {
 _Arrays = list[tuple[ColumnEntry, NDArray[Any]]]
 
 
-def load_typestore(purpose: str) -> "Typestore":
-    """Return the message definitions of ROS 2; raise InputError, naming the purpose, if rosbags is not installed."""
-    try:
-        import rosbags.typesys  # noqa: F401
-    except ImportError as error:
-        raise InputError(f"{purpose} needs rosbags: pip install 'padforge[formats]'") from error
-    return _typestore()
-
-
 @cache
 def _typestore() -> "Typestore":
     """Return one store for all files, since it compiles code for every type of message."""
     from rosbags.typesys import Stores, get_typestore
 
     return get_typestore(Stores.ROS2_HUMBLE)
+
+
+def load_typestore(purpose: str) -> "Typestore":
+    """Return the message definitions of ROS 2; raise InputError, naming the purpose, if rosbags is not installed."""
+    try:
+        return _typestore()
+    except ImportError as error:
+        raise InputError(f"{purpose} needs rosbags: pip install 'padforge[formats]'") from error
 
 
 def read_bag(
@@ -137,9 +133,6 @@ def _import_exported(path: Path, presses: Arrays) -> Recording:
     notes = []
     with naming_file(path):
         check_no_presses(presses)
-        for name, topic in raw.items():
-            if topic.msgtype != ros.TOPICS[name].msgtype:
-                raise InputError(f"{name} is of {short_repr(topic.msgtype)}, expected {ros.TOPICS[name].msgtype}")
         topics = {name: ros.decode(raw[name], ros.TOPICS[name].paths) for name in number_topics if name in raw}
         if ros.RECORDING in raw:
             if (recording := _restore(raw[ros.RECORDING], topics)) is not None:
@@ -152,10 +145,10 @@ def _import_exported(path: Path, presses: Arrays) -> Recording:
 
 def _restore(raw: ros.RawMessages, topics: Mapping[str, ros.TopicSeries]) -> Recording | None:
     """Return the exact recording in the text of a bag; None if its messages differ from it."""
-    restored = ros.decode_recording(raw, topics[ros.READINGS].values)
-    if restored is None:
+    try:
+        recording, epoch_s, digest = ros.decode_recording(raw, topics[ros.READINGS].values)
+    except (InputError, KeyError, TypeError, ValueError):
         return None
-    recording, epoch_s, digest = restored
     expected = ros.to_topics(recording, epoch_s)
     if expected.keys() != topics.keys() or not all(topics[name].equals(expected[name]) for name in expected):
         return None
@@ -170,7 +163,7 @@ def _to_arrays(topics: Mapping[str, ros.TopicSeries]) -> _Arrays:
     arrays: _Arrays = [(ColumnEntry("time", ""), stamps / 1e9), (ColumnEntry("fibres", ros.READINGS), readings)]
     if ros.PRESSED not in topics:
         return arrays
-    down, up = _find_commands(topics[ros.PRESSED], stamps)
+    commands, down, up = _find_commands(topics[ros.PRESSED], stamps)
 
     def in_presses(topic: str, column: int, factor: float = 1e3) -> Array:
         """Return the number of the last message in each press; NaN without one."""
@@ -184,7 +177,7 @@ def _to_arrays(topics: Mapping[str, ros.TopicSeries]) -> _Arrays:
     downward = 1.0 if np.nansum(z) > 0 else -1.0  # z points into a pad that lay mirrored
     return [
         *arrays,
-        *_commands(down, up),
+        *commands,
         (ColumnEntry("positions", ""), np.column_stack([in_presses(ros.PLACE, 0), in_presses(ros.PLACE, 1)])),
         (ColumnEntry("depth", ""), np.where(downward * z > 0, downward * z, np.nan)),
         (ColumnEntry("reached", ""), in_presses(ros.REACHED, 2, downward * 1e3)),
@@ -192,12 +185,8 @@ def _to_arrays(topics: Mapping[str, ros.TopicSeries]) -> _Arrays:
     ]
 
 
-def _commands(down: Indices, up: Indices) -> _Arrays:
-    return [(ColumnEntry("down_command", "", 1.0), down / 1e9), (ColumnEntry("up_command", "", 1.0), up / 1e9)]
-
-
-def _find_commands(pressed: ros.TopicSeries, readings: Indices) -> tuple[Indices, Indices]:
-    """Return the stamps (Q,) at which presses begin, after the first reading, and end.
+def _find_commands(pressed: ros.TopicSeries, readings: Indices) -> tuple[_Arrays, Indices, Indices]:
+    """Return the commands of presses that begin after the first reading, as arrays and as stamps (Q,), ns.
 
     A press that is held at the end of the bag ends with its last reading.
     """
@@ -209,7 +198,9 @@ def _find_commands(pressed: ros.TopicSeries, readings: Indices) -> tuple[Indices
     valid = (down > readings[0]) & (down <= readings[-1])
     if not valid.any():
         raise InputError("press is nowhere true after the first reading")
-    return down[valid], up[valid]
+    down, up = down[valid], up[valid]
+    commands = {"down_command": down, "up_command": up}
+    return [(ColumnEntry(name, "", 1.0), stamps / 1e9) for name, stamps in commands.items()], down, up
 
 
 def _import_mapped(path: Path, columns: str, presses: Arrays) -> Recording:
@@ -227,7 +218,7 @@ def _import_mapped(path: Path, columns: str, presses: Arrays) -> Recording:
         arrays.append((ColumnEntry("time", ""), clock / 1e9))
         for entry, topic in series:
             if entry.quantity == "press":
-                arrays += _commands(*_find_commands(topic, clock))
+                arrays += _find_commands(topic, clock)[0]
                 continue
             if entry.factor is None and UNITS[entry.quantity] is MILLIMETRES:
                 entry = entry._replace(factor=MILLIMETRES["m"])
@@ -309,13 +300,9 @@ def export_bag(
         recording: recording to write.
         path: path of the file.
         annotations: predictions of a model, for the topics of touches and health.
-        states: states of an arm, by `STATE_COLUMNS`, whose poses become a topic; shape (n, 10).
+        states: states of an arm, by `run_directory.STATE_COLUMNS`, whose poses become a topic; shape (n, 10).
     """
     path = check_export(recording, path, annotations)
-    if states is not None:
-        states = check_numbers(states, np.float64, "states")
-        if states.shape[1:] != (len(STATE_COLUMNS),):
-            raise InputError(f"states have shape {states.shape}, expected (n, {len(STATE_COLUMNS)})")
     store = load_typestore(f"{path}: MCAP")
     epoch_s = ros.choose_epoch(recording.times_s)
     topics = ros.to_topics(recording, epoch_s)
@@ -323,17 +310,13 @@ def export_bag(
         topics[ros.TOUCHES] = ros.touches(recording, annotations, epoch_s)
     if states is not None:
         topics[ros.ARM] = ros.arm_poses(states, epoch_s)
-    stamps = {topic: series.stamps for topic, series in topics.items()}
-    messages = {topic: ros.encode(store, topic, series) for topic, series in topics.items() if len(series.stamps)}
+    encoded = {topic: ros.encode(store, topic, series) for topic, series in topics.items() if len(series.stamps)}
     if annotations is not None and annotations.faults is not None:
-        stamps[ros.HEALTH], messages[ros.HEALTH] = ros.encode_health(
-            store, recording, annotations, stamps[ros.READINGS]
-        )
-    stamps[ros.RECORDING] = stamps[ros.READINGS][:1]
-    messages = {ros.RECORDING: [ros.encode_recording(store, recording, epoch_s, messages)], **messages}
-    in_order = merge(
-        *(zip(repeat(topic), stamps[topic].tolist(), messages[topic]) for topic in messages), key=itemgetter(1)
-    )
+        encoded[ros.HEALTH] = ros.encode_health(store, recording, annotations, topics[ros.READINGS].stamps)
+    start, document = encoded[ros.READINGS][0][0], ros.encode_recording(store, recording, epoch_s, encoded)
+    encoded = {ros.RECORDING: [(start, document)], **encoded}
+    messages = [(topic, *stamped) for topic in encoded for stamped in encoded[topic]]
+    in_order = sorted(messages, key=itemgetter(1))
     with reraise_write_error(path), atomic_files(path.parent) as folder:
         bag = _write_mcap(folder / f"{UNFINISHED}{path.stem}", store, in_order)
         bag.replace(folder / path.name)

@@ -11,9 +11,9 @@ import queue
 import socketserver
 import threading
 from collections import deque
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import asdict, dataclass
-from typing import Any, Protocol
+from typing import Any
 
 from padforge.common.server import HOST, ConnectionServer, LocalPage, page_text
 from padforge.common.validation import InputError, short_repr
@@ -107,20 +107,6 @@ def _header(time_s: float) -> dict[str, Any]:
     whole_s = math.floor(time_s)
     seconds, nanoseconds = divmod(whole_s * 10**9 + round((time_s - whole_s) * 1e9), 10**9)
     return {"stamp": {"sec": seconds, "nanosec": nanoseconds}, "frame_id": FRAME}
-
-
-class OutputStream(Protocol):
-    """An output to other programs."""
-
-    def send(self, message: Message) -> None:
-        """Send a message, if its topic is supported, without waiting for receivers."""
-
-
-def broadcast(outputs: Iterable[OutputStream], messages: Iterable[Message]) -> None:
-    """Send messages through all outputs, in their order."""
-    for message in messages:
-        for output in outputs:
-            output.send(message)
 
 
 class JsonLines(ConnectionServer):

@@ -8,7 +8,7 @@ press is masked in it.
 """
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -118,46 +118,58 @@ def window_means(readings: Array, down_command: Indices, up_command: Indices, un
     return windows_from_rest(readings, baseline, down_command, up_command, until)
 
 
-def mean_at_rest(readings: Array, down_command: Indices, previous_end: Indices) -> Array:
-    """Return the baselines (Q, C), V: means before the presses, after the ends (Q,) of the previous ones."""
-    return _gather(readings, down_command, REST, previous_end, down_command).mean(axis=1)
+def mean_at_rest(readings: Any, down_command: Any, previous_end: Any, xp: Any = np) -> Any:
+    """Return the baselines (Q, C), V: means before the presses, after the ends (Q,) of the previous ones.
+
+    All arrays are of the module `xp`, numpy or torch.
+    """
+    return _gather(readings, down_command, REST, previous_end, down_command, xp).mean(axis=1)
 
 
 def windows_from_rest(
-    readings: Array, baseline: Array, down_command: Indices, up_command: Indices, until: Indices
-) -> Array:
-    """Return the windows of `window_means`, relative to a known baseline (Q, C)."""
-    hold_end = np.minimum(up_command, until)
+    readings: Any, baseline: Any, down_command: Any, up_command: Any, until: Any, xp: Any = np
+) -> Any:
+    """Return the windows of `window_means`, relative to a known baseline (Q, C).
+
+    All arrays are of the module `xp`, numpy or torch.
+    """
+    hold_end = xp.minimum(up_command, until)
     spans = [(down_command, window, hold_end) for window in PRESS_WINDOWS]
     spans += [(up_command, window, until) for window in RELEASE_WINDOWS]
     spans += [(hold_end, window, hold_end) for window in LATEST_WINDOWS]
-    means = [_gather(readings, origin, window, down_command, high).mean(axis=1) for origin, window, high in spans]
-    return np.stack(means, axis=2) - baseline[:, :, None]
+    means = [_gather(readings, origin, window, down_command, high, xp).mean(axis=1) for origin, window, high in spans]
+    return xp.stack(means, axis=2) - baseline[:, :, None]
 
 
-def compute_history(readings: Array, down_command: Indices) -> Array:
+def compute_history(readings: Any, down_command: Any, xp: Any = np) -> Any:
     """Return the history (Q, C, J) before the presses, V, relative to the baseline: windows, then slow medians.
 
     It includes all readings, whether or not a press is known there. So the baseline is the mean of all readings in
-    `REST`, also of those before the end of the previous press, which `mean_at_rest` does not use.
+    `REST`, also of those before the end of the previous press, which `mean_at_rest` does not use. All arrays are of the
+    module `xp`, numpy or torch.
     """
     offset = readings[0]  # subtracted so that long sums keep their digits
-    sums = np.vstack([np.zeros((1, readings.shape[1])), np.cumsum(readings - offset, axis=0)])
+    sums = xp.cumsum(readings - offset, axis=0)
+    sums = xp.concat([xp.zeros_like(sums[:1]), sums])
 
-    def mean(window: Window) -> Array:
-        first = np.maximum(down_command + window[0], 0)
-        end = np.maximum(down_command + window[1], first + 1)
+    def mean(window: Window) -> Any:
+        first = xp.clip(down_command + window[0], 0, None)
+        end = xp.maximum(down_command + window[1], first + 1)
         return (sums[end] - sums[first]) / (end - first)[:, None] + offset
 
     means = [mean(window) for window in HISTORY_WINDOWS]
-    medians = [_slow_median(readings, down_command, length) for length in SLOW]
+    medians = [_slow_median(readings, down_command, length, xp) for length in SLOW]
     baseline = mean(REST)
-    return np.stack([*means, *medians], axis=2) - baseline[:, :, None]
+    return xp.stack([*means, *medians], axis=2) - baseline[:, :, None]
 
 
-def _slow_median(readings: Array, down_command: Indices, length: int) -> Array:
+def _slow_median(readings: Any, down_command: Any, length: int, xp: Any) -> Any:
     """Return the (Q, C) medians of `N_MEDIAN_SAMPLES` of the `length` readings before each press."""
-    offsets = np.arange(-length, 0, length // N_MEDIAN_SAMPLES)
+    offsets = xp.arange(-length, 0, length // N_MEDIAN_SAMPLES)
+    if xp is not np:  # the median of torch is the lower one of two
+        samples = xp.sort(readings[xp.clip(down_command[:, None] + offsets, 0, None)], axis=1).values
+        n = samples.shape[1]
+        return samples[:, (n - 1) // 2 : n // 2 + 1].mean(axis=1)
     out = np.empty((len(down_command), readings.shape[1]))
     for first in range(0, len(down_command), 1024):  # in chunks, since a press takes kilobytes
         index = np.maximum(down_command[first : first + 1024, None] + offsets, 0)
@@ -174,7 +186,7 @@ def _running_medians(readings: Array, down_command: Indices, up_command: Indices
         (down_command + MEDIAN_OFFSET, down_command, up_command),
         (up_command + MEDIAN_OFFSET, down_command, next_begin),
     )
-    medians = [np.median(_gather(readings, middle, window, low, high), axis=1) for middle, low, high in ranges]
+    medians = [np.median(_gather(readings, middle, window, low, high, np), axis=1) for middle, low, high in ranges]
     return np.stack(medians, axis=2)
 
 
@@ -183,7 +195,7 @@ def _neighbours(down_command: Indices, up_command: Indices, n_readings: int) -> 
     return np.concatenate([[0], up_command[:-1]]), np.concatenate([down_command[1:], [n_readings]])
 
 
-def _gather(readings: Array, origin: Indices, window: Window, low: Indices, high: Indices) -> Array:
-    """(Q, W, C) readings in `origin` + window, clipped to low <= index < high."""
-    last = np.minimum(high, len(readings))[:, None] - 1
-    return readings[np.clip(origin[:, None] + np.arange(*window), low[:, None], last)]
+def _gather(readings: Any, origin: Any, window: Window, low: Any, high: Any, xp: Any) -> Any:
+    """(Q, W, C) readings in `origin` + window, clipped to low <= index < high, which is at most their number."""
+    index = xp.maximum(origin[:, None] + xp.arange(*window), low[:, None])
+    return readings[xp.minimum(index, high[:, None] - 1)]

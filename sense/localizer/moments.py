@@ -25,7 +25,7 @@ press has its own network (`PHASES`), since one network for all phases learns ea
 from bisect import bisect_right
 from collections.abc import Container, Mapping
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -113,15 +113,16 @@ RESIDUAL_PHASE = Phase(N_PRESS_WINDOWS + 3, (0.15, 0.1, 0.15, 0.1, 0.05, 0.45))
 """Phase of the network that corrects the Bayesian localizers."""
 
 
-def complete_windows(down_command: Indices, up_command: Indices, until: Indices) -> Mask:
+def complete_windows(down_command: Any, up_command: Any, until: Any, xp: Any = np) -> Any:
     """Return (Q, K) which of `PRESS_WINDOWS` and `RELEASE_WINDOWS` are complete before readings `until` (Q,).
 
     After the release all `PRESS_WINDOWS` are complete, also those of a shorter press, whose last reading is repeated.
+    All arrays are of the module `xp`, numpy or torch.
     """
     released = (until > up_command)[:, None]
-    press_ends, release_ends = ([end for _, end in windows] for windows in (PRESS_WINDOWS, RELEASE_WINDOWS))
+    press_ends, release_ends = (xp.asarray([end for _, end in each]) for each in (PRESS_WINDOWS, RELEASE_WINDOWS))
     pressed = (down_command[:, None] + press_ends <= until[:, None]) | released
-    return np.hstack([pressed, released & (up_command[:, None] + release_ends <= until[:, None])])
+    return xp.hstack([pressed, released & (up_command[:, None] + release_ends <= until[:, None])])
 
 
 def complete_at(n_complete: int, down_command: Indices, up_command: Indices) -> Indices:

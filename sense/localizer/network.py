@@ -9,7 +9,7 @@ of one tanh layer.
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -172,20 +172,22 @@ class Sliding:
         return TrackedFinger(targets, std, distance)
 
 
-def combine_members(outputs: Floats) -> tuple[Floats, Floats]:
+def combine_members(outputs: Any, xp: Any = np) -> tuple[Any, Any]:
     """Combine (E, Q, 2 N) outputs by inverse variances; return (Q, N) targets and standard deviations, scaled.
 
     The error of a member is taken as Laplace distributed, with the variance 2 b^2 for the mean absolute error b.
     Members are weighted press by press, equally in x and y. Their disagreement adds to the variance (Lakshminarayanan
-    et al. 2017, Simple and scalable predictive uncertainty estimation using deep ensembles).
+    et al. 2017, Simple and scalable predictive uncertainty estimation using deep ensembles). All arrays are of the
+    module `xp`, numpy or torch.
     """
-    targets, log_errors = np.split(outputs, 2, axis=2)
-    variance = 2 * np.exp(2 * np.clip(log_errors, MIN_LOG_ERROR, MAX_LOG_ERROR))
-    pooled = variance.copy()
-    pooled[:, :, :2] = variance[:, :, :2].mean(axis=2, keepdims=True)
-    weight = 1 / pooled / (1 / pooled).sum(axis=0)
+    n_targets = outputs.shape[2] // 2
+    targets, log_errors = outputs[:, :, :n_targets], outputs[:, :, n_targets:]
+    variance = 2 * xp.exp(2 * xp.clip(log_errors, MIN_LOG_ERROR, MAX_LOG_ERROR))
+    xy_variance = variance[:, :, :2].mean(axis=2, keepdims=True)
+    precision = 1 / xp.concat([xy_variance, xy_variance, variance[:, :, 2:]], axis=2)
+    weight = precision / precision.sum(axis=0)
     mean = (weight * targets).sum(axis=0)
-    return mean, np.sqrt((weight * (variance + (targets - mean) ** 2)).sum(axis=0))
+    return mean, xp.sqrt((weight * (variance + (targets - mean) ** 2)).sum(axis=0))
 
 
 def stack_members(members: list[Weights]) -> Weights:

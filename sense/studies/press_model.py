@@ -31,16 +31,9 @@ class PressModel:
         return self.contact.model != "shape"
 
     def respond(self, pad: Morphology, presses: Array, rng: np.random.Generator, present: Mask | None = None) -> Array:
-        """Sample the responses of a pad.
+        """Sample the responses (Q, F) to presses (Q, 2), or to C simultaneous ones (Q, C, 2), whose strains add.
 
-        Args:
-            pad: the fibres.
-            presses: positions (Q, 2), or of C simultaneous presses (Q, C, 2), whose strains add; grid units.
-            rng: source of the scatter.
-            present: which of the simultaneous presses there are, all if None; shape (Q, C).
-
-        Returns:
-            Responses; shape (Q, F).
+        Of simultaneous presses, `present` (Q, C) says which there are, all if None; positions are in grid units.
         """
         compute = relative_stretch if self.is_scattered else signals
         response = compute(pad, presses.reshape(-1, 2), self.contact).reshape(*presses.shape[:-1], -1)

@@ -41,19 +41,19 @@ class _Objects(NamedTuple):
     other: str  # the other field that differs
     error: str  # column of their errors
     unit: str  # of the errors
-    names: tuple[str, str, str]  # of a size and of a value of the other field, formats; and of all these values
+    names: tuple[str, str]  # of a size and of a value of the other field, formats
     axes: tuple[str, str]  # labels of the size and of an object in the figure
 
 
 _OBJECTS = {
     "layer": _Objects(
         *("tool_radius_mm", "depth_mm", "mean_mm", "mm"),
-        ("a radius of {:g} mm", "{:g} mm deep", "depths"),
+        ("a radius of {:g} mm", "{:g} mm deep"),
         ("radius of the tool, trained and tested with (mm)", "radius/depth"),
     ),
     "shape": _Objects(
         *("radius", "sides", "mean", "grid units"),
-        ("K {:g}", "D {}", "shapes"),
+        ("K {:g}", "D {}"),
         ("size K of the object, trained and tested with (grid units)", "K/D"),
     ),
 }
@@ -102,7 +102,7 @@ def sensitivity_study(pads: Mapping[str, Morphology], *, contact: Contact | None
 
 def _name(contact: Contact) -> str:
     kind = _OBJECTS[contact.model]
-    size, other, _ = kind.names
+    size, other = kind.names
     return f"{size.format(getattr(contact, kind.size))}, {other.format(getattr(contact, kind.other))}"
 
 

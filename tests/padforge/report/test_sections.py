@@ -16,7 +16,6 @@ from padforge.fabricate import build
 from padforge.report import write_report
 from padforge.sense.recording.recording import Recording
 from padforge.sense.recording.run_directory import Recorder
-from padforge.sense.report.sections import loss_chart
 from tests.helpers.less import blank_pictures
 from tests.padforge.report.conftest import HOSTILE, design_document, study_document, written
 
@@ -118,9 +117,7 @@ DAMAGED = {
     "fibre_loss.json": ['{"format": "padforge-fibre-loss/1", "methods": {"x": {"by_subset": [{"failed": [1]}]}}}'],
     "mould.stl": ["solid nothing"],
     "recording/journal.ndjson": ["{}\n"],
-    "studies/drift.json": [
-        '{"format": "padforge-study-drift/1", "title": "a", "text": [], "rows": [{"a": 1}, {"b": 1}]}'
-    ],
+    "studies/drift.json": ['{"format": "padforge-study-drift/1", "title": "a", "text": []}'],
 }
 
 
@@ -141,23 +138,3 @@ def test_report_refuses_mould_of_other_checks(pad: Path, tmp_path: Path, monkeyp
     line = r"mould\.stl: is not the one fabrication\.json was written with; fabricate again"
     with pytest.raises(InputError, match=line):
         write_report(pad)
-
-
-def test_loss_chart_has_two_failed_fibres_in_the_column_of_the_first_and_the_row_of_the_second() -> None:
-    """The labels of columns stand below them, those of rows to their left."""
-    single, pairs = {(fibre,): 1.0 + fibre for fibre in range(3)}, {(0, 1): 4.0, (0, 2): 5.0, (1, 2): 6.0}
-    text = loss_chart(single | pairs, 3)
-    cells = re.findall(r'<rect x="(\d+)" y="(\d+)" width="38".*?<title>without (.*?): ', text)
-    corners = {name: (int(x), int(y)) for x, y, name in cells}
-    assert corners["1 and 3"] == (corners["1"][0], corners["3"][1])
-    assert corners["2 and 3"] == (corners["2"][0], corners["3"][1])
-    assert corners["1"][1] < corners["3"][1]
-    labels = re.findall(r'<text x="([\d.]+)" y="([\d.]+)" font-size="14">(\d)</text>', text)
-    rows, columns = labels[::2], labels[1::2]
-    for number, (row, column) in enumerate(zip(rows, columns, strict=True), 1):
-        x, y = corners[str(number)]
-        assert (row[2], column[2]) == (str(number), str(number))
-        assert y < float(row[1]) < y + 40
-        assert float(row[0]) < corners["1"][0]
-        assert float(column[0]) == pytest.approx(x + 19)
-        assert float(column[1]) > corners["3"][1] + 40

@@ -107,6 +107,7 @@ def test_sections_on_documents(golden, monkeypatch: pytest.MonkeyPatch) -> None:
         {"kind": "simulated", "rig": {"rate_hz": 13.3, "depth_mm": 5.0}},
         {"kind": "rig", "rig": {"rate_hz": 50, "depths_mm": [4.0, 1.5]}},
         {"kind": "published", "file": "5.mat"},
+        {"kind": "hand", "rig": {"rate_hz": 20.0}},
         {"kind": "simulated", "twin": {}},
     ):
         sections += recording_sections(Path("none"), {"source": source, "fibres": 7})

@@ -34,15 +34,6 @@ def exported(
 
 
 @pytest.fixture(scope="module")
-def deeply_exported(
-    deep_localizer: LocalizerModel, deep_recording: Recording, tmp_path_factory: pytest.TempPathFactory
-) -> tuple[Path, OnnxReport]:
-    """The same of one member, which has no Bayesian localizers, but depth and force."""
-    path = tmp_path_factory.mktemp("deep-onnx") / "localizer.onnx"
-    return path, export_onnx(deep_localizer, DIGEST, path, first_presses(deep_recording, 5))
-
-
-@pytest.fixture(scope="module")
 def graph(exported: tuple[Path, OnnxReport]) -> onnxruntime.InferenceSession:
     return onnxruntime.InferenceSession(exported[0])
 
@@ -130,8 +121,10 @@ def test_graph_follows_a_finger_that_slides(graph, localizer, brief) -> None:
 
 
 @pytest.mark.slow
-def test_graph_gives_depth_and_force(deep_localizer, deep_recording, deeply_exported) -> None:
-    path, report = deeply_exported
+def test_graph_gives_depth_and_force(deep_localizer, deep_recording, tmp_path) -> None:
+    """Of one member, which has no Bayesian localizers."""
+    path = tmp_path / "localizer.onnx"
+    report = export_onnx(deep_localizer, DIGEST, path, first_presses(deep_recording, 5))
     assert report.position_difference_mm < MAX_DIFFERENCE_MM
     assert report.n_presses == 5
     presses, graph = deep_localizer.scaled_features(deep_recording), onnxruntime.InferenceSession(path)

@@ -1,7 +1,7 @@
 """Bags of other programs, and messages as JSON."""
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -75,3 +75,25 @@ def as_json(value: Any) -> Any:
     if isinstance(value, list):
         return [as_json(part) for part in value]
     return None if isinstance(value, float) and math.isnan(value) else value
+
+
+LAB_COLUMNS = "fibres=/skin/all:mV,positions=/probe,force=/wrench,press=/down"
+
+
+def lab() -> Iterator[Message]:
+    """Yield readings at 50 Hz; from 1 s on a press every second, 0.4 s long, at (n, -n) cm and with 2 n N."""
+    yield "/camera", 0.0, make("String", "no picture")
+    for step in range(300):
+        time = step / 50
+        number = step // 50
+        if step % 50 == 0 and number:
+            yield "/probe", time - 0.001, pose(number / 100, -number / 100)
+            yield "/wrench", time - 0.001, wrench(0.0, 1.2 * number, -1.6 * number)
+        if step % 50 in (0, 20) and number:
+            yield "/down", time - 0.001, make("Bool", step % 50 == 0)
+        yield "/skin/all", time, array("Float32MultiArray", np.array([number, step, 512], np.float32))
+        yield "/skin/1", time, make("Int16", number)
+        yield "/skin/2", time + 0.001, make("Float64", step / 2)
+        if step % 2 == 0:
+            yield "/at/y", time, make("UInt8", step // 2 % 7)
+        yield "/at/x", time + 0.001, make("Float32", step)

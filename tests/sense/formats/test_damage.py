@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from padforge.common.validation import InputError
-from padforge.sense import Recorder, Recording, export_bag, export_csv, export_hdf5, import_bag, import_csv
+from padforge.sense import Recorder, Recording, export_bag, export_hdf5, import_bag
 from padforge.sense.formats.import_export import import_file
 
 from .foreign import array, write_bag
@@ -34,17 +34,6 @@ def test_import_file_of_files_without_their_end(eight: Recording, bag: Path, tmp
             import_file(path)
         assert "\n" not in str(refusal.value)
         assert name in str(refusal.value)
-
-
-def test_import_csv_of_a_file_without_its_end_reads_its_whole_lines(eight: Recording, tmp_path: Path) -> None:
-    export_csv(eight, tmp_path / "r.csv")
-    whole = (tmp_path / "r.csv").read_text()
-    lines = whole.splitlines()
-    (tmp_path / "r.csv").write_text("\n".join(lines[:200])[:-25])
-    recording = import_csv(tmp_path / "r.csv")
-    np.testing.assert_array_equal(recording.readings, eight.readings[: len(recording.readings)])
-    assert len(recording.readings) == 198
-    assert recording.source["note"] == "line 200, the last, is cut off and left out"
 
 
 def test_import_bag_refuses_damaged_messages(tmp_path: Path) -> None:

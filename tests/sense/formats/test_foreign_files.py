@@ -1,8 +1,8 @@
 """Files as other labs' programs write them, by the mapping that their page of errors suggests."""
 
-import re
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
+from datetime import datetime, timedelta
 from pathlib import Path
 from typing import Any
 
@@ -12,12 +12,13 @@ import pytest
 import scipy.io
 
 from padforge.common.validation import InputError
-from padforge.sense import Recording, import_bag, import_csv, import_hdf5, import_mat
+from padforge.sense import Recording, import_bag, import_csv
 from padforge.sense.formats.csv_recording import read_presses
 from padforge.sense.formats.import_export import import_file
 from padforge.sense.recording.doubts import find_doubts
+from tests.helpers.golden import Golden
 
-from .foreign import array, header, make, pose, write_bag, write_ros1_bag
+from .foreign import LAB_COLUMNS, array, header, lab, make, pose, write_bag, write_ros1_bag
 
 N = 156
 TIMES = np.arange(N) / 20
@@ -37,18 +38,36 @@ def table(header: str = "t,c0,c1,c2,c3", lines: list[str] | None = None) -> str:
     return "\n".join([*filter(None, [header]), *(lines or rows())]) + "\n"
 
 
-def load(tmp_path: Path, content: str | bytes, mapping: str = MAPPING, **options: Any) -> Recording:
-    path = tmp_path / "lab.csv"
-    path.write_bytes(content.encode() if isinstance(content, str) else content)
-    return import_csv(path, mapping, **options)
-
-
 def check(recording: Recording) -> None:
     """Check that a recording is the one of this page, with presses or as detected."""
     assert recording.readings.shape == (N, 4)
     np.testing.assert_allclose(recording.readings, VOLTS, atol=1e-9)
     np.testing.assert_allclose(recording.times_s - recording.times_s[0], TIMES, atol=1e-5)
     assert len(recording.down_command) == 6
+
+
+def name_missing(values: np.ndarray) -> str:
+    rows = np.argwhere(np.isnan(values)).tolist()
+    return f"missing {rows if len(rows) < 6 else len(rows)}"
+
+
+def outcome(path: Path, mapping: str, **options: Any) -> str:
+    """What is read of a file, in a line for each quantity, or the one line of its refusal."""
+    try:
+        recording = import_file(path, mapping, **options)
+    except InputError as error:
+        return f"refused: {error}"
+    readings, steps = recording.readings, np.diff(recording.times_s)
+    as_written = readings.shape == VOLTS.shape and np.allclose(readings, VOLTS, atol=1e-9)
+    volts = f"of {np.nansum(readings, axis=0).round(4).tolist()} V in all, {name_missing(readings)}"
+    lines = [f"{len(readings)} readings {'as written' if as_written else volts}"]
+    lines[0] += f", from {steps.min():.4f} to {steps.max():.4f} s apart, {recording.times_s[-1]:.3f} s at last"
+    lines.append(f"presses {recording.down_command.tolist()} to {recording.up_command.tolist()}")
+    for name in ("presses_mm", "depths_mm", "reached_mm", "forces_n"):
+        if not np.isnan(values := getattr(recording, name)).all():
+            lines.append(f"{name} {values.round(2).tolist()}")
+    about = {name: value for name, value in recording.source.items() if name not in ("kind", "file", "columns")}
+    return "\n".join([*lines, f"{about}", *find_doubts(recording)])
 
 
 def with_commas(text: str) -> str:
@@ -65,6 +84,15 @@ def clocked(i: int) -> str:
 
 EVENLY: dict[str, tuple[str | bytes, str]] = {
     "blanks": (table().replace(",", " "), MAPPING),
+    "UTF-8 with a mark": ("\ufeff" + table(), MAPPING),
+    "all cells in quotes": (
+        "\n".join(",".join(f'"{c}"' for c in line.split(",")) for line in table().split()),
+        MAPPING,
+    ),
+    "blanks, CR and LF": (table().replace(",", " , ").replace("\n", "\r\n") + "\r\n\r\n", MAPPING),
+    "comments": ("# of a probe\n\n# spring; warm\n" + table().replace("\n3.000", "\n# knocked at\n\n3.000"), MAPPING),
+    "tabs, names in a comment": ("# by hand\n#" + table().replace(",", "\t"), MAPPING),
+    "names with separators": (table('"t;s,x","c;0",c1,c2,c3'), "time=t;s?x,fibres=c*"),
     "runs of blanks, no header": (table("").replace(",", "   "), "time=1,fibres=2-5"),
     "commas, no header": (table(""), "time=1,fibres=2-5"),
     "sep line": ("sep=;\r\n" + with_commas(table()), MAPPING),
@@ -104,35 +132,138 @@ EVENLY: dict[str, tuple[str | bytes, str]] = {
 }
 
 
-@pytest.mark.parametrize("name", EVENLY)
-def test_import_csv_reads_tables_of_other_programs(tmp_path: Path, name: str) -> None:
-    check(load(tmp_path, *EVENLY[name]))
+def changed(row: int, line: str, header: str = "t,c0,c1,c2,c3", instead_of: int = 1) -> str:
+    """The table with another line in place of one or two."""
+    return table(header, [*rows()[:row], line, *rows()[row + instead_of :]])
 
 
-@pytest.mark.parametrize("form", ["{:%m/%d/%Y %I:%M:%S.%f %p}", "{:%d.%m.%Y %H:%M:%S,%f}"])
-def test_import_csv_reads_dates_of_other_countries(tmp_path: Path, form: str) -> None:
-    from datetime import datetime, timedelta
+def with_force(newtons: Callable[[int], float]) -> str:
+    return table("t,c0,c1,c2,c3,fz", [f"{line},{newtons(i)}" for i, line in enumerate(rows())])
 
-    pytest.importorskip("pandas")
+
+def positioned(scale: float = 1.0, jitter: float = 0.0, late: int = 0, held: bool = False, time: str = "") -> str:
+    noise = np.random.default_rng(1).normal(0, jitter, (N, 2)) if jitter else np.zeros((N, 2))
+    lines = [
+        f"{line},{x:.5f},{y:.5f}" if (i >= late if held else PRESSED[i]) else f"{line},,"
+        for i, (line, (x, y)) in enumerate(
+            zip(rows(lambda i: str(50 * i)) if time else rows(), SPOTS * scale + noise, strict=True)
+        )
+    ]
+    return table(f"t{time},c0,c1,c2,c3,px,py", lines)
+
+
+def measured(volts: str = "mV", other: str = "mV") -> str:
+    """A table whose times and volts have their units behind them."""
+    units = (volts, other)
+    lines = [
+        ",".join([f"{1000 * TIMES[i]:.1f} ms", *(f"{1000 * volt:.1f}{units[i % 2]}" for volt in VOLTS[i])])
+        for i in range(N)
+    ]
+    return table(lines=lines)
+
+
+def named(separator: str) -> str:
+    names = ["t", "c0", "c1", "c2", "c3"]
+    cells = [zip(names, row.split(","), strict=True) for row in rows()]
+    return table("", [separator.join(f"{name}:{value}" for name, value in row) for row in cells])
+
+
+def dated(form: str) -> str:
     start = datetime(2026, 3, 1, 11, 59, 58)
-    lines = rows(lambda i: form.format(start + timedelta(seconds=i / 20)), ";")
-    check(load(tmp_path, table("t;c0;c1;c2;c3", lines)))
+    return table("t;c0;c1;c2;c3", rows(lambda i: form.format(start + timedelta(seconds=i / 20)), ";"))
 
 
-def test_import_csv_says_what_is_left_out(tmp_path: Path) -> None:
-    def note(lines: list[str]) -> str:
-        return load(tmp_path, table(lines=lines)).source["note"]
+WITH_PLACES, WITH_FORCE = f"{MAPPING},x=px,y=py", f"{MAPPING},force=fz"
+TURNED = with_force(lambda _: -2.5)
+MERGED = [[f"{line},,", f"{TIMES[i] + 0.013:.3f},,,,,{SPOTS[i, 0]},{SPOTS[i, 1]}"] for i, line in enumerate(rows())]
+TIME_LAST = [",".join([*line.split(",")[1:], line.split(",")[0]]) for line in rows()]
+OWN = ["0,1,2,,", "1,1,2,3,4", "2,1,2,3,4", "3,1,2,,", "4,1,2,-1,0", "5,1,2,,"]
+"""Lines of the program's own format, with two presses."""
+PARTLY = ["0,1,2,,", "1,,2,?,?", "2,nan,2,?,?", "3,1,2,,", "4,1,2,-1,0", "5,1,,,", "6,1,2,?,?", "7,1,2,,", ""]
+LAB = """# bench 2
+t_ms;ch1;ch2;note;px;py;contact;f
+0;1000,5;2000;begin;1,5;2;0;0
+100;1001;2000;;1,5;2;1;200
+200;;2000;loud;1,5;2;1;250
+300;1000;2000;;-0,5;2;0;0
+400;1000;2000;;-0,5;2;1;500
+500;1000;2000;end;-0,5;2;0;0
+"""
 
-    assert note([*rows(), "7.8,1.8"]) == "line 158, the last, is cut off and left out"
-    assert note([*rows()[:70], rows()[70] + ",1", *rows()[71:]]) == "line 72 is left out: 6 values, expected 5"
-    back = rows()
-    back[70] = "0.000," + back[70].split(",", 1)[1]
-    assert note(back) == "line 72 is left out: times go back"
-    words = [*rows()[:30], "1.500,what,1.8,1.8,1.8", *rows()[31:]]
-    assert note(words) == "line 32 is a value missing: column 'c0' holds no number but 'what'"
-    assert (
-        load(tmp_path, table(lines=[*rows()[:30], "1.500,#N/A,ovf,inf,1.8", *rows()[31:]])).source.get("note") is None
-    )
+
+def own(*lines: str, header: str = "time_s,a,b,x_mm,y_mm") -> str:
+    return table(header, list(lines))
+
+
+REMARKABLE: dict[str, tuple[str, str]] = {
+    "dates of America": (dated("{:%m/%d/%Y %I:%M:%S.%f %p}"), MAPPING),
+    "dates of Germany": (dated("{:%d.%m.%Y %H:%M:%S,%f}"), MAPPING),
+    "numbers with names": (named(","), MAPPING),
+    "numbers with names, tabs": (named("\t"), MAPPING),
+    "numbers with units": (measured(), MAPPING),
+    "numbers of two units": (measured(other=" V"), MAPPING),
+    "last line torn": (table(lines=[*rows(), "7.8,1.8"]), MAPPING),
+    "a value too many": (changed(70, rows()[70] + ",1"), MAPPING),
+    "a time that goes back": (changed(70, "0.000," + rows()[70].split(",", 1)[1]), MAPPING),
+    "a word": (changed(30, "1.500,what,1.8,1.8,1.8"), MAPPING),
+    "words for what is missing": (changed(30, "1.500,#N/A,ovf,inf,1.8"), MAPPING),
+    "a line torn, and one of a later time": (changed(70, rows()[70][:12] + rows()[80], instead_of=2), MAPPING),
+    "a line torn, time in the last column": (
+        table("c0,c1,c2,c3,t", [*TIME_LAST[:70], TIME_LAST[70][:9] + TIME_LAST[71], *TIME_LAST[72:]]),
+        MAPPING,
+    ),
+    "two runs": (table(lines=rows() + rows()), MAPPING),
+    "merged sources": (table("t,c0,c1,c2,c3,x,y", [line for pair in MERGED for line in pair]), f"{MAPPING},x=x,y=y"),
+    "positions that are measured": (positioned(jitter=0.02), WITH_PLACES),
+    "positions that are always measured": (positioned(jitter=0.02, held=True, late=5), WITH_PLACES),
+    "positions in m": (positioned(scale=0.001), WITH_PLACES),
+    "times in ms that are said to be s": (positioned(time=" [s]"), WITH_PLACES.replace("=t", "=t*", 1)),
+    "times in ms, without positions": (table(lines=rows(lambda i: str(50 * i))), MAPPING),
+    "counts of 10 bits": (table(), f"{MAPPING}:310"),
+    "counts of 14 bits": (table(), f"{MAPPING}:5000"),
+    "force": (with_force(lambda _: 2.5), WITH_FORCE),
+    "force a little below 0": (with_force(lambda i: -0.02 if 78 < i < 98 else 2.5), WITH_FORCE),
+    "force that points the other way": (TURNED, WITH_FORCE),
+    "force that is turned": (TURNED, f"{WITH_FORCE}:-1"),
+    "own, positions unknown and readings missing": (own(*PARTLY), ""),
+    "own, a word in a column": (own(*OWN, *["6,1,two,,"] * 4), ""),
+    "own, one of x and y": (own(*OWN, "# here", "6,1,2,3,"), ""),
+    "own, lines torn": (own(*OWN, *["6,1"] * 4), ""),
+    "other units": (
+        table("t,c0,c1,c2,c3,on,y", [f"{line},{int(PRESSED[i])},{1000 * i}" for i, line in enumerate(rows())]),
+        "time=t:min,fibres=c0:uV,fibres=c1:0.5,x=c2:m,y=y:um,depth=c3:cm,press=on",
+    ),
+    "own, presses detected": (table("time_s,a,b,c,d"), ""),
+    "own, presses detected, no positions": (table("time_s,a,b,c,d,x_mm,y_mm", [f"{line},," for line in rows()]), ""),
+    "no mapping": (table(), ""),
+    "a mapping without a quantity": (table(), "t"),
+    "x without y": (table(), f"{MAPPING},x=c3"),
+    "a unit that is none": (table(), "time=t:volt,fibres=c*"),
+    "a column twice": (table(), "time=c1,fibres=c1"),
+    "no such column": (table(), "time=t_ms,fibres=c*"),
+    "own, no press": (own("0,1", "1,1", header="time_s,a"), ""),
+    **{
+        f"own, {cell!r} for a number": (own(*OWN[:2], f"2,1,{cell},3,4", *OWN[3:]), "") for cell in ("1_0", "1 2", "1e")
+    },
+    "own, ? for a number": (own(*OWN[:2], "2,1,?,3,4", *OWN[3:]), ""),
+    "semicolons and all quantities": (LAB, "time=t_ms:ms,fibres=ch*:mV,x=px:cm,y=py:cm,press=contact,force=f:mN"),
+}
+"""Tables of which something is to be said, or which are refused."""
+
+
+@pytest.mark.parametrize("name", EVENLY)
+def test_tables_of_other_programs_are_read_alike(tmp_path: Path, name: str) -> None:
+    content, mapping = EVENLY[name]
+    (tmp_path / "lab.csv").write_bytes(content.encode() if isinstance(content, str) else content)
+    check(import_csv(tmp_path / "lab.csv", mapping))
+
+
+def test_what_is_said_of_tables(golden: Golden, tmp_path: Path) -> None:
+    lines = []
+    for name, (content, mapping) in REMARKABLE.items():
+        (tmp_path / "lab.csv").write_text(content)
+        lines += [f"-- {name}", outcome(tmp_path / "lab.csv", mapping)]
+    golden("formats/tables.txt", "\n".join(lines))
 
 
 @pytest.mark.parametrize("cut", [6, 9, 12, 13, 20, None])
@@ -142,90 +273,12 @@ def test_import_csv_reads_the_line_that_follows_a_torn_one_in_the_same_line(
 ) -> None:
     lines = rows(lambda i: f"{TIMES[i]:.3f}" if unit == "s" else str(10000 + 50 * i))
     lines[70:72] = [lines[70][:cut] + lines[71]]
-    recording = load(tmp_path, table(lines=lines), f"time=t:{unit},fibres=c*")
+    (tmp_path / "lab.csv").write_text(table(lines=lines))
+    recording = import_csv(tmp_path / "lab.csv", f"time=t:{unit},fibres=c*")
     np.testing.assert_allclose(recording.readings, np.delete(VOLTS, 70, axis=0), atol=1e-9)
     np.testing.assert_allclose(np.diff(recording.times_s)[69:71], [0.1, 0.05])
     note = "line 72 is left out up to where another line begins in it: one was cut off"
     assert str(recording.source["note"]).startswith(note)
-
-
-def test_import_csv_leaves_out_a_torn_line_whose_continuation_is_uncertain(tmp_path: Path) -> None:
-    def note(lines: list[str], header: str = "t,c0,c1,c2,c3") -> str:
-        return load(tmp_path, table(header, lines)).source["note"]
-
-    left_out = "line 72 is left out: 6 values, expected 5"
-    late = rows()
-    late[70:72] = [late[70][:12] + late[80]]  # of a later time than the next line
-    assert note(late) == left_out
-    last = [",".join([*line.split(",")[1:], line.split(",")[0]]) for line in rows()]
-    last[70:72] = [last[70][:9] + last[71]]
-    assert note(last, "c0,c1,c2,c3,t") == left_out
-
-
-def test_import_csv_refuses_two_runs_by_their_line(tmp_path: Path) -> None:
-    with pytest.raises(
-        InputError, match=r"times go back from 7.75 to 0 s at line 158, .* are there several runs in it"
-    ):
-        load(tmp_path, table(lines=rows() + rows()))
-
-
-def test_import_csv_of_merged_sources_holds_positions(tmp_path: Path) -> None:
-    lines = []
-    for i, line in enumerate(rows()):
-        lines += [f"{line},,", f"{TIMES[i] + 0.013:.3f},,,,,{SPOTS[i, 0]},{SPOTS[i, 1]}"]
-    recording = load(tmp_path, table("t,c0,c1,c2,c3,x,y", lines), f"{MAPPING},x=x,y=y")
-    check(recording)
-    assert recording.presses_mm[4].tolist() == [0, 5]
-    assert recording.source["note"] == "156 lines without any reading are no readings"
-
-
-def positioned(scale: float = 1.0, jitter: float = 0.0, late: int = 0, held: bool = False) -> str:
-    noise = np.random.default_rng(1).normal(0, jitter, (N, 2)) if jitter else np.zeros((N, 2))
-    places = SPOTS * scale + noise
-    lines = [
-        f"{line},{x:.5f},{y:.5f}" if (i >= late if held else PRESSED[i]) else f"{line},,"
-        for i, (line, (x, y)) in enumerate(zip(rows(), places, strict=True))
-    ]
-    return table("t,c0,c1,c2,c3,px,py", lines)
-
-
-WITH_PLACES = f"{MAPPING},x=px,y=py"
-
-
-@pytest.mark.parametrize("content", [positioned(jitter=0.02), positioned(jitter=0.02, held=True, late=5)])
-def test_import_csv_of_measured_positions(tmp_path: Path, content: str) -> None:
-    recording = load(tmp_path, content, WITH_PLACES)
-    check(recording)
-    np.testing.assert_allclose(recording.presses_mm[0], [-10, -10], atol=0.1)
-
-
-def test_units_that_cannot_be_right_are_named_with_their_mapping(tmp_path: Path) -> None:
-    def doubt(content: str, mapping: str) -> str:
-        return " ".join(find_doubts(load(tmp_path, content, mapping)))
-
-    assert "are they in m (x=px:m,y=py:m)?" in doubt(positioned(scale=0.001), WITH_PLACES)
-    slow = positioned().replace("t,", "t [s],", 1)
-    slow = "\n".join(
-        [slow.split("\n")[0], *(re.sub(r"^[\d.]+", str(50 * i), line) for i, line in enumerate(slow.split()[2:]))]
-    )
-    assert "is time in ms (time=t*:ms)?" in doubt(slow, WITH_PLACES.replace("=t", "=t*", 1))
-    with pytest.raises(InputError, match=r"has no press: .*; is time in ms \(time=t:ms\)\?"):
-        load(tmp_path, table(lines=rows(lambda i: str(50 * i))))
-    assert "counts (fibres=c*:0.00323 for 10 bits of 3.3 V)" in doubt(table(), f"{MAPPING}:310")
-    with pytest.raises(
-        InputError, match=r"fibres rest at 9\d{3} V, .* are they counts \(fibres=c\*:0.000201 for 14 bits"
-    ):
-        load(tmp_path, table(), f"{MAPPING}:5000")
-
-
-@pytest.mark.parametrize(("force", "expected"), [(2.5, 2.5), (-0.02, 0.0)])
-def test_forces_below_zero(tmp_path: Path, force: float, expected: float) -> None:
-    lines = [f"{line},{force if 78 < i < 98 else 2.5}" for i, line in enumerate(rows())]
-    assert load(tmp_path, table("t,c0,c1,c2,c3,fz", lines), f"{MAPPING},force=fz").forces_n[3] == expected
-    turned = [f"{line},-2.5" for line in rows()]
-    with pytest.raises(InputError, match=r"force is below 0 in most presses, such as -2.5; .*\(force=fz:-1\)"):
-        load(tmp_path, table("t,c0,c1,c2,c3,fz", turned), f"{MAPPING},force=fz")
-    check(load(tmp_path, table("t,c0,c1,c2,c3,fz", turned), f"{MAPPING},force=fz:-1"))
 
 
 def test_presses_of_a_table_of_their_own(tmp_path: Path) -> None:
@@ -274,22 +327,6 @@ def mat73(path: Path, content: dict[str, Any], kind: str = "double") -> Path:
     return path
 
 
-def test_import_mat_reads_structures_and_columns(tmp_path: Path) -> None:
-    old, new = tmp_path / "old.mat", tmp_path / "new.mat"
-    scipy.io.savemat(old, {"data": {"t": TIMES, "in": {"v": VOLTS}}, "x": MATRIX})
-    mat73(new, {"data/t": TIMES[:, None], "data/in/v": VOLTS, "x": MATRIX})
-    for path in (old, new):
-        check(import_mat(path, "time=data.t,fibres=data.in.v"))
-        check(import_mat(path, "time=/data/t,fibres=/data/in/v"))
-        check(import_mat(path, "time=x[0],fibres=x[1:5],press=x[5]"))
-        check(import_mat(path, "time=x[:,0],fibres=x[:,1:5]"))
-        with pytest.raises(InputError, match=r"no variable voltage, tim .*'x'.*; --columns says what others hold"):
-            import_mat(path)
-        with pytest.raises(InputError, match=r"press is x\[7\], expected columns from 0 to 5"):
-            import_mat(path, "time=x[0],fibres=x[1:5],press=x[7]")
-    assert import_mat(new, "time=x[0],fibres=x[1:5]").fibre_names == ("x[1]", "x[2]", "x[3]", "x[4]")
-
-
 def opaque(path: Path, name: bytes, kind: bytes) -> Path:
     """Write a MATLAB 5 file with an object of a class that only MATLAB reads."""
 
@@ -304,33 +341,86 @@ def opaque(path: Path, name: bytes, kind: bytes) -> Path:
     return path
 
 
-def test_import_mat_names_timetables_and_cells(tmp_path: Path) -> None:
-    new = mat73(tmp_path / "new.mat", {"data": np.ones((1, 6), np.uint32)}, "timetable")
-    for path in (new, opaque(tmp_path / "old.mat", b"data", b"timetable")):
-        for mapping in ("", "rate=20,fibres=data", "time=data.Time,fibres=data.v"):
-            message = r"data is a timetable, which only MATLAB reads: writetimetable\(data, 'data.csv'\)"
-            with pytest.raises(InputError, match=message):
-                import_mat(path, mapping)
+def published_variables(**changes: Any) -> dict[str, Any]:
+    """Return the variables of a published file of three presses, with changes; None leaves one out."""
+    rng = np.random.default_rng(0)
+    content = {
+        "voltage": rng.uniform(1, 2, (120, 4)),
+        "pos": rng.uniform(-9, 9, (2, 3)),
+        "tim": np.arange(120.0)[None] / 13,
+    }
+    return {name: value for name, value in (content | changes).items() if value is not None}
+
+
+def test_what_is_said_of_files_of_matlab(golden: Golden, tmp_path: Path) -> None:
+    """Structures, columns of a matrix, objects that only MATLAB reads, and files as published."""
+    content = {"data": {"t": TIMES, "in": {"v": VOLTS}}, "x": MATRIX}
+    scipy.io.savemat(tmp_path / "old.mat", content)
+    mat73(tmp_path / "new.mat", {"data/t": TIMES[:, None], "data/in/v": VOLTS, "x": MATRIX})
+    opaque(tmp_path / "opaque.mat", b"data", b"timetable")
+    mat73(tmp_path / "timetable.mat", {"data": np.ones((1, 6), np.uint32)}, "timetable")
     scipy.io.savemat(tmp_path / "cells.mat", {"t": TIMES, "v": np.array([VOLTS, 1], dtype=object)})
-    with pytest.raises(InputError, match="v is a cell array, expected a full matrix"):
-        import_mat(tmp_path / "cells.mat", "time=t,fibres=v")
+    volts, positions, times = (published_variables()[name] for name in ("voltage", "pos", "tim"))
+    holed = volts.astype(np.float32)
+    holed[:, 2] = holed[50:55] = np.nan
+    for name, changes in {
+        "published": {},
+        "cut": {"voltage": volts[:111], "tim": times[:, :111]},
+        "more": {"voltage": volts[:100], "tim": times[:, :100], "pos": positions[:, :2]},
+        "short": {"voltage": volts[:79]},
+        "sparse": {"voltage": scipy.sparse.csc_matrix(volts)},
+        "counts": {"voltage": np.rint(volts * 200).astype(np.uint16)},
+        "holed": {"voltage": holed, "tim": times.T, "pos": positions.T},
+        "blind": {"pos": None},
+        "partly": {"pos": np.where([True, False, True], positions, np.nan)},
+    }.items():
+        scipy.io.savemat(tmp_path / f"{name}.mat", published_variables(**changes))
+    columns = (
+        "time=x[0],fibres=x[1:5],press=x[5]",
+        "time=x[:,0],fibres=x[:,1:5]",
+        "time=x[0],fibres=x[1:5],press=x[7]",
+    )
+    structure = ("time=data.t,fibres=data.in.v", "time=/data/t,fibres=/data/in/v", *columns, "")
+    table = ("", "rate=20,fibres=data", "time=data.Time,fibres=data.v")
+    mappings = dict.fromkeys(("old", "new"), structure) | dict.fromkeys(("opaque", "timetable"), table)
+    golden("formats/matlab.txt", outcomes(tmp_path, "*.mat", mappings | {"cells": ("time=t,fibres=v",)}))
 
 
-def test_import_hdf5_reads_columns_of_tables_and_frames(tmp_path: Path) -> None:
+def outcomes(folder: Path, pattern: str, mappings: Mapping[str, Sequence[str]]) -> str:
+    """Return what is read of the files in a folder by their mappings, or without one."""
+    lines = []
+    for path in sorted(folder.glob(pattern)):
+        for mapping in mappings.get(path.stem, ("",)):
+            lines += [f"-- {path.name} {mapping}", outcome(path, mapping)]
+    return "\n".join(lines)
+
+
+def test_what_is_said_of_hdf5_files(golden: Golden, tmp_path: Path) -> None:
+    """Columns of tables, frames along either axis, and commands as indices or as times."""
+    begin = np.flatnonzero(np.diff(PRESSED, prepend=0) == 1)
     with h5py.File(tmp_path / "lab.h5", "w") as file:
         kinds = [("t", "f8"), *((f"c{i}", "f4" if i else "f8") for i in range(4)), ("on", "u1")]
-        records = np.array([tuple(row) for row in MATRIX], kinds)
-        file["log/table"] = records
-        file["data"], file["t_ns"] = MATRIX, (TIMES * 1e9).astype(np.int64)
-        file["frames"] = VOLTS.reshape(N, 2, 2)
-        file["last"] = np.moveaxis(VOLTS.reshape(N, 2, 2), 0, -1)
-    path = tmp_path / "lab.h5"
-    tabled = import_hdf5(path, "time=log/table/t,fibres=log/table/c*,press=log/table/on")
-    np.testing.assert_allclose(tabled.readings, VOLTS, rtol=1e-6)
-    check(import_hdf5(path, "time=/data[0],fibres=/data[1:5]"))
-    check(import_hdf5(path, "time=t_ns:ns,fibres=frames"))
-    check(import_hdf5(path, "time=t_ns:1e-9,fibres=last"))
-    check(import_hdf5(path, "rate=20,fibres=frames"))
+        file["log/table"] = np.array([tuple(row) for row in MATRIX], kinds)
+        file["data"], file["t_ns"], file["note"] = MATRIX, (TIMES * 1e9).astype(np.int64), "bench 2"
+        file["frames"], file["last"] = VOLTS.reshape(N, 2, 2), np.moveaxis(VOLTS.reshape(N, 2, 2), 0, -1)
+        file["tenths_of_mv"], file["xy"] = (1e4 * VOLTS.T).round().astype(np.int16), SPOTS[begin] / 10
+        file["on"], file["off"] = begin, begin + 12
+        file["on_ms"], file["off_ms"] = 50 * begin, 50 * begin + 600
+    with h5py.File(tmp_path / "other.h5", "w") as file:
+        file["x"] = np.arange(3)
+    pressed = "time=/t_ns:ns,fibres=/tenths_of_mv:1e-4,positions=/xy:cm,down_command=/on{0},up_command=off{0}"
+    mappings = (
+        "",
+        "time=log/table/t,fibres=log/table/c*,press=log/table/on",
+        "time=/data[0],fibres=/data[1:5]",
+        "time=t_ns:ns,fibres=frames",
+        "time=t_ns:1e-9,fibres=last",
+        "rate=20,fibres=frames",
+        pressed.format(""),
+        pressed.format("_ms:ms"),
+        "time=t_ns:ns,fibres=note",
+    )
+    golden("formats/hdf5.txt", outcomes(tmp_path, "*.h5", {"lab": mappings}))
 
 
 @pytest.mark.parametrize("kind", ["csv", "h5", "mat", "mat73", "mcap"])
@@ -373,61 +463,55 @@ def test_import_bag_holds_late_poses_and_spreads_bursts(tmp_path: Path) -> None:
     np.testing.assert_allclose(recording.presses_mm[3], [-10, 10], atol=0.1)
 
 
-@pytest.mark.parametrize("separator", [",", "\t"])
-def test_import_csv_reads_numbers_with_names_before_and_units_behind_them(tmp_path: Path, separator: str) -> None:
-    named = [
-        separator.join(f"{n}:{v}" for n, v in zip(["t", "c0", "c1", "c2", "c3"], row.split(","), strict=True))
-        for row in rows()
-    ]
-    check(load(tmp_path, table("", named)))
-    measured = [
-        f"{1000 * t:.1f} ms,{','.join(f'{1000 * volt:.1f}mV' for volt in row)}"
-        for t, row in zip(TIMES, VOLTS, strict=True)
-    ]
-    check(load(tmp_path, table(lines=measured)))
-    mixed = [row.replace("mV", " V") if i % 2 else row for i, row in enumerate(measured)]
-    with pytest.raises(InputError, match=r"line 3: column 'c0' holds no number but '.* V'"):
-        load(tmp_path, table(lines=mixed))
-
-
-def test_import_bag_reads_fields_of_messages(tmp_path: Path) -> None:
-    messages = []
-    for i in range(N):
-        place = make("Pose", make("Point", *SPOTS[i] / 1000, 0.0), make("Quaternion", *VOLTS[i]))
-        messages.append(("/all", TIMES[i], place))
-    path = write_bag(tmp_path / "bag", messages)
-    with pytest.raises(InputError, match=r"fibres is '/all' of .*name one of its fields as /all.FIELD: 'position.x'"):
-        import_bag(path, "fibres=/all")
-    mapping = ",".join(f"fibres=/all.orientation.{axis}" for axis in "xyzw")
-    recording = import_bag(path, f"{mapping},positions=/all.position")
-    check(recording)
-    np.testing.assert_allclose(recording.presses_mm[4], [0, 5], atol=1e-9)
-    with pytest.raises(InputError, match=r"'position\.q' is no field"):
-        import_bag(path, "fibres=/all.position.q")
-
-
-def test_import_bag_finds_a_position_below_other_fields(tmp_path: Path) -> None:
+def test_what_is_said_of_bags(golden: Golden, tmp_path: Path) -> None:
+    """Fields of messages, a position below other fields, several numbers for one, and lengths that change."""
     still = make("TwistWithCovariance", make("Twist", *[make("Vector3", 0.0, 0.0, 0.0)] * 2), np.zeros(36))
-    messages = []
-    for i in range(N):
-        place = make("Pose", make("Point", *SPOTS[i] / 1000, 0.0), make("Quaternion", 0.0, 0.0, 0.0, 1.0))
-        odometry = make("Odometry", header(), "base", make("PoseWithCovariance", place, np.zeros(36)), still)
-        messages += [("/odom", TIMES[i], odometry), ("/skin", TIMES[i], array("Float64MultiArray", VOLTS[i]))]
-    recording = import_bag(write_bag(tmp_path / "bag", messages), "fibres=/skin,positions=/odom")
-    check(recording)
-    np.testing.assert_allclose(recording.presses_mm[4], [0, 5], atol=1e-9)
-
-
-def test_import_bag_refuses_several_numbers_for_one(tmp_path: Path) -> None:
     channels = [make("ChannelFloat32", "c", np.ones(n, np.float32)) for n in (2, 3)]
-    topics = {"/f": array("Float64MultiArray", np.ones(2)), "/cloud": make("PointCloud", header(), [], channels)}
-    path = write_bag(tmp_path / "bag", [(name, i / 20, topics[name]) for i in range(9) for name in topics])
-    with pytest.raises(InputError, match=r"depth is '/f' of .*MultiArray', name one .* /f.FIELD: .*'data'"):
-        import_bag(path, "fibres=/f.data,depth=/f")
-    with pytest.raises(InputError, match=r"fibres is '/cloud' of .*, name one of its fields as /cloud.FIELD: 'header"):
-        import_bag(path, "fibres=/cloud")
+    numbers: dict[str, list[Any]] = {"some": [array("Float64MultiArray", np.ones(2))] * 9}
+    numbers["lengths"] = [numbers["some"][0], array("Float64MultiArray", np.ones(3))]
+    numbers["none"] = [numbers["some"][0], array("Float64MultiArray", np.ones(0))]
+    messages: dict[str, list[Any]] = {
+        name: [("/f", i / 20, m) for i, m in enumerate(each)] for name, each in numbers.items()
+    }
+    messages["some"] += [
+        ("/cloud", 0.0, make("PointCloud", header(), [], channels)),
+        ("/words", 0.0, make("String", "a")),
+    ]
+    messages["some"] += [("/never", 0.2, make("Bool", False)), ("/before", 0.0, make("Bool", True))]
+    messages["some"] += [("/before", 0.01, make("Bool", False))]
+    messages["poses"], messages["odometry"] = [], []
+    for time, volts, spot in zip(TIMES, VOLTS, SPOTS / 1000, strict=True):
+        messages["poses"].append(("/all", time, make("Pose", make("Point", *spot, 0.0), make("Quaternion", *volts))))
+        place = make("Pose", make("Point", *spot, 0.0), make("Quaternion", 0.0, 0.0, 0.0, 1.0))
+        odometry = make("Odometry", header(), "base", make("PoseWithCovariance", place, np.zeros(36)), still)
+        messages["odometry"] += [("/odom", time, odometry), ("/skin", time, array("Float64MultiArray", volts))]
+    messages["lab"] = list(lab())
+    for name, each in messages.items():
+        write_bag(tmp_path / f"{name} bag", each).rename(tmp_path / f"{name}.mcap")
+    axes = ",".join(f"fibres=/all.orientation.{axis}" for axis in "xyzw")
+    mappings = {
+        "poses": ("fibres=/all", f"{axes},positions=/all.position", "fibres=/all.position.q"),
+        "odometry": ("fibres=/skin,positions=/odom",),
+        "some": (
+            *("fibres=/f.data,depth=/f", "fibres=/cloud", "fibres=/words", "fibres=/nowhere"),
+            *("fibres=/f,press=/never", "fibres=/f,press=/before", ""),
+        ),
+        **dict.fromkeys(("lengths", "none"), ("fibres=/f",)),
+        "lab": (LAB_COLUMNS, "fibres=/skin/?:0.01,press=/down,x=/at/x:mm,y=/at/y", "fibres=/camera"),
+    }
+    golden("formats/bags.txt", outcomes(tmp_path, "*.mcap", mappings))
 
 
 def test_import_bag_reads_bags_of_ros_1(tmp_path: Path) -> None:
     bag = write_ros1_bag(tmp_path / "lab.bag", "/skin", TIMES + 1.7e9, VOLTS)
     check(import_bag(bag, "fibres=/skin"))
+
+
+def test_import_mat_reads_the_published_recording(published: Path) -> None:
+    recording = import_file(published / "para5_long_first4500.mat")
+    content = scipy.io.loadmat(published / "para5_long_first4500.mat")
+    assert np.array_equal(recording.readings, content["voltage"])
+    assert np.array_equal(recording.presses_mm, content["pos"].T)
+    assert np.array_equal(recording.times_s, content["tim"].ravel())
+    assert recording.down_command[:3].tolist() == [20, 60, 100]
+    assert recording.up_command[:3].tolist() == [40, 80, 120]

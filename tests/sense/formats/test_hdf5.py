@@ -2,7 +2,6 @@
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import h5py
 import numpy as np
@@ -36,53 +35,6 @@ def test_export_hdf5_round_trip_is_reproducible(tmp_path: Path, eight: Recording
         assert (tmp_path / "a.h5").read_bytes() == (tmp_path / "b.h5").read_bytes()
         with h5py.File(tmp_path / "a.h5") as file:
             assert set(file) - {"times_s", "readings_v", "presses_mm", "down_command", "up_command"} == measures
-
-
-def test_import_hdf5_refuses_other_files(tmp_path: Path) -> None:
-    with h5py.File(tmp_path / "other.h5", "w") as file:
-        file["x"] = np.arange(3)
-    assert "format is None" in refusal_of(tmp_path / "other.h5")
-    assert "cannot be read" in refusal_of(tmp_path / "absent.h5")
-
-
-def lab(folder: Path, **changes: np.ndarray | None) -> dict[str, Any]:
-    """Write a foreign file; a change to None leaves a dataset out."""
-    content: dict[str, Any] = {
-        "t": np.arange(40.0) * 100,
-        "data/volts": np.random.default_rng(0).integers(900, 1100, (3, 40)).astype(np.int16),
-        "xy": np.array([[1.0, 2], [-3, 4]]),
-        "on": np.array([10, 25]),
-        "off": np.array([20, 35]),
-    } | changes
-    with h5py.File(folder / "lab.h5", "w") as file:
-        for name, values in content.items():
-            if values is not None:
-                file[name] = values
-        file["note"] = "bench 2"
-    return content
-
-
-def test_import_hdf5_by_columns(tmp_path: Path) -> None:
-    content = lab(tmp_path)
-    mapping = "time=/t:ms,fibres=/data/volts:mV,positions=/xy:cm,down_command=/on,up_command=off"
-    recording = import_hdf5(tmp_path / "lab.h5", mapping)
-    assert np.array_equal(recording.times_s, content["t"] * 1e-3)
-    assert np.array_equal(recording.readings, content["data/volts"].T * 1e-3)
-    assert recording.presses_mm.tolist() == [[10, 20], [-30, 40]]
-    assert (recording.down_command.tolist(), recording.up_command.tolist()) == ([10, 25], [20, 35])
-    names = {"fibre_names": [f"data/volts[{i}]" for i in range(len(content["data/volts"]))]}
-    assert recording.source == {"kind": "hdf5", "file": "lab.h5", "columns": mapping, **names}
-    lab(tmp_path, on=content["t"][content["on"]], off=content["t"][content["off"]])
-    assert import_hdf5(tmp_path / "lab.h5", mapping.replace("/on", "/on:ms").replace("off", "/off:ms")) == recording
-    channels = {f"data/ch{i}": np.full_like(content["t"], i, dtype=float) for i in range(1, 13)}
-    lab(tmp_path, **{"data/volts": None}, **channels)
-    wide = import_hdf5(tmp_path / "lab.h5", mapping.replace("volts:mV", "ch*"))
-    assert wide.readings[0].tolist() == list(range(1, 13))  # HDF5 lists ch10 before ch2
-    assert wide.fibre_names[1] == "data/ch2"
-    lab(tmp_path)
-    present = "there are 'data/volts', 'note', 'off', 'on', 't', 'xy'"
-    assert f"(--columns) say what other datasets hold, {present}" in refusal_of(tmp_path / "lab.h5")
-    assert "note holds object values" in refusal_of(tmp_path / "lab.h5", "time=t,fibres=note")
 
 
 @pytest.mark.parametrize("kind", ["external link", "soft link", "virtual", "external storage"])

@@ -6,10 +6,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scipy.stats import norm
 
 from padforge.sense.cli.live import EventPrinter, view_lines
-from padforge.sense.formats.ros_messages import TOUCHES
 from padforge.sense.health.fault_detector import FibreFault
 from padforge.sense.live.outputs import Message, MessageBuilder
 from padforge.sense.live.pipeline import Estimate, Event, OtherPad
@@ -59,21 +57,6 @@ def test_lines_over_tcp(golden: Golden, mirrored: bool) -> None:
             line["msg"]["pose"]["covariance"] = {at: value for at, value in enumerate(covariance) if value}
     chosen = [line for line in lines if not mirrored or "pose" in line["msg"]]
     golden(f"live/lines{'_mirrored' * mirrored}.txt", "\n".join(map(json.dumps, chosen)))
-
-
-def test_touches_lie_below_the_surface_in_a_right_handed_frame() -> None:
-    """In m, with variances in m^2. From above, y of the plan runs up and x to the right, or to the left if mirrored."""
-    for mirrored in (False, True):
-        for message in (each for each in messages(mirrored) if each.topic == TOUCHES):
-            pad, pose = message.pad, message.msg["pose"]
-            position, covariance = pose["pose"]["position"], np.reshape(pose["covariance"], (6, 6))
-            z_axis = np.cross([-1 if mirrored else 1, 0, 0], [0, 1, 0])
-            above = np.array([pad["x_mm"], pad["y_mm"], np.dot([0, 0, -pad.get("depth_mm", 0)], z_axis)])
-            assert list(position.values()) == pytest.approx(above / 1000)
-            std_z_mm = pad.get("depth_r90_mm", np.nan) / norm.ppf(0.95)
-            variances = (np.array([pad["std_x_mm"], pad["std_y_mm"], std_z_mm]) / 1000) ** 2
-            assert np.diag(covariance)[:3] == pytest.approx(np.nan_to_num(variances, nan=-1), rel=1e-4)
-            assert not (covariance - np.diag(np.diag(covariance))).any()
 
 
 def test_lines_on_a_terminal(golden: Golden, capsys: pytest.CaptureFixture[str]) -> None:

@@ -60,7 +60,10 @@ def sensor(model: Path) -> Iterator[PadSensor]:
     sensor.close()
 
 
-def test_sensor_reads_what_the_pipeline_says(boards, sensor: PadSensor, few: Recording, localizer) -> None:
+@pytest.mark.parametrize("is_held", [False, True])
+def test_sensor_reads_what_the_pipeline_says(boards, sensor: PadSensor, few: Recording, localizer, is_held) -> None:
+    """Of the last press, or of the one under way."""
+    end = boards[0].end = int(few.up_command[1]) - 1 if is_held else len(few.readings)
     with pytest.raises(InputError, match="the pad is not connected"):
         sensor.read()
     sensor.connect()
@@ -70,29 +73,19 @@ def test_sensor_reads_what_the_pipeline_says(boards, sensor: PadSensor, few: Rec
     values = sensor.read()
     assert tuple(values) == sensor.names
     pipeline = Live(localizer, rate_hz=few.rate_hz)
-    pipeline.feed(few.times_s, few.readings)
+    pipeline.feed(few.times_s[:end], few.readings[:end])
     latest = pipeline.presses[-1]
-    assert latest.press >= PRESSES - 1
-    expected = {"pressed": float(pipeline.pressed), "valid": 1.0, "x_mm": latest.x_mm, "y_mm": latest.y_mm}
-    expected |= {f"fibre_{i}_v": volts for i, volts in enumerate(few.readings[-1])}
+    assert (pipeline.pressed, latest.final) == (is_held, not is_held)
+    assert latest.press == 1 if is_held else latest.press >= PRESSES - 1
+    expected = {"pressed": float(is_held), "valid": 1.0} | {
+        name: getattr(latest, name) for name in ("x_mm", "y_mm", "r90_mm")
+    }
+    expected |= {f"fibre_{i}_v": volts for i, volts in enumerate(few.readings[end - 1])}
     assert {name: values[name] for name in expected} == pytest.approx(expected)
     sensor.close()
     assert boards[0].is_closed
     sensor.connect()  # again, to a pad that has not been pressed
     assert [sensor.read()[name] for name in ("pressed", "valid", "x_mm", "r90_mm")] == [0, 0, 0, 0]
-
-
-def test_sensor_reads_where_the_press_under_way_is(boards, sensor: PadSensor, few: Recording, localizer) -> None:
-    end = boards[0].end = int(few.up_command[1]) - 1
-    sensor.connect()
-    values, pipeline = sensor.read(), Live(localizer, rate_hz=few.rate_hz)
-    pipeline.feed(few.times_s[:end], few.readings[:end])
-    latest = pipeline.presses[-1]
-    assert (pipeline.pressed, latest.press, latest.final) == (True, 1, False)
-    assert [values[name] for name in ("pressed", "valid")] == [1, 1]
-    assert [values[name] for name in ("x_mm", "y_mm", "r90_mm")] == pytest.approx(
-        [latest.x_mm, latest.y_mm, latest.r90_mm]
-    )
 
 
 def read_for(sensor: PadSensor, duration_s: float) -> None:

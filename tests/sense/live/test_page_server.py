@@ -97,18 +97,6 @@ def test_server_refuses_other_paths_and_other_host_names(page, monkeypatch) -> N
             socket.create_connection(("127.0.0.2", port_of(page)), timeout=5)
 
 
-def test_every_browser_gets_the_latest_view(page: LivePage) -> None:
-    page.show(VIEW)
-    with pytest.raises(ValueError, match="JSON"):
-        page.show({"swing": float("nan")})
-    with events_of(page) as first, events_of(page) as second:
-        assert next(first) == next(second) == VIEW
-        page.show(VIEW | {"pressed": False})
-        assert next(first) == next(second) == VIEW | {"pressed": False}
-    with events_of(page) as again:
-        assert next(again) == VIEW | {"pressed": False}
-
-
 def test_slow_browser_skips_views_and_delays_nobody(page: LivePage) -> None:
     page.show({"at": 0})
     with events_of(page) as messages:

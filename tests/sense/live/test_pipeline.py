@@ -209,21 +209,6 @@ def test_a_tap_that_its_release_shows_is_estimated_from_then_on(recording, hasty
     assert_as_a_whole(part, hasty, events)
 
 
-def test_radii_shrink_as_a_press_goes_on(recording, localizer) -> None:
-    _, events = replay(first_presses(recording, 6), localizer)
-    by_moment = {
-        (since, readings): np.mean([e.r90_mm for e in events if (e.since, e.readings) == (since, readings)])
-        for since, readings in (("touch", 3), ("touch", 20), ("lift", RELEASE))
-    }
-    first, settled, last = by_moment.values()
-    assert first > settled > last
-    inside = [
-        np.hypot(e.x_mm - recording.presses_mm[e.press, 0], e.y_mm - recording.presses_mm[e.press, 1]) < e.r90_mm
-        for e in events
-    ]
-    assert np.mean(inside) > 0.7  # at any moment
-
-
 def test_live_handles_a_press_that_is_held_for_hours(recording, hasty, monkeypatch) -> None:
     """So long that old readings are dropped for the second time within the press."""
     history, slack, held = 120, 40, 2
@@ -286,25 +271,6 @@ def test_live_without_readings_says_anywhere(recording, hasty) -> None:
         assert (estimate.x_mm, estimate.y_mm) == pytest.approx(tuple(scaler.origin_mm))
         assert estimate.r90_mm > scaler.scale_mm
     assert live.view()["fibres"] == [{"swing": None, "state": "missing"}] * 4
-
-
-def test_view_follows_the_pad(recording, hasty, monkeypatch) -> None:
-    part = first_presses(recording, 3)
-    monkeypatch.setattr("padforge.sense.live.pipeline.PressDetector", ScriptedDetector(part))
-    live = Live(hasty, rate_hz=part.rate_hz)
-    missing = [{"swing": None, "state": "missing"}] * 4
-    assert live.view() == {"pressed": False, "fibres": missing, "presses": [], "track": [], "faults": []}
-    down, up = int(part.down_command[0]) + 15, int(part.up_command[0]) + 18
-    swings = []
-    for first, end in ((0, 15), (15, down), (down, up)):
-        live.feed(part.times_s[first:end], part.readings[first:end])
-        swings.append(max(abs(fibre["swing"]) for fibre in live.view()["fibres"]))
-        assert live.pressed == (end == down)
-    assert swings[0] < 0.1 < 0.3 < swings[1]
-    assert swings[2] < 0.75 * swings[1]  # what remains of a press is half of it
-    (press,) = live.view()["presses"]
-    assert press["moment_text"] == f"{press['since_s']:.2f} s after the lift"
-    assert press["text"].endswith(f" mm at 90 % ({press['moment_text']})")
 
 
 def test_faults_wait_while_the_pad_is_taken_for_another(recording, hasty, monkeypatch) -> None:

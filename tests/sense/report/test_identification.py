@@ -10,8 +10,6 @@ from unittest.mock import Mock
 import numpy as np
 import pytest
 
-from padforge.common.plotting import FAINT, HORIZONTAL, VERTICAL
-from padforge.design.paths.curves import flatten
 from padforge.design.settings import Contact
 from padforge.sense.report import identification as report
 from padforge.sense.report.identification import identification_lines, identification_sections, identify_into
@@ -82,55 +80,3 @@ def test_lines_state_the_side_with_regard_to_the_rig(mirrored: bool, rig_mirrore
     document |= {"doubts": [], "frame": frame}
     document |= {} if rig_mirrored is None else {"rig_mirrored": rig_mirrored}
     assert any(line.startswith(f"the pad lay {side}") for line in identification_lines(document, Path()))
-
-
-def test_document_and_responses_are_those_of_the_fit(
-    identification: Identification, identify: Callable[..., Identified]
-) -> None:
-    """Millivolts on one scale a channel; offsets to the left of a fibre as it runs, along x or y."""
-    document, (responses, _) = identify()
-    held_out, built = identification.held_out, identification.fit.pad
-    assert (document["presses"], document["held_out"]) == (len(identification.training), len(held_out))
-    assert set(map(tuple, identification.training.positions_mm)).isdisjoint(map(tuple, held_out.positions_mm))
-    predicted = built.predict(held_out.positions_mm)
-    residual = ((held_out.volts - predicted) ** 2).sum(axis=0)
-    spread = ((held_out.volts - held_out.volts.mean(axis=0)) ** 2).sum(axis=0)
-    assert [row["explained"] for row in document["channels"]] == pytest.approx((1 - residual / spread).tolist())
-    assert document["explained"] == pytest.approx((1 - residual / spread).mean())
-    panels = np.array([axes for axes in responses.axes if axes.get_label() != "<colorbar>"]).reshape(-1, 3)
-    assert len(panels) == len(identification.live) == 4
-    for row, axes in enumerate(panels):
-        measured_mv, predicted_mv = 1e3 * held_out.volts[:, row], 1e3 * predicted[:, row]
-        drawn = [each.collections[0] for each in axes]
-        for dots, values in zip(drawn, (measured_mv, predicted_mv, measured_mv - predicted_mv), strict=True):
-            np.testing.assert_allclose(dots.get_array(), values)
-            np.testing.assert_allclose(dots.get_offsets(), held_out.positions_mm)
-        assert len({dots.get_clim() for dots in drawn}) == 1
-    for row, (offset, std, within) in enumerate(identification.lateral_offsets_mm()):
-        fibre = built.fibres[row]
-        shift_mm = identification.pad.unit_mm * (built.path(row)[0] - built.plan.paths[fibre])
-        tangent = built.plan.tangents[fibre]
-        normal = np.column_stack([-tangent[:, 1], tangent[:, 0]])
-        np.testing.assert_allclose(offset, (shift_mm * normal).sum(axis=1), atol=1e-12)
-        entry = document["channels"][row]
-        assert entry["lateral_offset_mm"] == pytest.approx(np.sqrt((offset[within] ** 2).mean()))
-        assert entry["lateral_offset_std_mm"] == pytest.approx(std[within].mean())
-
-
-def test_plan_is_drawn_grey_under_the_fibres_as_built(
-    identification: Identification, identify: Callable[..., Identified]
-) -> None:
-    _, (_, figure) = identify()
-    plan, offsets = figure.axes
-    pad, built = identification.pad, identification.fit.pad
-    grey, coloured = ([line for line in plan.lines if (line.get_color() == FAINT) == is_plan] for is_plan in (1, 0))
-    for line, points in zip(grey, flatten(pad, 1e-3), strict=True):
-        np.testing.assert_allclose(line.get_xydata(), pad.to_mm(points))
-    colours = [(HORIZONTAL, VERTICAL)[pad.layout.family(fibre)] for fibre in built.fibres]
-    assert [line.get_color() for line in coloured] == colours
-    for row, line in enumerate(coloured):
-        np.testing.assert_allclose(line.get_xydata(), pad.to_mm(built.path(row)[0]))
-    presses = plan.collections[0].get_offsets()
-    np.testing.assert_allclose(presses, built.transform.to_plan(identification.training.positions_mm))
-    for line, (offset, _, within) in zip(offsets.lines, identification.lateral_offsets_mm(), strict=False):
-        np.testing.assert_allclose(line.get_ydata(), np.where(within, offset, np.nan))

@@ -11,14 +11,14 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from padforge.design import Contact, Morphology, press_forces_n
+from padforge.design import Contact, Morphology
 from padforge.design.settings import Scatter
 from padforge.sense import Recording
-from padforge.sense.studies.drift import AS_PUBLISHED, COMPENSATIONS, FILTERS, drift_study
+from padforge.sense.studies.drift import COMPENSATIONS, FILTERS, drift_study
 from padforge.sense.studies.fibre_loss import FibreLoss, MethodErrors, draw_fibre_loss, fibre_loss_lines
 from padforge.sense.studies.indentation import SETS, force_study, shape_study
 from padforge.sense.studies.learning_curve import LearningCurve, draw_learning_curve, learning_curve_lines
-from padforge.sense.studies.multicontact import COUNTING, METHODS, multicontact_study
+from padforge.sense.studies.multicontact import METHODS, multicontact_study
 from padforge.sense.studies.press_model import PressModel
 from padforge.sense.studies.robustness import SIDE, robustness_study
 from padforge.sense.studies.scaling import scaling_study
@@ -231,91 +231,3 @@ def test_error_map_has_rows_upwards() -> None:
     image = draw_error_map(axes, [[1.0, 2.0], [3.0, 4.0]], "", 9.0, (0.0, 20.0, -5.0, 5.0))
     assert (image.origin, list(image.get_extent()), image.get_clim()) == ("lower", [0, 20, -5, 5], (0, 9))
     assert image.get_array().tolist() == [[1.0, 2.0], [3.0, 4.0]]
-
-
-def row_of(name: str, **values: Any) -> dict[str, Any]:
-    """The row of a study with such values."""
-    study, states = STUDIES[name]()
-    (row,) = (row for row in study.conclude(states).rows if values.items() <= row.items())
-    return row
-
-
-def numbers(row: dict[str, Any], *names: str) -> list[float]:
-    return [row[name] for name in names]
-
-
-UNIT_MM = PADS["square"].unit_mm
-
-
-def test_rows_of_drift() -> None:
-    """Of errors 1, 2, 9 and 2, 3, 13 mm of two networks, and 4, 6 and 5, 9 of the last presses, and so much more."""
-    row = row_of("drift", recording="built", filter=AS_PUBLISHED, compensation="published")
-    more, more_last = 2 + 3 / 4, 2 + 3 / 2
-    assert numbers(row, "mean_mm", "median_mm", "p95_mm") == pytest.approx(np.array([5, 2.5, 12]) + more)
-    assert numbers(row, "std_mm", "mean_last_mm", "std_last_mm") == pytest.approx([1, 6 + more_last, 1])
-    assert row["seconds_per_10000"] == 2.25
-    study, states = drift()
-    (idle,) = (part for part in study.conclude(states).extra["idle"] if part["kind"] == "contact model")
-    # Fibre i, a straight line, is touched by presses within 0.6 units of it, of those over one unit.
-    assert idle["idle_percent"] == pytest.approx(100 * (1 - 0.6), abs=1.5)
-
-
-def test_rows_of_force() -> None:
-    """The deepest press is predicted to be as deep as presses are at most."""
-    row, depth = row_of("force", noise_counts=1.0), np.array([1.0, 1.5, 2.0, 3.0, 4.5, 5.0])
-    positions_mm = numbers(row, "position_mm", "position_depth_known_mm", "position_one_depth_mm")
-    assert positions_mm == pytest.approx(UNIT_MM * np.array([0.15, 0.1, 0.05]))
-    predicted = np.minimum(1.1 * depth, 5.0)
-    force, predicted_n, middle_n = (press_forces_n(np.atleast_1d(each)) for each in (depth, predicted, 3.0))
-    assert numbers(row, "depth_mm", "depth_guessed_mm") == pytest.approx([(predicted - depth).mean(), 8 / 6])
-    error_n, guess_n, range_n = (predicted_n - force).mean(), np.abs(middle_n - force).mean(), force[-1] - force[0]
-    expected = [error_n, 100 * error_n / range_n, 100 * guess_n / range_n]
-    assert numbers(row, "force_n", "force_percent", "force_guessed_percent") == pytest.approx(expected)
-
-
-def test_rows_of_shape() -> None:
-    for kind, shapes in SETS.items():
-        row, count = row_of("shape", pad="square", shapes=kind), len(shapes)
-        assert (row["worst"], row["worst_percent"]) == (shapes[1], 25)
-        assert row["accuracy_percent"] == pytest.approx(100 * (4 * count - 3) / (4 * count))
-        assert numbers(row, "position_mm", "position_shape_known_mm") == pytest.approx([UNIT_MM / 2, UNIT_MM / 4])
-
-
-def test_rows_of_multicontact() -> None:
-    """The midpoint for both is never resolved; a shift by a tenth of a unit in x and y is so beyond 0.57 units."""
-    labelled, ordered, free = (row_of("multicontact", method=method) for method in list(METHODS)[:3])
-    assert numbers(labelled, "error_mm", "midpoint_error_mm") == pytest.approx([0.55 * UNIT_MM] * 2)
-    assert (labelled["resolution_mm"], free["error_mm"], free["of_fixed_labels"]) == (None, 0, 0)
-    assert ordered["error_grid"] == pytest.approx(0.1 * np.sqrt(2))
-    assert ordered["of_fixed_labels"] == pytest.approx(0.1 * np.sqrt(2) / 0.55)
-    assert 0.56 < ordered["resolution_mm"] / UNIT_MM < 0.7
-    counted = row_of("multicontact", method=COUNTING)
-    assert numbers(counted, "accuracy_percent", "majority_percent") == pytest.approx([100 * 19 / 25, 100 * 9 / 25])
-
-
-def test_rows_of_strokes() -> None:
-    """The first two of ten readings do not count."""
-    for number, speed in enumerate(SPEEDS_MM_S):
-        row, errors = row_of("strokes", pad="square", speed_mm_s=speed), (number + 1) * (2 - np.arange(2, 10) / 10)
-        expected = [errors.mean(), number + 1, number + 1.5]
-        assert numbers(row, "mean_mm", "ratio", "lifted_mm") == pytest.approx(expected)
-        assert row["within_r90"] == np.mean([errors - 0.5 < 4, errors + 0.5 < 4])
-
-
-def test_rows_of_scaling() -> None:
-    """The seventh task, whose errors are up to 3 in 16, as often above as below the middle."""
-    row = row_of("scaling", pad="square", grid=4, method="published")
-    assert numbers(row, "mean", "median", "p95") == pytest.approx([1.5 / 16, 1.5 / 16, 2.55 / 16], rel=0.02)
-    assert numbers(row, "percent_of_side", "epochs", "seconds") == pytest.approx([100 * 1.5 / 16 / 4, 13, 8.5])
-    study, states = scaling()
-    (errors, *_) = (np.array(panel["errors"]) for panel in study.conclude(states).extra["maps"])
-    assert (np.diff(errors, axis=1) > 1.5 * np.diff(errors, axis=0).max()).all()  # along rows is x
-
-
-def test_rows_of_sensitivity() -> None:
-    """Trained with the second object and tested with the third one, whose radius is greater."""
-    study = STUDIES["sensitivity"]()[0].settings
-    trained = {"trained_tool_radius_mm": study["tool_radius_mm"][1], "trained_depth_mm": study["depth_mm"][0]}
-    tested = {"tool_radius_mm": study["tool_radius_mm"][2], "depth_mm": study["depth_mm"][0]}
-    row = row_of("sensitivity", pad="square", **trained, **tested)
-    assert numbers(row, "mean", "std", "mean_mm") == pytest.approx([2.35, 0.25, 2.35 * UNIT_MM])

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from padforge.common.validation import InputError
 from padforge.sense import Recording
 from padforge.sense.settings import LocalizerSettings as Options
-from padforge.sense.studies.learning_curve import LearningCurve, fit_power_law, learning_curve, power_law
+from padforge.sense.studies.learning_curve import fit_power_law, learning_curve, power_law
 from tests.helpers.door import called
 from tests.helpers.golden import Golden, json_text
 
@@ -47,23 +47,6 @@ def quick() -> Iterator[None]:
         patched.setattr("padforge.sense.studies.learning_curve.RESAMPLINGS", 20)
         patched.setattr("padforge.sense.localizer.response_model.RBF_SIDE", 7)
         yield
-
-
-@pytest.fixture(scope="module")
-def curve(recording: Recording) -> LearningCurve:
-    return learning_curve(recording, QUICK)
-
-
-def test_learning_curve_forecasts_twice_as_many_presses(curve: LearningCurve) -> None:
-    assert [point["presses"] for point in curve.points] == [16, 32, 64, 128, 255]
-    assert all(0.02 < point["standard_error_mm"] / point["mean_mm"] < 0.2 for point in curve.points)
-    forecast = curve.forecast
-    assert forecast["presses"] == 510
-    assert 0 < forecast["low_mm"] <= forecast["mean_mm"] <= forecast["high_mm"]
-    assert forecast["high_mm"] <= curve.points[-1]["mean_mm"] + 1e-9
-    assert "255 more training presses" in curve.advice
-    assert (curve.settings["members"], curve.test_presses) == (1, 45)
-    json.dumps(curve.to_dict(), allow_nan=False)
 
 
 class Trained:

@@ -13,17 +13,15 @@ import pytest
 from matplotlib.figure import Figure
 
 from padforge import InputError
-from padforge.cli import main
 from padforge.design import Contact, Morphology, PadSettings, SearchSettings, contact
 from padforge.design.optimize.search import SearchResult
 from padforge.design.settings import PUBLISHED_CONTACT, Layout
-from padforge.sense.localizer import evaluation
-from padforge.sense.localizer.moments import MOMENTS
 from padforge.sense.settings import LocalizerSettings, RigSettings
 from padforge.sense.simulation.pad_model import ADC_STEPS
 from padforge.sense.simulation.simulated_recording import simulate
-from padforge.sense.studies import drift, indentation, scaling
+from padforge.sense.studies import drift, indentation
 from padforge.sense.studies.multicontact import multicontact_study
+from padforge.sense.studies.scaling import scaling_study
 from padforge.sense.studies.strokes import strokes_study
 from padforge.sense.studies.study import (
     Sizes,
@@ -36,9 +34,21 @@ from padforge.sense.studies.study import (
     read_counts,
     run,
 )
-from tests.helpers.door import refused
+from tests.helpers.door import called, refused
 
 PADS = {"square": Morphology.straight(2)}
+
+
+SMALLER = {
+    "drift.MEMBERS": 2,
+    "drift.EPOCHS": 2,
+    "drift.FILTERS": {each: drift.FILTERS[each] for each in (drift.RAW, drift.AS_PUBLISHED)},
+    "indentation.FORCE_NOISES": (1.0,),
+    "indentation.TOOLS": ("dome", "flat"),
+    "indentation.SETS": {"tools": ("dome", "flat")},
+    "scaling.TEST": 50,
+    "scaling.EPOCHS": 8,
+}
 TINY = LocalizerSettings(members=1, hidden=8, layers=1, epochs=1, batch=16, max_failures=0)
 SMALLEST: dict[str, Callable[[], Study]] = {
     "drift": lambda: drift.drift_study({}, {"real": simulate(PADS["square"], RigSettings(presses=40, seed=3))}),
@@ -46,31 +56,19 @@ SMALLEST: dict[str, Callable[[], Study]] = {
     "shape": lambda: indentation.shape_study(PADS, sizes=Sizes(100, 60, hidden=4, epochs=3)),
     "multicontact": lambda: multicontact_study(PADS, sizes=Sizes(100, 60, hidden=5, members=2, epochs=3)),
     "strokes": lambda: strokes_study(PADS, presses=40, strokes=3, options=TINY),
-    "scaling": lambda: scaling.scaling_study(PADS, grids=(2, 4), side=16),
+    "scaling": lambda: scaling_study(PADS, grids=(2, 4), side=16),
 }
 """Those of robustness and of sensitivity are as small in the tests of their results."""
-
-SMALLER: dict[object, dict[str, object]] = {
-    drift: {
-        **{"MEMBERS": 2, "HIDDEN": 4, "EPOCHS": 2, "RIG": RigSettings(drift_mv=300, presses=40)},
-        "FILTERS": {each: drift.FILTERS[each] for each in (drift.RAW, drift.AS_PUBLISHED)},
-    },
-    contact: {"DEPTH_STEPS": 4},
-    evaluation: {"MOMENTS": MOMENTS[-1:]},
-    indentation: {"FORCE_NOISES": (1.0,), "TOOLS": ("dome", "flat"), "SETS": {"tools": ("dome", "flat")}},
-    scaling: {"HIDDEN": 12, "TEST": 50, "EPOCHS": 8},
-}
 
 
 @pytest.mark.parametrize("name", SMALLEST)
 @pytest.mark.usefixtures("blank")
 def test_every_study_concludes_from_its_tasks(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    for module, sizes in SMALLER.items():
-        for size, value in sizes.items():
-            monkeypatch.setattr(module, size, value)
-    document = run(SMALLEST[name](), tmp_path, jobs=1)
-    assert document["format"] == f"padforge-study-{name}/1"
-    assert np.isfinite([value for row in document["rows"] for value in row.values() if isinstance(value, float)]).all()
+    monkeypatch.setattr(contact, "DEPTH_STEPS", 4)
+    for constant, value in SMALLER.items():
+        monkeypatch.setattr(f"padforge.sense.studies.{constant}", value)
+    rows = run(SMALLEST[name](), tmp_path, jobs=1)["rows"]
+    assert np.isfinite([value for row in rows for value in row.values() if isinstance(value, float)]).all()
 
 
 def test_networks_see_no_test_presses() -> None:
@@ -147,11 +145,7 @@ def test_study_takes_contact_scatter_and_pads_from_the_settings(
     layer = "[contact]\ndepth_mm = 3\n[search]\nscatter = 0.1\n[pad]\ngrid = 3\npitch_mm = 8\n"
     for path, text in (("layer.toml", layer), ("paper.toml", "")):
         (tmp_path / path).write_text(text)
-        command = ["study", name, "square", "--spec", str(tmp_path / path), "--out", str(tmp_path)]
-        monkeypatch.setattr(sys, "argv", ["padforge", *command])
-        with pytest.raises(SystemExit) as caught:
-            main()
-        assert not caught.value.code
+        assert called("study", name, "square", "--spec", path, "--out", "out", cwd=tmp_path).code == 0
     layer_settings, paper_settings = (study.settings for study in studies)
     assert (layer_settings["contact"]["model"], layer_settings["contact"]["depth_mm"]) == ("layer", 3)
     assert layer_settings["scatter"] == {"floor": 0.02, "share": 0.1, "common": 0.36}
