@@ -501,7 +501,7 @@ class SearchSettings(Settings):
         default="descent", description="gradients of the expected error, or the genetic search as published"
     )
     knots: int = Field(default=21, ge=1, le=64, description="inner knots per fibre (N); the rules take 3 a turn")
-    starts: int = Field(default=4, ge=1, le=10_000, description="random starts of the gradient search")
+    starts: int = Field(default=2, ge=1, le=10_000, description="random starts of the gradient search")
     steps: Steps = Field(
         default=None, description="steps of a start of the gradient search, by its contact: 1200, of a shape 3000"
     )

@@ -36,7 +36,7 @@ GENTLE = Schedule(0.02, 2, (1.6, 530.0))
 with two or three failures.
 """
 STRICT = Schedule(0.04, 4, (5.0, 1600.0))
-"""Schedule of every fourth start, which begins nearly straight. Zigzags may tangle so that some rules stay broken, such
+"""Schedule of every second start, which begins nearly straight. Zigzags may tangle so that some rules stay broken, such
 as the one on crossing angles.
 """
 COMMON_TRACKS_FROM = 0.7
@@ -179,7 +179,7 @@ def border_width(pad: PadSettings, rules: RulesSettings) -> float:
 
 def is_strict(start: int) -> bool:
     """Return whether a start follows the schedule STRICT."""
-    return start % 4 == 3
+    return start % 2 == 1
 
 
 def initial_paths(

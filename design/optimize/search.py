@@ -2,15 +2,14 @@
 
 Each start is a chain of slices, each of which takes a state of plain arrays and returns the next one. Slices run on any
 `concurrent.futures` executor, here or on a cluster. Between slices a start can be logged, saved or stopped, which does
-not change its result. Half-way the better half of the starts is continued, a round of successive halving (Jamieson and
-Talwalkar, AISTATS 2016).
+not change its result.
 """
 
 import math
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Executor
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
@@ -30,7 +29,7 @@ from padforge.design.morphology import Array, Morphology
 from padforge.design.objectives.expected_error import straight_full_scale
 from padforge.design.objectives.rules import Violation
 from padforge.design.objectives.score import ScoredPad, terms_of
-from padforge.design.optimize.gradient import HISTORY_STEPS, GradientSearch, is_strict
+from padforge.design.optimize.gradient import GradientSearch
 from padforge.design.optimize.problem import SearchProblem, build_problem
 from padforge.design.paths.keep_outs import straight_paths
 from padforge.design.settings import Contact, Layout, PadSettings, RulesSettings, SearchSettings
@@ -41,7 +40,6 @@ if TYPE_CHECKING:
 
 SLICE_STEPS = {"descent": 20, "genetic": 2}  # steps or generations of a slice, by method: about a third of a second
 SLICE_S = 1.0  # time after which a slice ends early, so that a time budget is kept even if steps are slow
-MIN_STARTS = 2  # minimum number of starts that are continued after half of the steps
 GRACE_S = 10.0
 """Time after a deadline for running slices to end. One takes a second or so, but an executor may hang."""
 LAYOUT_KEYS = ("grid", "horizontals", "verticals", "pitch_mm", "size_mm")
@@ -135,12 +133,8 @@ def search(
     profiling.add_count("starts", len(problem.starts) - n_finished, len(problem.starts))
     with profiling.stage("search"), stop_on_interrupt(stop):
         _ = problem.straight_errors  # cached in the problem before it is pickled: else every slice computes them
-        starts, half_way = [*problem.starts], problem.steps // 2 // HISTORY_STEPS * HISTORY_STEPS
-        if len(starts) > MIN_STARTS and half_way:
-            _advance(problem, starts, half_way, states, stop, run, checkpoints)
-            starts = starts if stop else better_half({start: states[start]["history"] for start in starts}, half_way)
-        _advance(problem, starts, problem.steps, states, stop, run, checkpoints)
-        pads = _finish_starts(problem, {start: states[start] for start in starts if start in states}, stop)
+        _advance(problem, states, stop, run, checkpoints)
+        pads = _finish_starts(problem, states, stop)
     with profiling.stage("check and score"):
         straight = Candidate("straight fibres", _straight_pad(problem, stop), problem)
         candidates = [Candidate(name, morphology, problem) for name, morphology in pads]
@@ -228,14 +222,11 @@ def stop_on_interrupt(stop: Stop) -> Iterator[None]:
         signal.signal(signal.SIGINT, before)
 
 
-def _run_slice(problem: SearchProblem, start: int, last_step: int, state: State | None) -> tuple[State, int, float]:
-    """Run the next slice of a start, from its beginning if `state` is None, and return its state, step and objective.
-
-    The slice ends at `last_step` at the latest, unless that is the end of the search, after which it repairs.
-    """
+def _run_slice(problem: SearchProblem, start: int, state: State | None) -> tuple[State, int, float]:
+    """Run the next slice of a start, from its beginning without a `state`; return its state, step and objective."""
     run, until = _open_start(problem, start, state), time.perf_counter() + SLICE_S
     for _ in range(SLICE_STEPS[problem.search.method]):
-        if run.done or run.step == last_step < problem.steps:
+        if run.done:
             break
         run.advance()
         if time.perf_counter() > until:
@@ -260,48 +251,18 @@ def _open_start(problem: SearchProblem, start: int, state: State | None) -> "Gra
     return GradientSearch(problem, start, state)
 
 
-def better_half(histories: Mapping[int, Array], half_way: int) -> list[int]:
-    """Return the starts of lower objective up to the step `half_way`, in order, among them the best strict one.
-
-    A strict start may keep rules that the others break in the end. Histories are (n, 2), of step and objective. Starts
-    are compared by the geometric mean of their last 30 entries; over fewer, noise outweighs their differences.
-    """
-    log_means = {
-        start: np.nan_to_num(np.log(history[history[:, 0] <= half_way][-30:, 1]).mean(), nan=np.inf)
-        for start, history in histories.items()
-    }
-    ranked = sorted(log_means, key=lambda start: log_means[start])
-    better, strict = ranked[: max(len(ranked) // 2, MIN_STARTS)], [*filter(is_strict, ranked)]
-    if strict and strict[0] not in better:
-        better[-1] = strict[0]
-    return sorted(better)
-
-
 def _advance(
-    problem: SearchProblem,
-    starts: Iterable[int],
-    last_step: int,
-    states: dict[int, State],
-    stop: Stop,
-    run: SearchOptions,
-    checkpoints: Checkpoints | None,
+    problem: SearchProblem, states: dict[int, State], stop: Stop, run: SearchOptions, checkpoints: Checkpoints | None
 ) -> None:
-    """Advance `starts` slice by slice to `last_step`, or until `stop`; after the last step of all, until repaired.
-
-    `states` is updated.
-    """
+    """Advance all starts slice by slice until their pads are repaired, or until `stop`; `states` is updated."""
 
     def next_slice(start: int, state: State | None) -> Callable[[], tuple[State, int, float]] | None:
         """Return the next slice of a start as a function, or None if there is none."""
-        if stop:
+        if stop or (state is not None and state["done"]):
             return None
-        if state is not None:
-            step = state["history"][-1, 0] if len(state["history"]) else 0
-            if state["done"] or step >= last_step < problem.steps:
-                return None
-        return partial(_run_slice, problem, start, last_step, state)
+        return partial(_run_slice, problem, start, state)
 
-    slices = ((start, task) for start in starts if (task := next_slice(start, states.get(start))))
+    slices = ((start, task) for start in problem.starts if (task := next_slice(start, states.get(start))))
     results = run_tasks(
         slices,
         run.executor,

@@ -88,12 +88,12 @@ def test_initial_paths_from_an_origin_are_it_and_near_it():
     assert 0 < np.abs(straight[:4, :, 1] - np.arange(1, 5)[:, None]).max() < 1
 
 
-def test_every_fourth_start_is_nearly_straight_the_others_zigzags():
+def test_every_second_start_is_nearly_straight_the_others_zigzags():
     """The former within a tenth of a grid unit or so, and clear of the slopes without a gradient of straight ones."""
     size, rng = PadSettings(), np.random.default_rng(0)
-    paths = [initial_paths(size, RulesSettings(), 21, None, start, rng) for start in range(8)]
+    paths = [initial_paths(size, RulesSettings(), 21, None, start, rng) for start in range(4)]
     offsets = [np.abs(each[:4, :, 1] - np.arange(1, 5)[:, None]) for each in paths]
-    assert [each.max() < 0.5 for each in offsets] == 2 * [False, False, False, True]
+    assert [each.max() < 0.5 for each in offsets] == 2 * [False, True]
     assert all((each[:, 1:-1] > 0).all() for each in offsets if each.max() < 0.5)
 
 

@@ -15,7 +15,7 @@ from padforge.design.objectives.rules import check_rules
 from padforge.design.objectives.score import ScoredPad, describe_terms, score
 from padforge.design.optimize.gradient import GENTLE
 from padforge.design.optimize.problem import build_problem
-from padforge.design.optimize.search import SearchOptions, better_half, choose, search, search_for_twin
+from padforge.design.optimize.search import SearchOptions, choose, search, search_for_twin
 from padforge.design.paths.curves import refine
 from padforge.design.published.networks import localisation_error
 from padforge.design.settings import PUBLISHED_CONTACT, PadSettings, RulesSettings, SearchSettings
@@ -130,15 +130,6 @@ def test_search_of_a_bent_pad_obeys_the_rules_on_the_cylinder(monkeypatch):
     assert check_rules(origin, rules, pad) != []
     result = search(pad, None, QUICK, rules, origin=origin)
     assert check_rules(result.morphology, rules, pad) == result.violations == []
-
-
-def test_better_half_compares_the_last_objectives_before_a_step():
-    low, high = np.array([[10, 3.0], [20, 1.0], [30, 9.0]]), np.array([[10, 2.0], [20, 2.0], [30, 0.1]])
-    histories = {0: low, 1: high, 2: high * [1.0, 2.0], 4: low * [1.0, np.nan]}
-    assert better_half(histories, 30) == [1, 2]
-    assert better_half(histories, 20) == [0, 1]
-    assert better_half(histories | {3: high * [1.0, 9.0]}, 30) == [1, 3]  # a strict start goes on
-    assert better_half(dict.fromkeys(range(8), low), 30) == [0, 1, 2, 3]
 
 
 def test_search_reports_rules_that_cannot_hold(monkeypatch):

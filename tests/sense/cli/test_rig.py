@@ -18,6 +18,7 @@ from padforge.design import Contact, Morphology
 from padforge.fabricate import MouldSettings, build
 from padforge.fabricate.settings import DEFAULTS
 from padforge.sense import Recording
+from padforge.sense.formats import ros_recording
 from padforge.sense.formats.ros_recording import import_bag
 from padforge.sense.live import outputs
 from padforge.sense.rig import operation
@@ -72,6 +73,7 @@ def test_record_writes_an_mcap_file_as_export_does(padforge_sense, monkeypatch: 
     assert padforge_sense("export", "rec", "same/rec.mcap")[0] == 0
     assert Path("same/rec.mcap").read_bytes() == Path("rec.mcap").read_bytes()
     monkeypatch.setitem(sys.modules, "rosbags.typesys", None)
+    ros_recording._typestore.cache_clear()
     code, _, err = padforge_sense("record", "--presses", "4", "--mcap", "--out", "other")
     assert (code, err) == (2, "padforge: other.mcap: MCAP needs rosbags: pip install 'padforge[formats]'\n")
     assert not Path("other").exists()
