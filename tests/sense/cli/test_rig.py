@@ -2,9 +2,10 @@
 
 import json
 import os
-import sys
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from functools import partial
+from importlib import import_module
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -18,7 +19,6 @@ from padforge.design import Contact, Morphology
 from padforge.fabricate import MouldSettings, build
 from padforge.fabricate.settings import DEFAULTS
 from padforge.sense import Recording
-from padforge.sense.formats import ros_recording
 from padforge.sense.formats.ros_recording import import_bag
 from padforge.sense.live import outputs
 from padforge.sense.rig import operation
@@ -72,8 +72,7 @@ def test_record_writes_an_mcap_file_as_export_does(padforge_sense, monkeypatch: 
     Path("same").mkdir()
     assert padforge_sense("export", "rec", "same/rec.mcap")[0] == 0
     assert Path("same/rec.mcap").read_bytes() == Path("rec.mcap").read_bytes()
-    monkeypatch.setitem(sys.modules, "rosbags.typesys", None)
-    ros_recording._typestore.cache_clear()
+    monkeypatch.setattr(f"{import_bag.__module__}._typestore", partial(import_module, "rosbags.missing"))
     code, _, err = padforge_sense("record", "--presses", "4", "--mcap", "--out", "other")
     assert (code, err) == (2, "padforge: other.mcap: MCAP needs rosbags: pip install 'padforge[formats]'\n")
     assert not Path("other").exists()
