@@ -270,8 +270,8 @@ class WorkerProcess:
             self._latest = state
             self._update(state)
             self._new_state.set()
-            known = {name: getattr(state, name) for name in ARM_STATE}
-            self._send({"state": known | {"moving": self._is_moving()}})
+            stated = {name: getattr(state, name) for name in ARM_STATE}
+            self._send({"state": stated | {"moving": self._is_moving()}})
             try:
                 state = reader.read(STREAM_TIMEOUT_S)
             except TimeoutError:
