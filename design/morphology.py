@@ -283,7 +283,7 @@ class Morphology:
         Args:
             positions: shape (..., 2), grid units.
         """
-        return (np.asarray(positions, dtype=np.float64) - np.array(self.layout.extent) / 2) * self.unit_mm
+        return (_check_positions("positions", positions) - np.array(self.layout.extent) / 2) * self.unit_mm
 
     def to_grid(self, positions_mm: ArrayLike) -> Array:
         """Convert mm from the pad's centre to grid units.
@@ -291,7 +291,16 @@ class Morphology:
         Args:
             positions_mm: shape (..., 2), mm.
         """
-        return np.asarray(positions_mm, dtype=np.float64) / self.unit_mm + np.array(self.layout.extent) / 2
+        return _check_positions("positions_mm", positions_mm) / self.unit_mm + np.array(self.layout.extent) / 2
+
+
+def _check_positions(name: str, values: ArrayLike) -> Array:
+    positions = check_array(name, values, MAX_COORDINATE)
+    if positions.shape == (0,):
+        return positions.reshape(0, 2)
+    if positions.shape[-1:] != (2,):
+        raise InputError(f"{name} have shape {positions.shape}, expected (..., 2)")
+    return positions
 
 
 def _check_knot_count(layout: Layout, knots: int) -> int:

@@ -23,7 +23,7 @@ from padforge.common import profiling
 from padforge.common.parallel import Checkpoints, State, run_tasks
 from padforge.common.progress import OnProgress, ignore_progress
 from padforge.common.settings import Spec, or_default
-from padforge.common.validation import InputError
+from padforge.common.validation import InputError, check_float, check_path, check_type, short_repr
 from padforge.design.contact_comparison import errors_by_contact
 from padforge.design.morphology import Array, Morphology
 from padforge.design.objectives.expected_error import straight_full_scale
@@ -66,6 +66,17 @@ class SearchOptions:
     resume: bool = False
     time_budget: float | None = None
     executor: Executor | None = None
+
+    def __post_init__(self) -> None:
+        if not callable(self.on_progress):
+            raise InputError(f"on_progress is {short_repr(self.on_progress)}, expected a function")
+        if self.keep_in is not None:
+            object.__setattr__(self, "keep_in", check_path("keep_in", self.keep_in))
+        check_type("resume", self.resume, bool)
+        if self.time_budget is not None:
+            object.__setattr__(self, "time_budget", check_float("time_budget", self.time_budget, 0, 1e9))
+        if self.executor is not None:
+            check_type("executor", self.executor, Executor)
 
 
 @dataclass(frozen=True)
@@ -125,7 +136,7 @@ def search(
     pad, settings = or_default("pad", pad, PadSettings), or_default("settings", settings, SearchSettings)
     contact = or_default("contact", contact, Contact, settings.default_contact)
     problem = build_problem(pad, contact, settings, or_default("rules", rules, RulesSettings), origin)
-    run = run or SearchOptions()
+    run = SearchOptions() if run is None else check_type("run", run, SearchOptions)
     checkpoints = Checkpoints(run.keep_in, problem.settings()) if run.keep_in else None
     states = checkpoints.begin(run.resume) if checkpoints else {}
     stop = Stop(begin, run.time_budget)

@@ -24,6 +24,7 @@ def test_positions_convert_both_ways_and_knots_are_separate_and_read_only():
     assert pad.to_mm(np.array(pad.layout.extent) / 2) == pytest.approx([0, 0])
     assert pad.to_mm([[0, 0], pad.layout.extent]) == pytest.approx(np.array([[-12, -30], [12, 30]]))
     assert pad.to_grid(pad.to_mm([[1.0, 4.0]])) == pytest.approx(np.array([[1.0, 4.0]]))
+    assert pad.to_mm([]).shape == pad.to_grid([]).shape == (0, 2)
     with pytest.raises(ValueError, match="read-only"):
         Morphology.straight(2).knots[0, 0, 0] = 1
     heaped = Morphology(assemble_knots(np.full((2, 4, 2), 2.0))).knots

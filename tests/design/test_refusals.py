@@ -90,6 +90,10 @@ VALUES: dict[str, Callable[[], object]] = {
     "failed fibres": lambda: design.localisation_error(PAD, n_failed=(-1,)),
     "an origin of other fibres": lambda: design.search(PadSettings(grid=2), origin=Morphology.straight(3)),
     "a population": lambda: design.search(settings=SearchSettings(method="genetic", population=100_000)),
+    "a time budget": lambda: design.SearchOptions(time_budget=-1),
+    "a report of progress": lambda: design.SearchOptions("start 1"),  # pyright: ignore[reportArgumentType]
+    "options of a search": lambda: design.search(run={"resume": True}),  # pyright: ignore[reportArgumentType]
+    "positions": lambda: PAD.to_mm([1.0, 2.0, 3.0]),
 }
 
 
