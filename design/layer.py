@@ -99,9 +99,9 @@ class LayerPress:
         r = np.asarray(r_mm, dtype=float)
         min_depth_mm = 0.01 * min(self.thickness_mm, self.contact_radius_mm)
         height_mm = min(height_mm, self.thickness_mm - min_depth_mm)
-        k, weight, load = self._waves(height_mm, r.max(initial=0.0), blur_mm)
+        k, weight, pressure = self._waves(height_mm, r.max(initial=0.0), blur_mm)
         _, outward = _transfer(self.base, k, height_mm, self.thickness_mm)
-        amplitude = weight * load * outward * np.exp(-((k * blur_mm) ** 2) / 2)
+        amplitude = weight * pressure * outward * np.exp(-((k * blur_mm) ** 2) / 2)
         compressive = _bessel(0, r, k) @ (k * amplitude)
         hoop = np.where(r > 0, _bessel(1, r, k) @ amplitude / np.where(r > 0, r, 1), compressive / 2)
         return Strains(compressive, compressive - hoop, hoop)
@@ -151,7 +151,7 @@ def solve_press(
         unit, shape = solve(a)
         return float(shape.sum() - depth_mm * unit.sum())
 
-    # the contact radius is between Hertz's and, for a thin layer, twice that
+    # the contact radius is between Hertz's and, for a thin layer, twice that; the bracket has slack
     hertz = math.sqrt(radius_mm * depth_mm)
     tool_limit = radius_mm if tool == "flat" else radius_mm * (1 - 1e-6) if tool == "ball" else math.inf
     upper = min(3 * hertz, tool_limit, MAX_CONTACT * thickness_mm)
@@ -172,7 +172,10 @@ def solve_press(
 def _solve_phi(
     tool: Tool, radius: float, a: float, thickness: float, base: Base, compliance: float
 ) -> tuple[Array, Array]:
-    """Return the Legendre coefficients (TERMS,) of phi on [0, a], by Galerkin's method for 1 and for f(x)."""
+    """Return the Legendre coefficients (TERMS,) of phi on [0, a], by Galerkin's method for 1 and for f(x).
+
+    The phi of a press is that for 1, times its depth, less that for f(x).
+    """
     nodes, weights = _gauss(400)
     x = a * nodes
     k, correction = _thickness_correction(base, thickness, 2 * a)

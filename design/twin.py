@@ -56,9 +56,9 @@ class PlanTransform:
 
     def to_plan(self, positions_mm: Array) -> Array:
         """Transform positions (Q, 2) of the arm to the plan, both in mm from the middle."""
-        return self.scale * self.rotate(positions_mm) + self.shift_mm
+        return self.scale * self.turned(positions_mm) + self.shift_mm
 
-    def rotate(self, positions_mm: Array) -> Array:
+    def turned(self, positions_mm: Array) -> Array:
         """Mirror and rotate positions (Q, 2) of the arm, mm."""
         cos, sin = np.cos(np.radians(self.turn_deg)), np.sin(np.radians(self.turn_deg))
         mirrored = positions_mm * ([-1.0, 1.0] if self.mirrored else [1.0, 1.0])
@@ -315,9 +315,9 @@ def _cut(path: Array, sensitivity: Array | None) -> tuple[Array, Array, Array]:
     """Return the middles (n, 2), lengths times sensitivity (n,) and unit tangents (n, 2) of a path's elements."""
     step = np.diff(path, axis=0)
     size = np.hypot(*step.T)
-    parts = np.maximum(np.ceil(size / MAX_ELEMENT_LENGTH), 1).astype(int)
-    piece = np.repeat(np.arange(len(parts)), parts)
-    share = (np.arange(len(piece)) - np.repeat(np.cumsum(parts) - parts, parts) + 0.5) / parts[piece]
+    counts = np.maximum(np.ceil(size / MAX_ELEMENT_LENGTH), 1).astype(int)
+    piece = np.repeat(np.arange(len(counts)), counts)
+    share = (np.arange(len(piece)) - np.repeat(np.cumsum(counts) - counts, counts) + 0.5) / counts[piece]
     tangents = step / np.maximum(size, 1e-12)[:, None]
     weighted = size if sensitivity is None else sensitivity * size
-    return path[piece] + share[:, None] * step[piece], (weighted / parts)[piece], tangents[piece]
+    return path[piece] + share[:, None] * step[piece], (weighted / counts)[piece], tangents[piece]

@@ -1,7 +1,8 @@
 """Building a mould and writing its files: meshes, CAD, drawings, G-code, laying page and fabrication document.
 
 The same inputs give the same bytes. Everything is built and checked before the first file is written, and the files
-appear together or not at all. A new export format needs a writer and a line in `FORMATS`.
+appear together or not at all; a failed check is reported and stops nothing, but for a body that is no closed solid. A
+new export format needs a writer and a line in `FORMATS`; a CAD format shares the checks of "step" in `build`, too.
 """
 
 import logging
@@ -78,7 +79,7 @@ class Fabrication:
 
 @dataclass(frozen=True, kw_only=True)
 class Build:
-    """A mould that was written, with everything that a lab needs to print it, to cast, and to cut and place fibres.
+    """A mould with everything that a lab needs to print it, to cast, and to cut and place fibres.
 
     Attributes:
         files: names of the exported files.

@@ -60,7 +60,7 @@ def cylinder(x: float, y: float, diameter_mm: float, sides: int = 64) -> shapely
 
 
 def _tray(outline: BaseGeometry, hollows: Iterable[BaseGeometry], floor: float, depth: float, flare: float = 0) -> Body:
-    """Build an open tray with rectangular hollows of a depth, whose walls lean outwards by `flare` in all."""
+    """Build an open tray with rectangular hollows of a depth; walls lean outwards by `flare` from floor to rim."""
     rim, flare_per_mm = floor + depth, flare / depth
     cuts = tuple(Prism(hollow, floor, rim + 1, flare + flare_per_mm) for hollow in hollows)  # to 1 mm above the rim
     return Body((Prism(outline, 0, rim),), cuts)
@@ -75,7 +75,8 @@ def mould_body(plan: Plan, wells: Sequence[BaseGeometry] = ()) -> Body:
     """Build the mould of a compensated plan: tray, ridges with wells if any, exits, numbers, pillars and pins."""
     ridges = []
     for layer, top_outline in enumerate(plan.ridges):
-        ridges += ridge_prisms(plan, plan.layer_fibres(layer), top_outline | wells[layer] if wells else top_outline)
+        with_wells = (top_outline | wells[layer]) if wells else top_outline
+        ridges += ridge_prisms(plan, plan.layer_fibres(layer), with_wells)
     tray = tray_body(plan)
     return replace(tray, adds=(*ridges, *(number for number in number_prisms(plan) if number), *tray.adds))
 
@@ -108,7 +109,7 @@ def number_prisms(plan: Plan) -> list[Prism | None]:
     """Build the number of every fibre; None if it does not fit; [] if numbers are disabled."""
     floor = plan.settings.mould.floor_mm
     top = floor + plan.settings.mould.shallow_ridge_height_mm
-    return [number and Prism(number, floor - INTO_FLOOR_MM, top) for number in plan.numbers]
+    return [Prism(number, floor - INTO_FLOOR_MM, top) if number else None for number in plan.numbers]
 
 
 def registration_pins(plan: Plan) -> list[Prism]:
@@ -191,7 +192,8 @@ def lid_body(plan: Plan) -> Body:
 
 def lid_holes(plan: Plan) -> int:
     """Return the number of holes through the lid: vents, holes for the pins, and the spout."""
-    return 4 + 3 * plan.settings.mould.pins + plan.settings.mould.spout
+    mould = plan.settings.mould
+    return 4 + (3 if mould.pins else 0) + (1 if mould.spout else 0)
 
 
 def _free_position(plan: Plan, wanted: Position, diameter_mm: float) -> Position:
@@ -221,8 +223,8 @@ def holder_body(plan: Plan) -> Body:
     through = mould.wall_mm + mould.exit_mm + plan.flare_mm + 1
     slots = []
     for lead in (lead for pair in plan.leads.pairs for lead in pair):
-        middle_mm = plan.leads.edge_mm(lead) * lead.outward[lead.axis]
-        x_min, y_min, x_max, y_max = plan.leads.box_at_edge(lead, half, -middle_mm, through).bounds
+        to_middle_mm = plan.leads.edge_mm(lead) * lead.outward[lead.axis]
+        x_min, y_min, x_max, y_max = plan.leads.box_at_edge(lead, half, -to_middle_mm, through).bounds
         slots.append(shapely.box(-x_max, y_min, -x_min, y_max))
     _, y_min, x_max, _ = plan.tray.bounds
     marked = plan.tray - shapely.Polygon([(x_max, y_min), (x_max - cut, y_min), (x_max, y_min + cut)])

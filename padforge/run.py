@@ -94,15 +94,15 @@ class _StageCache:
     def __init__(self, run: Run) -> None:
         """Read the record of an earlier run, or delete it if the run is not resumed."""
         self.reused: list[str] = []
-        self._run, self._note = run, run.out / NAME
+        self._run, self._path = run, run.out / NAME
         self._stages: dict[str, dict[str, Any]] = {}
-        if run.resume and self._note.exists():
-            with reraise_as_input_error(self._note):
-                for stage, entry in dict(read_json(self._note, FORMAT)["stages"]).items():
+        if run.resume and self._path.exists():
+            with reraise_as_input_error(self._path):
+                for stage, entry in dict(read_json(self._path, FORMAT)["stages"]).items():
                     files = {str(name): digest for name, digest in dict(entry["files"]).items()}
                     self._stages[stage] = {"cache_key": entry["cache_key"], "files": files}
         if not self._stages:  # results of an earlier run will be replaced
-            self._note.unlink(missing_ok=True)
+            self._path.unlink(missing_ok=True)
 
     def get(
         self,
@@ -133,13 +133,13 @@ class _StageCache:
             self.reused.append(stage)
             return load()
 
-        def note(result: Result) -> None:
+        def record(result: Result) -> None:
             if digests := self._digests(files(result)):
                 self._stages[stage] = {"cache_key": key, "files": digests}
-                write_json(self._note, {"format": FORMAT, "stages": self._stages})
+                write_json(self._path, {"format": FORMAT, "stages": self._stages})
 
-        result = compute(note)
-        note(result)
+        result = compute(record)
+        record(result)
         return result
 
     def _digests(self, names: Iterable[str]) -> dict[str, str]:
@@ -234,12 +234,12 @@ def run_stages(
 
     spec, out, seed, cache = run.spec, run.out, {"seed": run.seed}, _StageCache(run)
 
-    def search(note: "Callable[[SearchResult], None]") -> "SearchResult":
+    def search(record: "Callable[[SearchResult], None]") -> "SearchResult":
         with search_progress() as on_progress:
             options = SearchOptions(on_progress, resume=run.resume, time_budget=run.remaining_s(SEARCH_SHARE))
-            return run_design(spec, out, seed, None, options, None, note, _regenerated_files(), run.force)[1]
+            return run_design(spec, out, seed, None, options, None, record, _regenerated_files(), run.force)[1]
 
-    def calibrate(note: object) -> dict[str, Any]:
+    def calibrate(_: object) -> dict[str, Any]:
         options, budget = _read_localizer(spec, run.seed), run.remaining_s(reserve_s=RESERVE_S)
         if budget == 0:
             reason = "nothing of it remains for the training; continue with --resume and more"
@@ -267,7 +267,7 @@ def run_stages(
     mould = cache.get(
         "mould",
         lambda document: ["fabrication.json", *document["sha256"]],
-        lambda note: build(pad, out, run.formats, settings, source).to_dict(),
+        lambda _: build(pad, out, run.formats, settings, source).to_dict(),
         partial(read_document, "fabrication.json"),
         pad=digest,
         formats=sorted(run.formats),
@@ -277,8 +277,8 @@ def run_stages(
     plan = spec.section(RigSettings).plan_file
     recording = cache.get(
         "recording",
-        lambda recording: ["recording"],
-        lambda note: record_simulated(spec, pad, out / "recording", seed, source, replacing=True),
+        lambda _: ["recording"],
+        lambda _: record_simulated(spec, pad, out / "recording", seed, source, replacing=True),
         lambda: Recording.open(out / "recording"),
         pad=digest,
         plan=plan and sha256(plan),
@@ -286,14 +286,14 @@ def run_stages(
     on_line(f"sense: {len(recording.presses_mm)} presses on the simulated rig -> {out / 'recording'}")
     contacts = cache.get(
         "contacts",
-        lambda document: ["contacts.json"],
-        lambda note: compare_contacts(spec, pad, out, run.seed),
+        lambda _: ["contacts.json"],
+        lambda _: compare_contacts(spec, pad, out, run.seed),
         partial(read_document, "contacts.json"),
         pad=digest,
     )
     calibration = cache.get(
         "calibration",
-        lambda document: ["calibration.json", *FILES],
+        lambda _: FILES,
         calibrate,
         partial(read_document, "calibration.json"),
         recording=recording.digest,

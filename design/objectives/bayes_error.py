@@ -11,7 +11,7 @@ At a position p of the responses x_p, the reading x' is normal with the mean x_p
 
 The estimate is the mean of the posterior over all positions, with the likelihood N(x'; x_p, S_p) and a uniform prior.
 No other localizer has a smaller mean squared error; a network trained on many presses errs LEARNING times as much. A
-search minimises a differentiable approximation (`expected_error`); the error computed here includes every confusion.
+search minimises a differentiable approximation (`criterion`); the error computed here includes every confusion.
 """
 
 import math
@@ -23,7 +23,7 @@ from threadpoolctl import threadpool_limits
 
 from padforge.design.contact import relative_stretch
 from padforge.design.morphology import Array, Morphology
-from padforge.design.objectives.expected_error import evaluation_windows, scatter_of_full_scale, straight_full_scale
+from padforge.design.objectives.criterion import evaluation_windows, scatter_of_full_scale, straight_full_scale
 from padforge.design.objectives.fibre_loss import failure_masks, failure_shares
 from padforge.design.paths.keep_outs import is_outside
 from padforge.design.settings import Contact, PadSettings, Rectangle, Scatter, SearchSettings

@@ -20,7 +20,7 @@ from padforge.design.contact import fibre_axes, serpentine_presses, signals
 from padforge.design.morphology import Array, Morphology
 from padforge.design.objectives.ambiguity import AMBIGUITY_NOISE, ambiguities
 from padforge.design.objectives.bayes_error import expected_errors
-from padforge.design.objectives.expected_error import SEARCH_SIDE
+from padforge.design.objectives.criterion import SEARCH_SIDE
 from padforge.design.objectives.penalties import PER_SPAN, check_comparisons, penalties
 from padforge.design.published import objective as formula
 from padforge.design.settings import PUBLISHED_CONTACT, Contact, PadSettings, RulesSettings, Scatter, SearchSettings

@@ -12,7 +12,7 @@ import numpy as np
 
 from padforge.common.parallel import State
 from padforge.design.morphology import MARGIN, Array, Morphology, assemble_knots, fibre_ends, split_axes
-from padforge.design.objectives import expected_error as objective
+from padforge.design.objectives import criterion as objective
 from padforge.design.objectives.fibre_loss import failure_shares, sample_failures
 from padforge.design.objectives.penalties import penalties
 from padforge.design.objectives.score import weighted_terms
@@ -427,11 +427,12 @@ class GradientSearch:
         scale: float,
         scatter: Scatter,
     ) -> tuple[Array, Differentiate]:
-        """Return the expected errors (L,) under a contact, and the function from a gradient by them to (3, F, n).
+        """Return the criterion (L,) under a contact, and the function from a gradient by them to (3, F, n).
 
         The response of a fibre is its relative stretch in full scales, signal / (scale * length).
         """
-        (length, grad_length), weights = curves.lengths(), objective.kernel_weights(self.problem.pad.layout)
+        length, grad_length = curves.lengths()
+        weights = objective.kernel_weights(self.problem.pad.layout)
         per_signal, positions = 1 / (scale * length[:, None]), presses.positions
         if len(presses.far):
             near, far = (
@@ -440,7 +441,7 @@ class GradientSearch:
             positions = presses.with_partners(objective.confusable(near, far, masks))
         signals, differentiate_signals = curves.signals(positions, contact)
         responses = per_signal * signals
-        errors, error_gradients = objective.expected_error(
+        errors, error_gradients = objective.criterion(
             responses, positions, presses.step, presses.free, masks, scatter, weights
         )
 

@@ -10,7 +10,7 @@ from padforge.common.validation import MAX_VALUES, InputError, check_type
 from padforge.design.contact_set import served_contacts
 from padforge.design.morphology import Array, Morphology
 from padforge.design.objectives.ambiguity import free_presses
-from padforge.design.objectives.expected_error import criterion_errors, relative_error
+from padforge.design.objectives.criterion import criterion_errors, relative_error
 from padforge.design.objectives.fibre_loss import failure_shares
 from padforge.design.objectives.rules import Violation, check_rules
 from padforge.design.objectives.score import ScoredPad, weighted_terms

@@ -26,7 +26,7 @@ from padforge.common.settings import Spec, or_default
 from padforge.common.validation import InputError, check_float, check_path, check_type, short_repr
 from padforge.design.contact_comparison import errors_by_contact
 from padforge.design.morphology import Array, Morphology
-from padforge.design.objectives.expected_error import straight_full_scale
+from padforge.design.objectives.criterion import straight_full_scale
 from padforge.design.objectives.rules import Violation
 from padforge.design.objectives.score import ScoredPad, terms_of
 from padforge.design.optimize.gradient import GradientSearch

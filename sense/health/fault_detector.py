@@ -66,7 +66,7 @@ class FibreFault:
     since: int  # estimated index of the first bad press
     fibres: tuple[int, ...]  # indices of the fibres; two if they are swapped, most of a misfit
     kind: str  # a key of `TEXTS`
-    score: float  # a healthy pad looks like this once in 10 ** score presses; at most 99, which is certain
+    score: float  # a healthy pad shows any such fault once in 10 ** score presses; at most 99, which is certain
 
     @property
     def is_masked(self) -> bool:
@@ -244,7 +244,7 @@ class FaultMonitor:
         hypothesis = int(neg_log_p[fibre].argmax())
         since = int(onset[fibre, hypothesis])
         kind = wiring.kind if wiring else self._classify(fibre, hypothesis, since)
-        score = min(float(largest[fibre] / np.log(10)), MAX_SCORE)
+        score = min(float((largest[fibre] - np.log(len(HYPOTHESES))) / np.log(10)), MAX_SCORE)
         # 5. The faulty fibres are masked, and the sums of the others computed without them.
         self._failed[list(fibres)] = True
         self._replay(first, self._failed)

@@ -225,6 +225,8 @@ class ExceedanceModel:
     def fit(cls, llrs: Sequence[tuple[Array, Array]]) -> "ExceedanceModel":
         """Fit to the ratios (Q, C, H), continuing and onset, of successive healthy presses, by the number of failures.
 
+        Those of several sets of failed fibres follow one another; the sums run on from one to the next.
+
         The slope is the mean excess of the highest tenth of the peaks, at least 1, that of exact likelihoods (A. Wald).
         The level is so high that the highest peak occurs at least once in Q presses.
         """

@@ -72,13 +72,13 @@ class BayesianLocalizer:
         # 1. Grids: the table, the linearization and the posterior, from fine to coarse
         grid = grid_positions(side)
         step, coarse = float(grid[1, 0, 0] - grid[0, 0, 0]), grid[::COARSENING, ::COARSENING]
-        fine = (slice(None, None, LINEARIZED),) * 2
+        linearized = (slice(None, None, LINEARIZED),) * 2
         cell = float(coarse[1, 0, 0] - coarse[0, 0, 0])
         inside = ((coarse >= low - cell) & (coarse <= high + cell)).all(axis=2)
 
         # 2. Discriminants, and the covariance of their residuals on the coarse grid
         residual = inputs - interpolate_grid(table, positions)
-        projection = fit_projection(table, residual, fibre_mask, COMPONENTS, earlier and earlier.projection)
+        projection = fit_projection(table, residual, fibre_mask, COMPONENTS, earlier.projection if earlier else None)
         residual = np.einsum("qcf,cfd->qcd", residual, projection) * fibre_mask[:, :, None]
         scatter = local_scatter(coarse.reshape(-1, 2), positions, residual, fibre_mask, cell)
         scatter = scatter.reshape(*coarse.shape[:2], fibres, -1)
@@ -94,10 +94,10 @@ class BayesianLocalizer:
             jacobian = np.stack(np.gradient(expected, step, axis=(0, 1)), axis=2)
             weighted = jacobian @ np.linalg.inv(covariance)
             fisher = weighted @ jacobian.swapaxes(2, 3)
-            responses.append(expected[fine])
-            jacobians.append(weighted[fine].reshape(*responses[-1].shape[:2], -1))
+            responses.append(expected[linearized])
+            jacobians.append(weighted[linearized].reshape(*responses[-1].shape[:2], -1))
             diagonal = (np.maximum(fisher[..., k, k], 0) for k in (0, 1))  # may be negative by rounding
-            informations.append(np.stack([*diagonal, fisher[..., 0, 1]], axis=2)[fine])
+            informations.append(np.stack([*diagonal, fisher[..., 0, 1]], axis=2)[linearized])
             # Each position of the grid stands for its cell, over which the response varies by its slope.
             slope = jacobian[::COARSENING, ::COARSENING][inside]
             blurred = covariance[::COARSENING, ::COARSENING][inside] + cell**2 / 12 * slope.swapaxes(1, 2) @ slope
@@ -193,7 +193,7 @@ def fit_stages(
     stages, numbers = [], BAYES_STAGES if n_timed else (0,)
     for n_complete in numbers:
         on_progress(len(stages), len(numbers), "Bayesian localizer")
-        unused = slice(n_complete, n_timed + len(LATEST_WINDOWS) if n_timed else 0)
+        unused = slice(n_complete, (n_timed + len(LATEST_WINDOWS)) if n_timed else 0)
         masked = table.copy()
         masked[:, :, :, unused] = 0
         earlier_stage = earlier[len(stages)] if earlier else None

@@ -6,7 +6,6 @@ early stopping.
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 import numpy as np
 
@@ -29,9 +28,9 @@ from padforge.sense.localizer.evaluation import (
     evaluate,
     held_back_presses,
 )
-from padforge.sense.localizer.features import MODULATED, FeatureSet, PressFeatures, compute_features
+from padforge.sense.localizer.features import FeatureSet, PressFeatures, compute_features
 from padforge.sense.localizer.model import Localization, LocalizerModel
-from padforge.sense.localizer.moments import N_PRESS_WINDOWS, complete_at, count_complete
+from padforge.sense.localizer.moments import MODULATED, N_PRESS_WINDOWS, complete_at, count_complete
 from padforge.sense.localizer.network import (
     MAX_LOG_ERROR,
     MIN_LOG_ERROR,
@@ -199,7 +198,8 @@ def fit_recording(
         until = complete_at(n_complete, *commands)
         return compute_features(readings, *commands, until, history=features.history)[presses]
 
-    origin: tuple[Any, ...] = "published" if is_published else "windows", recording.rate_hz, recording.digest
+    feature_set: FeatureSet = "published" if is_published else "windows"
+    origin = feature_set, recording.rate_hz, recording.digest
     data = CalibrationData(features, detected, recording.presses_mm, measures, *origin, None if is_published else at)
     if pad is not None:
         data = replace(data, pad=pad, contact=stated_contact(recording))
@@ -247,8 +247,8 @@ def fit_model(
 
     # 2. Tests for single presses, networks and Bayesian localizers
     left_out = leave_one_out_residuals(presses, table, leverage)
-    zero = scaler.mean_v / scaler.scale_v
-    tests = tuple(SinglePressTest.fit(table, left_out, zero, n_complete) for n_complete in stages(n_timed))
+    centring = scaler.mean_v / scaler.scale_v
+    tests = tuple(SinglePressTest.fit(table, left_out, centring, n_complete) for n_complete in stages(n_timed))
     bayes, residual_network, trained_share = (), {}, 1.0
     if is_ensemble:
         trained = train_members(presses, table, options, rng, on_progress, time_budget, leverage)
@@ -277,6 +277,7 @@ def fit_model(
         moments = [scaler.transform(data.features[calibration])]
     else:
         moments = [scaler.transform(data.at(n_complete, calibration)) for n_complete in range(1, n_timed + 1)]
+    # features without moments have one stage, 0, and one entry of `moments`
     tests = (test.calibrated(moments[n - 1]) for test, n in zip(tests, stages(n_timed), strict=True))
     model = replace(model, single_press=tuple(tests))
     positions_mm = data.positions_mm[calibration]
@@ -459,12 +460,12 @@ def missing_target_lines(recording: Recording, model: LocalizerModel) -> list[st
     """Return lines on why a model does not predict depth or force although a recording holds some of them."""
     predicted = {target.name for target in model.scaler.measures}
     depth, force = (recording.measures[name][recording.has_position] for name in ("depth_mm", "force_n"))
-    presses, n_above = len(depth), int((depth <= 0).sum())
+    presses, n_shallow = len(depth), int((depth <= 0).sum())
     n_depth, n_force = int((~np.isnan(depth)).sum()), int((~np.isnan(force)).sum())
     if model.method != "ensemble":
         return []
-    if "depth_mm" not in predicted and n_above:
-        return [f"depth is not learnt: {n_above} of {presses} presses reached 0 mm or less"]
+    if "depth_mm" not in predicted and n_shallow:
+        return [f"depth is not learnt: {n_shallow} of {presses} presses reached 0 mm or less"]
     if "depth_mm" not in predicted and 0 < n_depth < presses:
         return [f"depth is not learnt: it is known of {n_depth} of {presses} presses, needed is of all"]
     if "depth_mm" in predicted and "force_n" not in predicted and n_force:

@@ -12,9 +12,9 @@ from padforge.common.progress import OnProgress, ignore_progress
 from padforge.common.validation import InputError, check_int, check_type
 from padforge.design.objectives.fibre_loss import failure_subsets
 from padforge.sense.arrays import Array, Indices
-from padforge.sense.localizer.features import PRESS_WINDOWS, compute_features, interpolate_gaps, window_means
+from padforge.sense.localizer.features import compute_features, interpolate_gaps, window_means
 from padforge.sense.localizer.model import Localization, LocalizerModel
-from padforge.sense.localizer.moments import MOMENTS
+from padforge.sense.localizer.moments import MOMENTS, PRESS_WINDOWS
 from padforge.sense.localizer.single_press import OTHER_PAD
 from padforge.sense.recording import doubts
 from padforge.sense.recording.frames import framed

@@ -3,8 +3,8 @@
 Both are relative to the baseline of the fibre, its mean at rest just before the press. Where a window of `moments`
 would reach into a neighbouring press, the nearest reading of its own press is repeated. The history shows how far the
 fibre has crept after earlier presses, and so how it still creeps. Each feature depends on one fibre alone, so that a
-failed fibre can be masked and affects no other. Short gaps (NaN) are interpolated; a fibre with too few readings in a
-press is masked in it.
+failed fibre can be masked and affects no other. Gaps (NaN) are interpolated; a fibre with too few readings in a press
+is masked in it. Readings are frames here (see `recording.frames`).
 """
 
 from dataclasses import dataclass
@@ -178,7 +178,7 @@ def _slow_median(readings: Any, down_command: Any, length: int, xp: Any) -> Any:
 
 
 def _running_medians(readings: Array, down_command: Indices, up_command: Indices) -> Array:
-    """(Q, C, 3) published features, V: the running medians before, in and after the press."""
+    """Return the published features (Q, C, 3), V: the running medians before, in and after the press."""
     previous_end, next_begin = _neighbours(down_command, up_command, len(readings))
     window = (-(MEDIAN_WIDTH // 2), MEDIAN_WIDTH // 2 + 1)
     ranges = (
@@ -191,11 +191,11 @@ def _running_medians(readings: Array, down_command: Indices, up_command: Indices
 
 
 def _neighbours(down_command: Indices, up_command: Indices, n_readings: int) -> tuple[Indices, Indices]:
-    """(Q,) first reading after the previous press, and first of the next press."""
+    """Return the first reading (Q,) after the previous press, and the first of the next press."""
     return np.concatenate([[0], up_command[:-1]]), np.concatenate([down_command[1:], [n_readings]])
 
 
 def _gather(readings: Any, origin: Any, window: Window, low: Any, high: Any, xp: Any) -> Any:
-    """(Q, W, C) readings in `origin` + window, clipped to low <= index < high, which is at most their number."""
+    """Return the readings (Q, W, C) in `origin` + window, clipped to low <= index < high, at most their number."""
     index = xp.maximum(origin[:, None] + xp.arange(*window), low[:, None])
     return readings[xp.minimum(index, high[:, None] - 1)]

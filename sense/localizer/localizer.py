@@ -14,8 +14,9 @@ from padforge.common.validation import InputError, check_float, check_type
 from padforge.sense.arrays import MAX_MM, MAX_VOLTS, Array, Indices, check_magnitude, check_numbers
 from padforge.sense.localizer.calibration import MAX_TIME_BUDGET_S, CalibrationData, calibrate, fit_model, fit_recording
 from padforge.sense.localizer.evaluation import Evaluation, distances, evaluate
-from padforge.sense.localizer.features import MODULATED, PressFeatures, compute_features, features_without_moments
+from padforge.sense.localizer.features import PressFeatures, compute_features, features_without_moments
 from padforge.sense.localizer.model import Localization, LocalizerModel
+from padforge.sense.localizer.moments import MODULATED
 from padforge.sense.localizer.scaler import FeatureScaler
 from padforge.sense.recording.frames import framed
 from padforge.sense.recording.recording import PressSelection, Recording

@@ -132,9 +132,9 @@ class PressSampler:
         angle = rng.uniform(0, 2 * math.pi, n_sliding)
         extra_readings = MAX_SLIDE_READINGS * rng.random(n_sliding) ** 2
         velocity = speed[:, None] * np.column_stack([np.cos(angle), np.sin(angle)])
-        end = last[:n_sliding]
-        end = end + np.where(end >= _ENDS[N_PRESS_WINDOWS] - 1, extra_readings, 0.0)
-        return _Moments(counts, last, end, velocity, RESIDUAL_LENGTH_MM * self._per_mm)
+        slide_end = last[:n_sliding]
+        slide_end = slide_end + np.where(slide_end >= _ENDS[N_PRESS_WINDOWS] - 1, extra_readings, 0.0)
+        return _Moments(counts, last, slide_end, velocity, RESIDUAL_LENGTH_MM * self._per_mm)
 
 
 def sample_fibre_dropout(batch: int, fibres: int, max_failures: int, rng: np.random.Generator) -> Mask:
@@ -186,7 +186,7 @@ def _compute_inputs(
             x[b, fibres * size + c] = 1
             # 2. Response of a finger at rest
             for f in range(size):
-                if f < N_PRESS_WINDOWS or complete[f]:
+                if f < N_PRESS_WINDOWS or complete[f]:  # the latest readings may be of a window that is not complete
                     residual[f] = source.residual[row, c, f] + noise * rng.standard_normal()
                     features[f] = gain * _respond(source.table, i, j, u, v, c, f) + residual[f]
             # 3. Windows that the slide changes, and the latest readings
@@ -208,7 +208,7 @@ def _compute_inputs(
 
 @kernel(inline="always")
 def _locate(x: float, y: float, side: int) -> tuple[int, int, float, float]:
-    """Return the cell (i, j) of the table that is nearest to a position, and the position (u, v) in it, 0 to 1."""
+    """Return the cell (i, j) of the table that holds a position, clipped, and the position (u, v) in it, 0 to 1."""
     u = min(max((x + 1) * ((side - 1) / 2), 0.0), side - 1 - 1e-3)
     v = min(max((y + 1) * ((side - 1) / 2), 0.0), side - 1 - 1e-3)
     return int(u), int(v), u - int(u), v - int(v)
@@ -272,10 +272,10 @@ def _write_slide(
     other_residual: Any,
     noise: float,
     rng: Any,
-    pressed: Any,
+    features: Any,
     latest: Any,
 ) -> None:
-    """Write the windows of fibre c under a sliding finger, see `_trace_slide`, into `pressed` and `latest`.
+    """Write the windows of fibre c under a sliding finger, see `_trace_slide`, into `features` and `latest`.
 
     Along the slide, the residual of the press becomes `other_residual`, that of another press.
     """
@@ -292,6 +292,6 @@ def _write_slide(
         uncorrelated = math.sqrt(1 - correlation[k] ** 2) * (other_residual[window] + noise * rng.standard_normal())
         sliding = gain * response + correlation[k] * residual[window] + uncorrelated
         if k < N_PRESS_WINDOWS:
-            pressed[k] = sliding
+            features[k] = sliding
         else:
             latest[k - N_PRESS_WINDOWS] = sliding

@@ -75,27 +75,29 @@ class SinglePressTest:
         cls,
         table: Floats,
         presses: TrainingPresses,
-        zero: Array,
+        centring: Array,
         n_complete: int,
         earlier: "SinglePressTest | None" = None,
     ) -> "SinglePressTest":
         """Fit the scatter of presses, with leave-one-out residuals, about the response at a stage of a press.
 
-        The table (S, S, C, F + G) is the scaled response over [-1, 1] in x and y; `zero` (C, F + G) are the scaled
-        features of a pad without response, with a minus sign. Discriminants of an earlier pad are kept, since few
+        The table (S, S, C, F + G) is the scaled response over [-1, 1] in x and y; `centring` (C, F + G) is what
+        scaling has subtracted from the features. Discriminants of an earlier pad are kept, since few
         presses do not determine them.
         """
         n_timed, side = presses.complete.shape[1], len(table)
         usable = np.ones(table.shape[3], bool)
-        usable[n_complete : n_timed + len(LATEST_WINDOWS) if n_timed else 0] = False
+        usable[n_complete : (n_timed + len(LATEST_WINDOWS)) if n_timed else 0] = False
         table = np.where(usable, table, 0.0)
         positions = presses.targets[:, :2].astype(np.float64)
         relative_depth = 1 + presses.depth_gain * presses.targets[:, 2:3] if presses.depth_gain else np.ones((1, 1))
         at_presses = relative_depth * interpolate_grid(table.reshape(side, side, -1), positions)
         residual = presses.inputs - at_presses.reshape(presses.inputs.shape)
-        projection = fit_projection(table, residual, presses.fibre_mask, COMPONENTS, earlier and earlier.projection)
+        projection = fit_projection(
+            table, residual, presses.fibre_mask, COMPONENTS, earlier.projection if earlier else None
+        )
         residual = np.einsum("qcf,cfd->qcd", residual, projection) * presses.fibre_mask[:, :, None]
-        offset = np.einsum("cf,cfd->cd", zero * usable, projection)
+        offset = np.einsum("cf,cfd->cd", centring * usable, projection)
         responses = np.einsum("xycf,cfd->xycd", table, projection) + offset
         low, high = positions.min(axis=0), positions.max(axis=0)
         grid = grid_positions(side)[::COARSENING, ::COARSENING]

@@ -95,7 +95,7 @@ def model_twin(twin: Twin, rig: RigSettings, size: PadSettings | None = None) ->
         return PressParts(held, onset, creep, after)
 
     # Least squares for the sides, along the axes of the arm, that span `sensed_mm` along the axes of the plan.
-    spans = np.abs(twin.frame.rotate(np.eye(2))).T
+    spans = np.abs(twin.frame.turned(np.eye(2))).T
     sides, *_ = np.linalg.lstsq(spans, np.array(twin.sensed_mm) / twin.frame.scale, rcond=MIN_SINGULAR)
     half_mm = np.maximum(sides, 0) / 2
     plan = model_plan(twin.morphology, twin.contact(), rig, size)

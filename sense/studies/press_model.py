@@ -7,7 +7,7 @@ import numpy as np
 
 from padforge.design.contact import relative_stretch, signals
 from padforge.design.morphology import Morphology
-from padforge.design.objectives.expected_error import scatter_of_full_scale, straight_full_scale
+from padforge.design.objectives.criterion import scatter_of_full_scale, straight_full_scale
 from padforge.design.settings import PUBLISHED_CONTACT, Contact, Scatter, SearchSettings
 from padforge.sense.arrays import Array, Mask
 

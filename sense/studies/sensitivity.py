@@ -19,7 +19,7 @@ from padforge.common.plotting import CURVES, INK
 from padforge.common.validation import InputError
 from padforge.design.contact import relative_stretch, signals
 from padforge.design.morphology import Morphology
-from padforge.design.objectives.expected_error import scatter_of_full_scale, straight_full_scale
+from padforge.design.objectives.criterion import scatter_of_full_scale, straight_full_scale
 from padforge.design.published.networks import SimulatedPresses, fit_batch
 from padforge.design.settings import Contact, SearchSettings
 from padforge.sense.arrays import Array

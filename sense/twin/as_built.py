@@ -241,7 +241,7 @@ class AsBuiltPad:
         """Predict responses (Q, C), and return for each channel their derivatives (Q, N_SHARED + N_CHANNEL)."""
         transform, plan = self.transform, self.plan
         positions = np.ascontiguousarray(plan.to_grid(transform.to_plan(positions_mm)))
-        rotated = transform.rotate(positions_mm)
+        rotated = transform.turned(positions_mm)
         by_transform = np.zeros((len(positions), 2, 4))  # of positions, by turn, shift and scale
         by_transform[:, 0, 0], by_transform[:, 1, 0] = -transform.scale * rotated[:, 1], transform.scale * rotated[:, 0]
         by_transform[:, 0, 1] = by_transform[:, 1, 2] = 1

@@ -118,7 +118,7 @@ def _centred(transform: PlanTransform, responses: Responses, unit_mm: float) -> 
     middle_mm = responses.positions_mm.min(axis=0) / 2 + responses.positions_mm.max(axis=0) / 2
     if np.abs(middle_mm).max() <= unit_mm:
         return transform
-    return replace(transform, shift_mm=tuple((-transform.rotate(middle_mm[None])[0]).tolist()))
+    return replace(transform, shift_mm=tuple((-transform.turned(middle_mm[None])[0]).tolist()))
 
 
 def images(wiring: Wiring, layout: Layout) -> list[Wiring]:
@@ -132,12 +132,12 @@ def images(wiring: Wiring, layout: Layout) -> list[Wiring]:
     out = []
     for mirrored, quarter in product((False, True), range(0, 4, 1 if layout.is_square else 2)):
         symmetry, old = PlanTransform(mirrored, 90.0 * quarter), wiring.transform
-        distance_mm = np.hypot(*(symmetry.rotate(middles_mm)[:, None] - middles_mm).T).T
+        distance_mm = np.hypot(*(symmetry.turned(middles_mm)[:, None] - middles_mm).T).T
         distance_mm[(families[:, None] ^ (quarter % 2)) != families] = np.inf
         transform = PlanTransform(
             mirrored != old.mirrored,
             (symmetry.turn_deg + (-old.turn_deg if mirrored else old.turn_deg) + 180) % 360 - 180,
-            tuple(symmetry.rotate(np.array([old.shift_mm]))[0].tolist()),
+            tuple(symmetry.turned(np.array([old.shift_mm]))[0].tolist()),
             old.scale,
         )
         fibres = tuple(distance_mm.argmin(axis=1)[list(wiring.fibres)].tolist())
@@ -153,7 +153,7 @@ def planned_paths_mm(plan: PadPlan, transform: PlanTransform, fibres: tuple[int,
     mirrored, turn_deg = transform.mirrored, 90.0 * round(transform.turn_deg / 90)
     from_plan = PlanTransform(mirrored, turn_deg if mirrored else -turn_deg)  # the inverse of such a transform
     paths_mm = (plan.paths[list(fibres)] - np.array(plan.layout.extent) / 2) * plan.layout.unit_mm
-    return from_plan.rotate(paths_mm)
+    return from_plan.turned(paths_mm)
 
 
 def _refine(scorer: _Scorer, wiring: Wiring, unit_mm: float) -> Wiring:

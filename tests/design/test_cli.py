@@ -11,7 +11,7 @@ from padforge.common.files import sha256
 from padforge.common.settings import commented_toml
 from padforge.design import Contact, Morphology, SearchOptions, Twin, score, search
 from padforge.design.cli import design
-from padforge.design.objectives.expected_error import straight_full_scale
+from padforge.design.objectives.criterion import straight_full_scale
 from padforge.design.optimize.search import settings_for_twin, state_folders
 from padforge.design.settings import Layout, PadSettings, Scatter, SearchSettings
 from tests.helpers.less import blank_pictures

@@ -13,7 +13,7 @@ from padforge.design.objectives.bayes_error import (
     expected_errors,
     possible_positions,
 )
-from padforge.design.objectives.expected_error import evaluation_windows, straight_full_scale
+from padforge.design.objectives.criterion import evaluation_windows, straight_full_scale
 from padforge.design.settings import PUBLISHED_CONTACT, Scatter
 
 PLACES = np.stack(np.meshgrid(*[np.linspace(0, 4, 41)] * 2), axis=-1).reshape(-1, 2)

@@ -9,7 +9,7 @@ from scipy.interpolate import PchipInterpolator
 from padforge.design import Contact, Morphology
 from padforge.design.contact_set import served_contacts
 from padforge.design.morphology import MARGIN
-from padforge.design.objectives.expected_error import criterion_errors
+from padforge.design.objectives.criterion import criterion_errors
 from padforge.design.objectives.penalties import penalties
 from padforge.design.objectives.rules import check_rules
 from padforge.design.optimize.gradient import (

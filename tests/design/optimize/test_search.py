@@ -10,7 +10,7 @@ import pytest
 
 from padforge.design import Contact, Morphology
 from padforge.design.contact_set import served_contacts
-from padforge.design.objectives.expected_error import POWER, criterion_errors
+from padforge.design.objectives.criterion import POWER, criterion_errors
 from padforge.design.objectives.rules import check_rules
 from padforge.design.objectives.score import ScoredPad, describe_terms, score
 from padforge.design.optimize.gradient import GENTLE

@@ -52,7 +52,7 @@ def test_robot_frame_inverts_and_agrees_with_the_plan_transform(mirrored, angle_
     np.testing.assert_allclose(tips, positions, atol=1e-9)
     np.testing.assert_allclose(tip_depths, depths, atol=1e-9)
     turned = PlanTransform(mirrored, angle_deg if mirrored else -angle_deg)
-    transform = replace(turned, shift_mm=tuple(-turned.rotate(np.array(centre_mm))))
+    transform = replace(turned, shift_mm=tuple(-turned.turned(np.array(centre_mm))))
     np.testing.assert_allclose(transform.to_plan(poses[:, :2]), positions, atol=1e-9)
 
 

@@ -7,16 +7,17 @@ proportional to the response, a fraction `common` of whose variance is shared by
 
     x' = x (1 + share (sqrt(common) g + sqrt(1 - common) g_f)) + floor e_f,       g, g_f, e_f ~ N(0, 1).
 
-For presses a and the set K of fibres that still work, the criterion is a weighted sum of two terms:
+For presses a, cells c of a grid between them and the set K of fibres that still work, the criterion is a weighted sum
+of two terms:
 
     L_K = mean_a |alpha_a| / c_aa,           alpha = C p,    C = (k + r 1)^-1,    k_ab = exp(-|x_a - x_b|^2_K / 2 w^2),
-    B_K = mean_a sqrt(trace F_a^-1),         F_a = J_a' S_a^-1 J_a + 12 / size^2,     J_a = dx / dp at a,
+    B_K = mean_c sqrt(trace F_c^-1),         F_c = J_c' S_c^-1 J_c + 12 / side^2,     J_c = dx / dp in c,
     criterion = 0.85 B_K + 0.47 L_K.
 
 L_K is the leave-one-out error of kernel ridge regression in closed form, with the kernel width w, the ridge r, the
-diagonal c_aa of C and the positions p relative to their centre. B_K is the Cramer-Rao bound with a prior over the pad
-and the covariance S_a of the responses. The weights are fitted to errors of small trained networks. `docs/method.md`
-names sources and reasons.
+diagonal c_aa of C and the positions p relative to their centre. B_K is the Cramer-Rao bound with a prior over the
+window, of that side, and the covariance S_c of the responses. The weights are fitted to errors of small trained
+networks. `docs/method.md` names sources and reasons.
 
 Presses are compared on a fine grid over a window of the pad. To penalise distant positions of similar responses, the
 presses of a coarse grid over the remaining pad whose responses resemble some press of the window join the regression.
@@ -93,7 +94,7 @@ def criterion_errors(pad: Morphology, contact: Contact, search: SearchSettings, 
     rng, fibres = np.random.default_rng(0), len(pad.knots)
     levels = range(min(len(failure_shares(search.max_failures)), fibres))
     windows = evaluation_windows(size.sensed)
-    masks = [failure_masks(fibres, k, max(MAX_SETS // len(windows), MIN_SETS)) for k in levels]
+    masks_by_size = [failure_masks(fibres, k, max(MAX_SETS // len(windows), MIN_SETS)) for k in levels]
     scale, weights = straight_full_scale(pad.layout, contact, size.sensed_mm), kernel_weights(pad.layout)
     scatter = scatter_of_full_scale(search.response_scatter, contact, scale)
     errors: list[list[float]] = []  # by window, means over the sets of each size
@@ -109,10 +110,10 @@ def criterion_errors(pad: Morphology, contact: Contact, search: SearchSettings, 
         touched = np.concatenate([near, far], axis=1).any(axis=1)
         near, far, touched_weights = near[touched], far[touched], weights[touched]
         errors.append([])
-        for mask in masks:
-            unique, inverse = np.unique(mask[:, touched], axis=0, return_inverse=True)
+        for masks in masks_by_size:
+            unique, inverse = np.unique(masks[:, touched], axis=0, return_inverse=True)
             partners = confusable(touched_weights[:, None] * near, touched_weights[:, None] * far, unique)
-            values, _ = expected_error(
+            values, _ = criterion(
                 np.concatenate([near, far[:, partners]], axis=1),
                 presses.with_partners(partners),
                 presses.step,
@@ -251,7 +252,7 @@ def _min_squared_distances(near: Any, far: Any, masks: Any, limit: float) -> Any
     return out
 
 
-def expected_error(
+def criterion(
     responses: Array,
     positions: Array,
     step: Array,
@@ -303,7 +304,7 @@ def expected_error(
 
 
 def averages(masks: Array, levels: int) -> Array:
-    """Return the matrix (`levels`, L) that averages over the sets (L, F) of 0, 1, ... failed fibres."""
+    """Return the matrix (`levels`, L) that averages over the sets (L, F) of 0, 1, ... failed fibres, if any."""
     has_size = (masks == 0).sum(axis=1) == np.arange(levels)[:, None]
     return has_size / np.maximum(has_size.sum(axis=1, keepdims=True), 1)
 

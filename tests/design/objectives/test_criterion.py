@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from padforge.design.morphology import Morphology
-from padforge.design.objectives import expected_error as module
-from padforge.design.objectives.expected_error import (
+from padforge.design.objectives import criterion as module
+from padforge.design.objectives.criterion import (
     BOUND_WEIGHT,
     POWER,
     REGRESSION_WEIGHT,
@@ -13,8 +13,8 @@ from padforge.design.objectives.expected_error import (
     WIDTH,
     averages,
     confusable,
+    criterion,
     evaluation_windows,
-    expected_error,
     place_window,
     relative_error,
     straight_full_scale,
@@ -30,7 +30,7 @@ SILENT = Scatter(1e-9)  # noise that adds nothing where signals tell the place
 
 
 def errors(signals: np.ndarray, masks, scatter=SILENT, free=FREE) -> list[float]:
-    return expected_error(signals, PLACES, STEPS, free, np.array(masks), scatter, np.ones(len(signals)))[0].tolist()
+    return criterion(signals, PLACES, STEPS, free, np.array(masks), scatter, np.ones(len(signals)))[0].tolist()
 
 
 def error(signals: np.ndarray, scatter=SILENT) -> float:
@@ -117,7 +117,7 @@ def test_expected_error_gradient_matches_finite_differences(scatter):
     of_sets, straight = averages(kept, 2), np.array([[0.31, 0.48]])  # both sets count
 
     def joint(signals):
-        errors, by_signals = expected_error(signals, places, STEPS, FREE, kept, scatter, np.ones(3))
+        errors, by_signals = criterion(signals, places, STEPS, FREE, kept, scatter, np.ones(3))
         value, by_means = relative_error((of_sets @ errors)[None], straight, shares)
         return value, np.tensordot(by_means[0] @ of_sets, by_signals, axes=1)
 
@@ -189,6 +189,6 @@ def test_expected_error_counts_distant_presses_with_equal_responses():
     signals, kept = PLACES.T / 4, np.ones((1, 2))
     alike, other = signals[:, 90:91], signals[:, 90:91] + 3.0
     given = np.vstack([PLACES, [[30.0, 30.0]]]), STEPS, FREE, kept, SILENT, np.ones(2)
-    confused, apart = (expected_error(np.hstack([signals, far]), *given)[0][0] for far in (alike, other))
+    confused, apart = (criterion(np.hstack([signals, far]), *given)[0][0] for far in (alike, other))
     assert apart == pytest.approx(error(signals), rel=0.2)
     assert confused > 5 * apart
