@@ -12,7 +12,6 @@ from scipy.interpolate import PchipInterpolator
 from scipy.optimize import brentq
 
 from padforge.benchmarks.harness import Bench, BenchTrial
-from padforge.common.profiling import profiled
 from padforge.design.contact import signals, signals_quantized, signals_sparse
 from padforge.design.kernels.pchip import pchip_sample
 from padforge.design.morphology import Array, Morphology
@@ -115,16 +114,7 @@ def contact_trials() -> Iterator[BenchTrial]:
     for grid in GRIDS:
         pad, presses = Morphology.straight(grid), rng.uniform(1, grid, (2000, 2))
         work = partial(signals_sparse, pad, presses, PUBLISHED_CONTACT)
-        evaluate = partial(_visited, pad, presses[:100])
-        yield BenchTrial(f"grid {grid}, a press", "exact", 0, work, evaluate, items=len(presses))
-
-
-def _visited(pad: Morphology, presses: Array, result: object) -> dict[str, float]:
-    """Return the share of the spans that the exact kernel visits."""
-    with profiled() as profile:
-        signals(pad, presses, PUBLISHED_CONTACT)
-    visited, total = profile.counts["spans, press by press"]
-    return {"visited": visited / total}
+        yield BenchTrial(f"grid {grid}, a press", "exact", 0, work, items=len(presses))
 
 
 def _ways(pad: Morphology, presses: Array, contact: Contact) -> Iterator[BenchTrial]:
@@ -142,9 +132,7 @@ def _ways(pad: Morphology, presses: Array, contact: Contact) -> Iterator[BenchTr
         yield BenchTrial(case, "scanned", samples, scan, evaluate)
         yield BenchTrial(case, "culled", samples, culled, evaluate)
     reference = cache(partial(reference_signals, pad, presses, contact))
-    yield BenchTrial(
-        case, "exact", 0, work, lambda result: evaluate(result, reference) | _visited(pad, presses, result)
-    )
+    yield BenchTrial(case, "exact", 0, work, lambda result: evaluate(result, reference))
 
 
 def objective_trials() -> Iterator[BenchTrial]:

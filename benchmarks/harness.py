@@ -38,28 +38,27 @@ FORMAT = "padforge-benches/1"
 """Format of bench.json; runs of earlier versions stay comparable, so keys must not change."""
 
 Row = dict[str, Any]
-"""A trial: "case", "way", "size", "repetition", "error", "seconds", "paces", "visited" and more."""
+"""A trial: "case", "way", "size", "repetition", "error", "seconds", "paces" and more."""
 TrialKey = tuple[str, str, float, int]
 Documents = Mapping[str, Mapping[str, Any]]
 """Results in bench.json by the name of the benchmark."""
 KEY = ("case", "way", "size", "repetition")
 """Columns that identify a trial."""
 
-SLOWER, LESS_ACCURATE, VISITS_MORE = "slower", "less accurate", "visits more"
-MAX_RATIOS = {SLOWER: 1.25, LESS_ACCURATE: 1.25, VISITS_MORE: 1.1}
-"""Ratios beyond which a trial counts as worse."""
+SLOWER, LESS_ACCURATE = "slower", "less accurate"
+MAX_RATIO = 1.25
+"""Ratio beyond which a trial counts as worse."""
 SHORT_S = 1e-3
 """The time of shorter work depends on memory layout: it counts as slower only if another trial of its way does."""
-MIN_ERROR, MIN_VISITED = 1e-15, 1e-3
-"""Smaller errors (rounding) and shares count as equal."""
+MIN_ERROR = 1e-15
+"""Smaller errors, of rounding, count as equal."""
 
 
 @dataclass(frozen=True)
 class BenchTrial:
     """One measurement.
 
-    `evaluate` returns the quality of the result of `work`: "error" in the unit of the bench, "visited", the share of
-    the scene that was computed, and columns of the bench.
+    `evaluate` returns the quality of the result of `work`: "error" in the unit of the bench, and columns of the bench.
     """
 
     case: str  # the problem
@@ -105,8 +104,8 @@ class Worsening:
 
     bench: str  # name of the benchmark
     key: TrialKey  # identity of the trial
-    what: str  # SLOWER, LESS_ACCURATE or VISITS_MORE
-    before: float  # seconds per item, error or visited share in the earlier run
+    what: str  # SLOWER or LESS_ACCURATE
+    before: float  # seconds per item, or error in the earlier run
     now: float  # the same in this run
     ratio: float  # of the two; of times as far as the pace of the machine does not explain it
 
@@ -218,7 +217,7 @@ def _to_document(bench: Bench, rounds: BenchRounds) -> dict[str, Any]:
     """Return the results of a benchmark as plain data."""
     rows = [
         dict(zip(KEY, key, strict=True))
-        | {"error": None, "seconds": min(rounds.seconds[key]), "paces": min(rounds.paces[key]), "visited": None}
+        | {"error": None, "seconds": min(rounds.seconds[key]), "paces": min(rounds.paces[key])}
         | dict(result)
         for key, result in rounds.results.items()
     ]
@@ -255,7 +254,7 @@ def _medians(rows: Sequence[Row]) -> list[Row]:
         groups.setdefault((*_key(row)[:3], 0), []).append(row)
     medians = [dict(zip(KEY, key, strict=True)) for key in groups]
     for row, group in zip(medians, groups.values(), strict=True):
-        for name in ("error", "seconds", "visited"):
+        for name in ("error", "seconds"):
             values = [trial[name] for trial in group if trial[name] is not None]
             row[name] = median(values) if values else None
     return medians
@@ -269,11 +268,10 @@ def bench_lines(document: Mapping[str, Any]) -> list[str]:
     """Format a benchmark as a table of text."""
     rows, reference = _medians(document["rows"]), tuple(document["reference"])
     reference_s = {row["case"]: row["seconds"] for row in rows if (row["way"], row["size"]) == reference}
-    cells = [["case", "way", "size", "error", "time", "speed", "visited"]]
+    cells = [["case", "way", "size", "error", "time", "speed"]]
     for row in rows:
         speed = f"{reference_s[row['case']] / row['seconds']:.2f}x" if row["case"] in reference_s else "-"
-        visited = "-" if row["visited"] is None else f"{100 * row['visited']:.1f} %"
-        quantities = f"{row['size']:g}", _error(row["error"]), _time(row["seconds"]), speed, visited
+        quantities = f"{row['size']:g}", _error(row["error"]), _time(row["seconds"]), speed
         cells.append([row["case"], row["way"], *quantities])
     return [f"{document['bench']}: speed relative to {_way(*reference)}", "", *text_table(cells, (0, 1))]
 
@@ -353,11 +351,10 @@ def find_worsenings(before: Documents, now: Documents) -> list[Worsening]:
             # a machine that is busy all the time never shows its best pace: the pace beside the trial counts as well
             slowdown = min(pace * new["seconds"] / old["seconds"], new["paces"] / old["paces"])
             changes = [(SLOWER, "seconds", slowdown)]
-            for what, column, minimum in ((LESS_ACCURATE, "error", MIN_ERROR), (VISITS_MORE, "visited", MIN_VISITED)):
-                if old[column] is not None and new[column] is not None:
-                    changes.append((what, column, max(new[column], minimum) / max(old[column], minimum)))
+            if old["error"] is not None and new["error"] is not None:
+                changes.append((LESS_ACCURATE, "error", max(new["error"], MIN_ERROR) / max(old["error"], MIN_ERROR)))
             for what, column, ratio in changes:
-                if not ratio <= MAX_RATIOS[what]:  # also NaN
+                if not ratio <= MAX_RATIO:  # also NaN
                     worse.append(Worsening(now[name]["bench"], key, what, old[column], new[column], ratio))
         slower_ways = [change.key[1] for change in worse if change.what == SLOWER]
         certain = [w for w in worse if w.what != SLOWER or w.before >= SHORT_S or slower_ways.count(w.key[1]) > 1]
@@ -375,5 +372,5 @@ def comparison_lines(changes: Sequence[Worsening], before: Documents, now: Docum
     """Format the comparison of two runs, and what is worse, as text."""
     n_trials = sum(len(_common_trials(before[name], now[name])) for name in before.keys() & now.keys())
     if not changes:
-        return [f"{n_trials} trials compared: none is slower, less accurate or visits more"]
+        return [f"{n_trials} trials compared: none is slower or less accurate"]
     return [f"{n_trials} trials compared; worse than before:", *(f"  {change}" for change in changes)]

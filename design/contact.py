@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
-from padforge.common import profiling
 from padforge.common.parallel import map_chunks
 from padforge.common.settings import or_default
 from padforge.common.validation import MAX_VALUES, InputError, check_array, check_float, check_int, check_type
@@ -106,15 +105,14 @@ def signals(
         _run_exact(along, across, ends, centres, press_shape(contact, unit_mm), _NO_SPARSE_OUTPUT, out.reshape(-1))
     elif len(centres):
         precision = check_float("precision", precision, 1e-6, 1.0)  # that of a `weight_table` is about 1e-7
-        (_, extents, law), spacings = press_shape(contact, unit_mm), element_spacings(contact, unit_mm, precision)
+        law, spacings = contact_law(contact, unit_mm), element_spacings(contact, unit_mm, precision)
         for t, v, pad_signals in zip(along, across, out, strict=True):
             slope = population_slopes(t[None], v[None])[0]
             elements = element_signals.fibre_elements(t, v, slope, ends.horizontals, centres, law, spacings)
             if sensitivity is not None:
                 element_signals.weigh_elements(elements, t, sensitivity)
             table = weight_table(contact, unit_mm)
-            visited = element_signals.element_signals(t, v, elements, centres, law, table, pad_signals)
-            record_visits(t[None], v[None], ends, centres, extents, visited)
+            element_signals.element_signals(t, v, elements, centres, law, table, pad_signals)
     return _sum_simultaneous(out, (*batch, *press_counts, fibres))
 
 
@@ -280,24 +278,10 @@ def _run_exact(
     """Run `exact_signals` on all cores."""
     max_offsets, curves = geometry.max_offsets(across, ends), (along, across, population_slopes(along, across))
 
-    def compute(begin: int, end: int) -> int:
-        return exact_signals(curves, max_offsets, ends, presses, shape, begin, end, sparse, out)
+    def compute(begin: int, end: int) -> None:
+        exact_signals(curves, max_offsets, ends, presses, shape, begin, end, sparse, out)
 
-    visited = sum(map_chunks(compute, len(along) * len(presses), min_chunk=2000))
-    record_visits(along, across, ends, presses, shape[1], visited)
-
-
-def record_visits(
-    along: Array, across: Array, ends: geometry.Ends, presses: Array, extents: Array, visited: int
-) -> None:
-    """Count visited fibres and spans if the program is profiled; arguments are those of the kernels."""
-    if not profiling.is_profiling():
-        return
-    pads, fibres, knots = along.shape
-    max_offsets = geometry.max_offsets(across, ends)
-    touched = sum(int(geometry.count_touched(offsets, presses, extents, ends)[-1]) for offsets in max_offsets)
-    profiling.add_count("fibres, press by press", touched, pads * len(presses) * fibres)
-    profiling.add_count("spans, press by press", visited, pads * len(presses) * fibres * (knots - 1))
+    map_chunks(compute, len(along) * len(presses), min_chunk=2000)
 
 
 def _sum_simultaneous(signals: Array, shape: tuple[int, ...]) -> Array:

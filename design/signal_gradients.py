@@ -6,7 +6,7 @@ from functools import cached_property
 
 import numpy as np
 
-from padforge.design.contact import element_spacings, press_shape, record_visits, search_precision, weight_table
+from padforge.design.contact import element_spacings, press_shape, search_precision, weight_table
 from padforge.design.kernels.element_signals import element_signals, elements_gradient, fibre_elements
 from padforge.design.kernels.exact_gradient import signals_gradient
 from padforge.design.kernels.exact_signals import exact_signals
@@ -58,13 +58,12 @@ class FibreCurves:
             law, table = shape[2], weight_table(contact, self.unit_mm)
             spacings = element_spacings(contact, self.unit_mm, search_precision(contact))
             elements = fibre_elements(t, v, d, ends.horizontals, presses, law, spacings)
-            visited = element_signals(t, v, elements, presses, law, table, out)
+            element_signals(t, v, elements, presses, law, table, out)
             kernel = lambda upstream: elements_gradient(t, v, d, elements, presses, upstream, law, table)  # noqa: E731
         else:
             max_offsets = compute_max_offsets(v[None], ends)
             curves, none = (t[None], v[None], d[None]), np.empty(0, np.int64)
             where = max_offsets, ends, presses, shape, 0, len(presses), (none, none)
-            visited = exact_signals(curves, *where, out.reshape(-1))
+            exact_signals(curves, *where, out.reshape(-1))
             kernel = lambda upstream: signals_gradient(t, v, d, max_offsets[0], ends, presses, upstream, shape)  # noqa: E731
-        record_visits(t[None], v[None], ends, presses, shape[1], visited)
         return out.T, lambda grad_signals: np.asarray(kernel(np.ascontiguousarray(grad_signals.T)))

@@ -274,13 +274,9 @@ def _is_near(t: Any, v: Any, j: int, ct: float, cv: float, end: float) -> bool:
 
 
 @kernel
-def element_signals(along: Any, across: Any, elements: Any, presses: Any, law: Any, table: Any, out: Any) -> int:
-    """Compute the signals of a pad from its elements and the `weight_table` of the law into `out` (Q, F).
-
-    Returns:
-        Number of spans visited.
-    """
-    (fibres, n), end, visited = along.shape, law.radius, 0
+def element_signals(along: Any, across: Any, elements: Any, presses: Any, law: Any, table: Any, out: Any) -> None:
+    """Compute the signals of a pad from its elements and the `weight_table` of the law into `out` (Q, F)."""
+    (fibres, n), end = along.shape, law.radius
     steps = table.shape[1] - 1
     rate = steps / end**2
     for f in range(fibres):
@@ -292,7 +288,6 @@ def element_signals(along: Any, across: Any, elements: Any, presses: Any, law: A
             for j in range(n - 1 if bottom - end < cv < top + end else 0):
                 if not _is_near(t, v, j, ct, cv, end):
                     continue
-                visited += 1
                 begin, after = elements.far_starts[f, j], elements.far_starts[f, j + 1]
                 if _is_near(t, v, j, ct, cv, law.near):
                     begin, after = elements.starts[f, j], elements.starts[f, j + 1]
@@ -309,7 +304,6 @@ def element_signals(along: Any, across: Any, elements: Any, presses: Any, law: A
                         weight += directed * (way * way / square)
                     total += elements.length[k] * weight
             out[q, f] = total
-    return visited
 
 
 @kernel

@@ -466,13 +466,13 @@ def _compute_fibre_signal(
     span: Any,
     scratch: Any,
     stretches: Any,
-) -> tuple[float, int]:
-    """Return the signal of one fibre for the press at (ct, cv), and the number of spans visited."""
+) -> float:
+    """Return the signal of one fibre for the press at (ct, cv)."""
     n, begin, end = len(t), ct + extents[0], ct + extents[1]
     if end <= t[0] or begin >= t[n - 1]:
-        return 0.0, 0
+        return 0.0
     tolerance, is_plain = 4 * EPS * (abs(cv) + law.radius), law.weight == UNIFORM and law.length == MANHATTAN
-    total, visited, j = 0.0, 0, piece_of(begin, t, n)
+    total, j = 0.0, piece_of(begin, t, n)
     while j < n - 1 and t[j] < end:
         if min(v[j], v[j + 1]) <= cv + extents[3] + tolerance and max(v[j], v[j + 1]) >= cv + extents[2] - tolerance:
             s0 = centre_cubic(t[j], t[j + 1], v[j], v[j + 1], d[j], d[j + 1], ct, cv, span)
@@ -482,9 +482,8 @@ def _compute_fibre_signal(
                     total += _manhattan_length(span, stretches[i, 0], stretches[i, 1])
                 else:
                     total += _compute_stretch_signal(span, stretches[i, 0], stretches[i, 1], law, scratch)
-            visited += 1
         j += 1
-    return total, visited
+    return total
 
 
 @kernel
@@ -500,7 +499,7 @@ def make_scratch(breaks: int) -> Any:
 @kernel
 def exact_signals(
     curves: Any, max_offsets: Any, ends: Any, presses: Any, shape: Any, begin: int, end: int, sparse: Any, signal: Any
-) -> int:
+) -> None:
     """Compute signals of pads for some presses, only of the fibres that a press can touch.
 
     Args:
@@ -513,16 +512,11 @@ def exact_signals(
         end: index after the last one.
         sparse: empty arrays, or for one pad the starts (Q + 1,) of `count_touched` and an array for fibre indices.
         signal: receives the signals; shape (P Q F,), zeros, or as many values as there are fibre indices.
-
-    Returns:
-        Number of spans visited.
     """
     chains = shape[0]
     stretches, scratch = make_scratch(max(chains[0].shape[1], chains[1].shape[1]))
     frames, span = (select_frame(shape, 0), select_frame(shape, 1)), np.empty(6)
-    return _compute_signals(
-        curves, max_offsets, ends, presses, frames, begin, end, sparse, signal, span, stretches, scratch
-    )
+    _compute_signals(curves, max_offsets, ends, presses, frames, begin, end, sparse, signal, span, stretches, scratch)
 
 
 @kernel(_nrt=False)  # else counting references takes most of the time
@@ -539,10 +533,10 @@ def _compute_signals(
     span: Any,
     stretches: Any,
     scratch: Any,
-) -> int:
+) -> None:
     """Compute `exact_signals` from the shape in both frames, with work arrays, since no array may be allocated here."""
     (along, across, slope), (starts, fibre) = curves, sparse
-    fibres, visited = along.shape[1], 0
+    fibres = along.shape[1]
     for index in range(begin, end):
         p, q = index // len(presses), index % len(presses)
         slot = starts[q] if len(starts) else 0
@@ -552,11 +546,9 @@ def _compute_signals(
             first, last = find_touched_range(cv, extents, max_offsets[p, family], ends, family)
             for f in range(first, last):
                 t, v, d = along[p, f], across[p, f], slope[p, f]
-                value, spans = _compute_fibre_signal(t, v, d, ct, cv, chains, extents, law, span, scratch, stretches)
-                visited += spans
+                value = _compute_fibre_signal(t, v, d, ct, cv, chains, extents, law, span, scratch, stretches)
                 if len(starts):
                     fibre[slot], signal[slot] = f, value
                     slot += 1
                 else:
                     signal[index * fibres + f] = value
-    return visited

@@ -89,11 +89,6 @@ def add_count(name: str, evaluated: int, total: int) -> None:
             _active.counts[name][1] += total
 
 
-def is_profiling() -> bool:
-    """Return whether a command is being profiled, for counts that take time themselves."""
-    return _active is not None
-
-
 class _TimedImports(MetaPathFinder):
     """Makes the import of each of the libraries in `HEAVY` a stage."""
 

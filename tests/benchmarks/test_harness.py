@@ -24,15 +24,15 @@ from tests.helpers.less import blank_pictures
 def bench(error=0.1, work=lambda: None, name="x"):
     def trials():
         for case in ("a", "b"):
-            yield BenchTrial(case, "plain", 7, lambda: None, lambda result: {"error": 0.5, "visited": 1.0})
-            yield BenchTrial(case, "ours", 0, work, lambda result: {"error": error, "visited": 0.25})
+            yield BenchTrial(case, "plain", 7, lambda: None, lambda result: {"error": 0.5})
+            yield BenchTrial(case, "ours", 0, work, lambda result: {"error": error})
 
     return Bench(name, trials, "error (mm)", ("plain", 7), ("ours", 0), baselines=("plain",))
 
 
-def document(seconds=1.0, error=0.1, visited=0.25, pace=1e-3, way="ours"):
+def document(seconds=1.0, error=0.1, pace=1e-3, way="ours"):
     row = {"case": "a", "way": way, "size": 0, "repetition": 0}
-    row |= {"error": error, "seconds": seconds, "paces": seconds / pace, "visited": visited, "speed": 1.0}
+    row |= {"error": error, "seconds": seconds, "paces": seconds / pace, "speed": 1.0}
     return {"bench": "x", "plain": ["plain"], "pace_s": pace, "rows": [row]}
 
 
@@ -87,7 +87,6 @@ def test_run_benches_refuses_an_unwritable_folder_before_measuring(tmp_path):
         ({}, {"seconds": 1.3, "pace": 1.3e-3}, []),  # the machine is slower
         ({}, {"seconds": 1.0, "pace": 0.7e-3}, ["slower"]),  # the machine is faster
         ({}, {"error": float("nan")}, ["less accurate"]),
-        ({}, {"visited": 0.5}, ["visits more"]),
         ({"way": "plain"}, {"seconds": 3.0, "way": "plain"}, []),
         ({"seconds": 1e-4}, {"seconds": 3e-4}, []),  # no other trial of this way is slower
         ({"error": 1e-17}, {"error": 9e-16}, []),  # rounding

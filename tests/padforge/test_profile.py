@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from padforge.common import profiling
-from padforge.design import Morphology, signals
+from padforge.design import Morphology
 from padforge.design.optimize.search import SearchOptions, search
 from padforge.design.settings import PUBLISHED_CONTACT, PadSettings, RulesSettings, SearchSettings
 from padforge.fabricate import build
@@ -44,16 +44,8 @@ def test_failing_stage_ends_profile():
         raise ValueError("on purpose")
     assert "failing" in profile.seconds
     assert sys.meta_path == finders
-    assert not profiling.is_profiling()
     profiling.add_count("nothing", 1, 2)  # no one listens
     assert not profile.counts
-
-
-def test_press_visits_only_fibres_in_reach():
-    presses = [[1, 1], [2.5, 3.0], [0.7, 2.5]]  # reaching 1 + 1, 2 + 1 and 1 + 2 of 4 + 4 fibres
-    with profiling.profiled() as profile:
-        signals(Morphology.straight(4), presses, PUBLISHED_CONTACT)
-    assert profile.counts == {"fibres, press by press": [8, 24], "spans, press by press": [8, 24]}
 
 
 def test_finished_starts_are_not_repeated(tmp_path, monkeypatch):
