@@ -12,7 +12,7 @@ from scipy.interpolate import PchipInterpolator
 from scipy.optimize import brentq
 
 from padforge.benchmarks.harness import Bench, BenchTrial
-from padforge.design.contact import signals, signals_quantized, signals_sparse
+from padforge.design.contact import signals, signals_quantized
 from padforge.design.kernels.pchip import pchip_sample
 from padforge.design.morphology import Array, Morphology
 from padforge.design.published import objective as published
@@ -113,7 +113,7 @@ def contact_trials() -> Iterator[BenchTrial]:
         yield from _ways(Morphology.random(4, knots, seed=knots), rng.uniform(1, 4, (49, 2)), PUBLISHED_CONTACT)
     for grid in GRIDS:
         pad, presses = Morphology.straight(grid), rng.uniform(1, grid, (2000, 2))
-        work = partial(signals_sparse, pad, presses, PUBLISHED_CONTACT)
+        work = partial(signals, pad, presses, PUBLISHED_CONTACT)
         yield BenchTrial(f"grid {grid}, a press", "exact", 0, work, items=len(presses))
 
 

@@ -2,7 +2,6 @@ from .contact import indented_signals as indented_signals
 from .contact import press_forces_n as press_forces_n
 from .contact import signals as signals
 from .contact import signals_quantized as signals_quantized
-from .contact import signals_sparse as signals_sparse
 from .morphology import Morphology as Morphology
 from .objectives.rules import Violation as Violation
 from .objectives.rules import check_rules as check_rules

@@ -7,7 +7,6 @@ under a tool, is a measured function of the distance to the press centre, or is 
 import math
 from collections.abc import Iterator
 from functools import lru_cache
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -35,13 +34,8 @@ from padforge.design.paths.curves import lengths
 from padforge.design.published.kernels import quantized_signals
 from padforge.design.settings import DEFAULT_PITCH_MM, PUBLISHED_CONTACT, Contact, Layout, Rectangle
 
-if TYPE_CHECKING:
-    from scipy.sparse import csr_array
-
 _WEIGHTS = {"uniform": geometry.UNIFORM, "inverse_square": geometry.INVERSE_SQUARE, "inverse": geometry.INVERSE}
 _LENGTHS = {"manhattan": geometry.MANHATTAN, "euclidean": geometry.EUCLIDEAN}
-_Sparse = tuple[Ints, Ints]
-_NO_SPARSE_OUTPUT = np.empty(0, np.int64), np.empty(0, np.int64)
 LAYER_REACH = {"bonded": 8.0, "slipping": 16.0}
 """Distance outside the contact at which strains of a layer are cut off, thicknesses. The neglected part is less than
 1 % of the largest signal of a straight fibre. Strains of a slipping layer decay only with the square of the distance.
@@ -102,7 +96,10 @@ def signals(
     out = np.zeros((len(along), len(centres), fibres))
     unit_mm = grid_unit_mm(pad)
     if contact.model == "shape":
-        _run_exact(along, across, ends, centres, press_shape(contact, unit_mm), _NO_SPARSE_OUTPUT, out.reshape(-1))
+        shape, max_offsets = press_shape(contact, unit_mm), geometry.max_offsets(across, ends)
+        curves = along, across, population_slopes(along, across)
+        where = curves, max_offsets, ends, centres, shape
+        map_chunks(lambda begin, end: exact_signals(*where, begin, end, out), len(along) * len(centres), 2000)
     elif len(centres):
         precision = check_float("precision", precision, 1e-6, 1.0)  # that of a `weight_table` is about 1e-7
         law, spacings = contact_law(contact, unit_mm), element_spacings(contact, unit_mm, precision)
@@ -244,44 +241,6 @@ def _depth_weights(depths_mm: Array, contact: Contact) -> Array:
     for node, weight in enumerate(cubic):
         np.put_along_axis(weights, (first + node).astype(np.int64)[..., None], weight[..., None], axis=-1)
     return weights[..., 1:]
-
-
-def signals_sparse(pad: Morphology, presses: ArrayLike, contact: Contact | None = None) -> "csr_array":
-    """Compute `signals` (Q, F) of one pad as a sparse matrix, in time and memory proportional to the touched fibres.
-
-    Args:
-        pad: the fibres.
-        presses: centres; shape (Q, 2), grid units.
-        contact: as in `signals`.
-    """
-    from scipy.sparse import csr_array, vstack
-
-    contact = or_default("contact", contact, Contact)
-    along, across, ends, _ = fibre_axes(check_type("pad", pad, Morphology))
-    centres, _ = check_presses(presses)
-    if contact.model != "shape":
-        blocks = np.array_split(centres, range(1000, len(centres), 1000))  # 1000 rows are dense at a time
-        return csr_array(vstack([csr_array(signals(pad, block, contact)) for block in blocks], format="csr"))
-    shape = press_shape(contact, pad.unit_mm)
-    starts = geometry.count_touched(geometry.max_offsets(across, ends)[0], centres, shape[1], ends)
-    check_memory(int(starts[-1]))
-    fibre, signal = np.empty(starts[-1], np.int64), np.empty(starts[-1])
-    _run_exact(along, across, ends, centres, shape, (starts, fibre), signal)
-    matrix = csr_array((signal, fibre, starts), shape=(len(centres), len(pad.knots)))
-    matrix.eliminate_zeros()
-    return matrix
-
-
-def _run_exact(
-    along: Array, across: Array, ends: geometry.Ends, presses: Array, shape: PressShape, sparse: _Sparse, out: Array
-) -> None:
-    """Run `exact_signals` on all cores."""
-    max_offsets, curves = geometry.max_offsets(across, ends), (along, across, population_slopes(along, across))
-
-    def compute(begin: int, end: int) -> None:
-        exact_signals(curves, max_offsets, ends, presses, shape, begin, end, sparse, out)
-
-    map_chunks(compute, len(along) * len(presses), min_chunk=2000)
 
 
 def _sum_simultaneous(signals: Array, shape: tuple[int, ...]) -> Array:
@@ -492,7 +451,7 @@ def signals_quantized(
 def check_memory(values: int) -> None:
     """Check that signals fit into memory."""
     if values > MAX_VALUES:
-        raise InputError(f"these are {values} signals, allowed at once are {MAX_VALUES}; signals_sparse takes less")
+        raise InputError(f"these are {values} signals, allowed at once are {MAX_VALUES}")
 
 
 def check_samples(samples: int, fibres: int) -> int:

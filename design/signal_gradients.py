@@ -62,8 +62,7 @@ class FibreCurves:
             kernel = lambda upstream: elements_gradient(t, v, d, elements, presses, upstream, law, table)  # noqa: E731
         else:
             max_offsets = compute_max_offsets(v[None], ends)
-            curves, none = (t[None], v[None], d[None]), np.empty(0, np.int64)
-            where = max_offsets, ends, presses, shape, 0, len(presses), (none, none)
-            exact_signals(curves, *where, out.reshape(-1))
+            curves = t[None], v[None], d[None]
+            exact_signals(curves, max_offsets, ends, presses, shape, 0, len(presses), out[None])
             kernel = lambda upstream: signals_gradient(t, v, d, max_offsets[0], ends, presses, upstream, shape)  # noqa: E731
         return out.T, lambda grad_signals: np.asarray(kernel(np.ascontiguousarray(grad_signals.T)))

@@ -498,7 +498,7 @@ def make_scratch(breaks: int) -> Any:
 
 @kernel
 def exact_signals(
-    curves: Any, max_offsets: Any, ends: Any, presses: Any, shape: Any, begin: int, end: int, sparse: Any, signal: Any
+    curves: Any, max_offsets: Any, ends: Any, presses: Any, shape: Any, begin: int, end: int, out: Any
 ) -> None:
     """Compute signals of pads for some presses, only of the fibres that a press can touch.
 
@@ -510,13 +510,12 @@ def exact_signals(
         shape: chains, extents and law of the press.
         begin: first of the P Q presses.
         end: index after the last one.
-        sparse: empty arrays, or for one pad the starts (Q + 1,) of `count_touched` and an array for fibre indices.
-        signal: receives the signals; shape (P Q F,), zeros, or as many values as there are fibre indices.
+        out: receives the signals; shape (P, Q, F), zeros.
     """
     chains = shape[0]
     stretches, scratch = make_scratch(max(chains[0].shape[1], chains[1].shape[1]))
     frames, span = (select_frame(shape, 0), select_frame(shape, 1)), np.empty(6)
-    _compute_signals(curves, max_offsets, ends, presses, frames, begin, end, sparse, signal, span, stretches, scratch)
+    _compute_signals(curves, max_offsets, ends, presses, frames, begin, end, span, stretches, scratch, out)
 
 
 @kernel(_nrt=False)  # else counting references takes most of the time
@@ -528,27 +527,19 @@ def _compute_signals(
     frames: Any,
     begin: int,
     end: int,
-    sparse: Any,
-    signal: Any,
     span: Any,
     stretches: Any,
     scratch: Any,
+    out: Any,
 ) -> None:
     """Compute `exact_signals` from the shape in both frames, with work arrays, since no array may be allocated here."""
-    (along, across, slope), (starts, fibre) = curves, sparse
-    fibres = along.shape[1]
+    along, across, slope = curves
     for index in range(begin, end):
         p, q = index // len(presses), index % len(presses)
-        slot = starts[q] if len(starts) else 0
         for family in range(2):
             ct, cv = presses[q, family], presses[q, 1 - family]
             chains, extents, law = frames[0] if family == 0 else frames[1]
             first, last = find_touched_range(cv, extents, max_offsets[p, family], ends, family)
             for f in range(first, last):
                 t, v, d = along[p, f], across[p, f], slope[p, f]
-                value = _compute_fibre_signal(t, v, d, ct, cv, chains, extents, law, span, scratch, stretches)
-                if len(starts):
-                    fibre[slot], signal[slot] = f, value
-                    slot += 1
-                else:
-                    signal[index * fibres + f] = value
+                out[p, q, f] = _compute_fibre_signal(t, v, d, ct, cv, chains, extents, law, span, scratch, stretches)

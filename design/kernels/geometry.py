@@ -239,18 +239,6 @@ def find_touched_range(cv: float, extents: Any, max_offset: float, ends: Any, fa
     return before + int(first), before + int(end)
 
 
-@kernel
-def count_touched(max_offsets: Any, presses: Any, extents: Any, ends: Any) -> Any:
-    """Return the cumulative number (Q + 1,) of fibres that presses can touch on one pad of `max_offsets` (2,)."""
-    starts = np.zeros(len(presses) + 1, np.int64)
-    for q in range(len(presses)):
-        starts[q + 1] = starts[q]
-        for family in range(2):
-            first, end = find_touched_range(presses[q, 1 - family], extents[family], max_offsets[family], ends, family)
-            starts[q + 1] += max(end - first, 0)
-    return starts
-
-
 _BOX_SEGMENTS = 8
 """Segments per bounding box."""
 

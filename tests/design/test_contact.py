@@ -14,7 +14,7 @@ from padforge.design import (
     signals,
     signals_quantized,
 )
-from padforge.design.contact import half_width_mm, signals_sparse
+from padforge.design.contact import half_width_mm
 from padforge.design.contact_set import judged_contacts, served_contacts
 from padforge.design.layer import solve_press
 from padforge.design.objectives.rules import check_rules
@@ -54,8 +54,6 @@ def test_signals_of_a_transposed_rectangle(contact, pad):
     places, other = np.random.default_rng(0).uniform(-0.3, 0.3 + np.array(pad.layout.extent), (40, 2)), turned(pad)
     found = signals(pad, places, contact)[:, order(pad)]
     np.testing.assert_allclose(signals(other, places[:, ::-1], exchanged), found, rtol=1e-8, atol=1e-8)
-    sparse = signals_sparse(other, places[:, ::-1], exchanged).toarray()
-    np.testing.assert_allclose(sparse, found, rtol=1e-8, atol=1e-8)
     # a sample on the edge of the disc may fall to either side of it by rounding
     sampled = signals_quantized(pad, places, contact, 300)[:, order(pad)]
     assert np.isclose(signals_quantized(other, places[:, ::-1], exchanged, 300), sampled, atol=1e-8).mean() > 0.99

@@ -69,7 +69,6 @@ VALUES: dict[str, Callable[[], object]] = {
     "presses that are NaN": lambda: signals(PAD, [[np.nan, 1]]),
     "presses of three numbers": lambda: signals(PAD, [[1, 2, 3]]),
     "sampled presses that are NaN": lambda: design.signals_quantized(PAD, [[np.nan, 1]]),
-    "sparse presses that are NaN": lambda: design.signals_sparse(PAD, [[np.nan, 1]]),
     "a precision": lambda: signals(PAD, [[1, 1]], Contact(), precision=1e-7),
     "depths of a profile": lambda: design.indented_signals(PAD, [[1, 1]], 0.1, Contact(model="profile")),
     "depths of a shape": lambda: design.indented_signals(PAD, [[1, 1]], 0.1, Contact(radius=0.6)),

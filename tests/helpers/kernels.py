@@ -35,7 +35,6 @@ def use_design() -> None:
     contacts = design.Contact(), PUBLISHED_CONTACT, PUBLISHED_CONTACT.model_copy(update={"sides": None})
     for contact in contacts:
         design.signals(pad, presses, contact)
-        design.signals_sparse(pad, presses, contact)
     design.signals_quantized(pad, presses)
     design.published_objective(pad)
     ambiguity_map(pad, presses, contacts[0], 1, 0.1)

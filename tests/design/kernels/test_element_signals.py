@@ -7,7 +7,7 @@ import pytest
 from numpy.polynomial import Polynomial
 from scipy.interpolate import CubicSpline, PchipInterpolator
 
-from padforge.design import Contact, Morphology, signals, signals_quantized, signals_sparse
+from padforge.design import Contact, Morphology, signals, signals_quantized
 from padforge.design.contact import fibre_axes, profile_weights
 from padforge.design.kernels.element_signals import LAYER_PRECISION, PROFILE_PRECISION
 from padforge.design.kernels.geometry import DEGREE
@@ -69,12 +69,11 @@ def test_signals_are_precise_where_a_bend_may_be_missed(contact, seed, press, fi
 
 @pytest.mark.parametrize("contact", [PROFILES["broad"], Contact()], ids=["profile", "layer"])
 def test_signals_of_elements_agree_in_every_form(contact):
-    """One press by one, of several pads, of presses at once, sparse, and in blocks."""
+    """One press by one, of several pads, and of presses at once."""
     pads = [Morphology.random(2, 3, seed=seed) for seed in (1, 2)]
     presses = np.random.default_rng(0).uniform(0, 3, (2200, 2))
     found = signals(np.array([pad.knots for pad in pads]), presses, contact)
     np.testing.assert_array_equal(signals(pads[1], presses[[7]], contact), found[1, [7]])
-    np.testing.assert_array_equal(signals_sparse(pads[0], presses, contact).toarray(), found[0])
     together = signals(pads[0], presses.reshape(1100, 2, 2), contact)
     np.testing.assert_allclose(together, found[0, ::2] + found[0, 1::2], rtol=1e-12, atol=1e-12)
 

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.interpolate import PchipInterpolator
 
-from padforge.design import Contact, Morphology, signals, signals_quantized, signals_sparse
+from padforge.design import Contact, Morphology, signals, signals_quantized
 from padforge.design.settings import PUBLISHED_CONTACT, Layout
 from tests.design import wild_pads as wild
 
@@ -80,8 +80,8 @@ def test_signals_on_wild_pads_are_within_0_and_the_fibre_length(pad, contact, se
     st.sampled_from(wild.KINDS), st.integers(1, 3), st.integers(0, 6), st.integers(0, 2), wild.wild_contacts, wild.SEEDS
 )
 @settings(max_examples=25)
-def test_signals_do_not_depend_on_batching_or_sparsity(kind, grid, count, population, contact, seed):
-    """Presses at once add up; order, other pads beside it, the layout in memory and sparseness change no bit."""
+def test_signals_do_not_depend_on_batching(kind, grid, count, population, contact, seed):
+    """Presses at once add up; order, other pads beside it, and the layout in memory change no bit."""
     rng = np.random.default_rng(seed)
     pads = [Morphology(wild.wild_knots(kind, grid, count, rng)) for _ in range(population)]
     knots = np.array([pad.knots for pad in pads]).reshape(-1, 2 * grid, count + 2, 2)
@@ -94,7 +94,6 @@ def test_signals_do_not_depend_on_batching_or_sparsity(kind, grid, count, popula
     np.testing.assert_allclose(together, found[:, ::2] + found[:, 1::2], rtol=1e-12)
     for pad, alone in zip(pads, found, strict=True):
         np.testing.assert_array_equal(signals(pad, presses, contact), alone)
-        np.testing.assert_array_equal(signals_sparse(pad, presses, contact).toarray(), alone)
 
 
 @pytest.mark.parametrize(
@@ -124,9 +123,8 @@ def test_signals_of_many_presses_are_those_of_each():
 
 def test_signals_of_no_presses_and_of_ones_far_away():
     pad = Morphology.random(2, 3, seed=0)
-    for function in (signals, signals_quantized, signals_sparse):
+    for function in (signals, signals_quantized):
         assert function(pad, []).shape == (0, 4)
         assert not function(pad, [[50, 50], [-9, 1]], PUBLISHED_CONTACT).sum()
-    for function in (signals, signals_quantized):
         none = function(pad, np.empty((5, 0, 2)))
         assert (none.shape, none.any()) == ((5, 4), False)
