@@ -3,10 +3,15 @@
 from collections.abc import Iterator, Mapping
 from functools import partial
 
+import numpy as np
+
 from padforge.benchmarks.harness import Bench, BenchTrial
+from padforge.common.parallel import one_thread
+from padforge.design.contact import signals
+from padforge.design.objectives.fibre_loss import failure_subsets
 from padforge.design.objectives.rules import check_rules
 from padforge.design.optimize.search import SearchResult, search
-from padforge.design.published.networks import localisation_error
+from padforge.design.published.networks import SimulatedPresses
 from padforge.design.settings import PUBLISHED_CONTACT, PUBLISHED_PAD, PUBLISHED_SEARCH, RulesSettings
 
 KNOTS = (5, 20)
@@ -38,8 +43,14 @@ def trials() -> Iterator[BenchTrial]:
 
 def evaluate_pad(result: SearchResult) -> Mapping[str, float]:
     """Return the localisation errors with up to three failed fibres, their mean, and the number of broken rules."""
-    errors = [level.mean for level in localisation_error(result.morphology, subsets=SUBSETS)]
-    row = {"error": sum(errors) / len(errors), "violations": len(check_rules(result.morphology, RulesSettings()))}
+    pad, errors = result.morphology, []
+    presses = SimulatedPresses.simulate(pad, 32, 2000, 0, partial(signals, pad, contact=PUBLISHED_CONTACT))
+    for n_failed in range(4):
+        failures = failure_subsets(len(pad.knots), n_failed, SUBSETS)
+        with one_thread():
+            networks = presses.fit(failures, 50)
+        errors.append(float(np.mean([presses.test_errors(*pair) for pair in zip(networks, failures, strict=True)])))
+    row = {"error": sum(errors) / len(errors), "violations": len(check_rules(pad, RulesSettings()))}
     return row | {f"failed_{number}": error for number, error in enumerate(errors)}
 
 

@@ -11,8 +11,6 @@ from .optimize.search import SearchResult as SearchResult
 from .optimize.search import search as search
 from .paths.curves import crossings as crossings
 from .paths.curves import flatten as flatten
-from .published.networks import FailureError as FailureError
-from .published.networks import localisation_error as localisation_error
 from .published.objective import published_objective as published_objective
 from .report import draw_plan as draw_plan
 from .settings import Contact as Contact

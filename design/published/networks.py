@@ -1,23 +1,17 @@
 """The published localizer in simulation: networks of one hidden layer, and their errors with fibres failed."""
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import partial
 from threading import Lock
 
 import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
 
-from padforge.common.parallel import one_thread, run_tasks
-from padforge.common.settings import or_default
-from padforge.common.validation import InputError, check_int
-from padforge.design.contact import serpentine_presses, signals
+from padforge.design.contact import serpentine_presses
 from padforge.design.morphology import Array, Morphology
-from padforge.design.objectives.fibre_loss import failure_subsets
 from padforge.design.published.levenberg_marquardt import train_batch
-from padforge.design.settings import MAX_FIBRES, PUBLISHED_CONTACT, Contact, Rectangle, between_fibres
+from padforge.design.settings import Rectangle, between_fibres
 
 EPOCHS = 1000
 TRAINING_SHARE, VALIDATION_SHARE = 0.7, 0.15
@@ -132,77 +126,6 @@ def initial_weights(varies: NDArray[np.bool_], hidden: int, rng: np.random.Gener
     weights *= np.divide(length, norm, out=np.zeros_like(norm), where=norm > 0)
     bias = length * np.linspace(-1, 1, hidden) * rng.choice([-1, 1], hidden)
     return np.column_stack([weights, bias])
-
-
-@dataclass(frozen=True)
-class FailureError:
-    """Localisation error with some fibres failed, in grid units, over the sets of fibres that may fail.
-
-    Attributes:
-        n_failed: number of failed fibres.
-        subsets: number of sets of failed fibres.
-        mean: of the sets' mean Euclidean distances.
-        std: their standard deviation.
-        max: the greatest of them.
-    """
-
-    n_failed: int
-    subsets: int
-    mean: float
-    std: float
-    max: float
-
-
-def localisation_error(
-    pad: Morphology,
-    contact: Contact | None = None,
-    n_failed: Sequence[int] = (0, 1, 2, 3),
-    seed: int = 0,
-    hidden: int = 50,
-    presses: int = 1024,
-    test: int = 2000,
-    subsets: int | None = None,
-) -> list[FailureError]:
-    """Evaluate the published localizer, trained afresh for every set of failed fibres (paper, evaluation).
-
-    Errors are those of presses that were never trained on; the figures of the paper include training presses, and so
-    are lower. Networks are trained in parallel, one thread a core; results do not depend on the number of cores.
-
-    Args:
-        pad: the fibres.
-        contact: contact model; PUBLISHED_CONTACT if None.
-        n_failed: numbers of failed fibres; those that would leave no fibre are left out.
-        seed: of the jitter, the test presses, the splits and the networks' first weights.
-        hidden: neurons of a network.
-        presses: to train on, a square number: a serpentine over 1..M (over 0.5..1.5 for a grid of 1), as published.
-        test: presses to test on, drawn uniformly over the same square.
-        subsets: most sets of a number of failed fibres, always the same; all if None.
-
-    Raises:
-        InputError: `presses` is no square of a number from 2, or a number of failed fibres is out of range.
-    """
-    side = math.isqrt(check_int("presses", presses, 4, 2**20))
-    if side**2 != presses:
-        raise InputError(f"presses is {presses}, allowed is a square number from 4")
-    contact, fibres = or_default("contact", contact, Contact, PUBLISHED_CONTACT), len(pad.knots)
-    numbers = [number for number in n_failed if check_int("n_failed", number, 0, 2 * MAX_FIBRES) < fibres]
-    counts = [math.comb(fibres, number) if subsets is None else subsets for number in numbers]
-    failures = [failure_subsets(fibres, number, count) for number, count in zip(numbers, counts, strict=True)]
-    simulated = SimulatedPresses.simulate(pad, side, test, seed, lambda positions: signals(pad, positions, contact))
-
-    def mean_errors(batch: list[FailureSet]) -> Array:
-        networks = simulated.fit(batch, hidden)
-        return np.array([simulated.test_errors(*pair).mean() for pair in zip(networks, batch, strict=True)])
-
-    batches = [batch for level in failures for batch in split_batches(level)]
-    with one_thread():
-        means = dict(run_tasks((i, partial(mean_errors, batch)) for i, batch in enumerate(batches)))
-    errors = np.concatenate([np.empty(0), *(means[i] for i in range(len(batches)))])
-    levels = np.split(errors, np.cumsum([len(sets) for sets in failures[:-1]], dtype=int))
-    return [
-        FailureError(len(sets[0]), len(level), float(level.mean()), float(level.std()), float(level.max()))
-        for sets, level in zip(failures, levels, strict=False)
-    ]
 
 
 def split_batches(failures: Sequence[FailureSet]) -> list[list[FailureSet]]:

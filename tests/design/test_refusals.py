@@ -85,8 +85,6 @@ VALUES: dict[str, Callable[[], object]] = {
     "a sensed area": lambda: design.score(Morphology.straight(3), size=PadSettings(sensed_mm=(46, 20))),
     "too many fibres to compare": lambda: design.score(Morphology.random(16, 3000, seed=0), max_failures=0),
     "no noise": lambda: design.score(PAD, noise=0.0),
-    "training presses": lambda: design.localisation_error(PAD, presses=1000),
-    "failed fibres": lambda: design.localisation_error(PAD, n_failed=(-1,)),
     "an origin of other fibres": lambda: design.search(PadSettings(grid=2), origin=Morphology.straight(3)),
     "a population": lambda: design.search(settings=SearchSettings(method="genetic", population=100_000)),
     "a time budget": lambda: design.SearchOptions(time_budget=-1),

@@ -1,7 +1,6 @@
 """Evaluation by simulation: the published order of the pads, and fresh test presses."""
 
-import os
-from typing import Any
+from functools import partial
 
 import numpy as np
 import pytest
@@ -11,18 +10,9 @@ from padforge.design.published.networks import (
     SimulatedPresses,
     fit_batch,
     fresh_presses,
-    localisation_error,
     training_presses,
 )
-from padforge.design.settings import Layout, between_fibres
-
-
-def test_localisation_error_summarises_all_failure_subsets():
-    found = localisation_error(Morphology.random(2, 5, seed=1), n_failed=(0, 2, 4), presses=144, test=300, hidden=10)
-    assert [(level.n_failed, level.subsets) for level in found] == [(0, 1), (2, 6)]  # one fibre works at least
-    assert found[0].std == 0
-    assert found[0].mean < found[1].mean
-    assert all(level.mean <= level.max and (level.subsets == 1) == (level.std == 0) for level in found)
+from padforge.design.settings import PUBLISHED_CONTACT, Layout, between_fibres
 
 
 def test_networks_ignore_the_signals_of_failed_fibres():
@@ -46,22 +36,16 @@ def test_networks_are_scaled_by_their_training_samples_alone():
         np.testing.assert_array_equal(scaler.transform(samples).max(axis=0), 1)
 
 
-def test_localisation_error_of_the_published_pad_is_below_the_square_grid(published):
+def test_errors_of_the_published_pad_are_below_those_of_the_square_grid(published):
     square, curved = (Morphology.load(published / f"{name}.mat") for name in ("square_grid_cir", "5para_dis"))
-    straight = localisation_error(square, Contact(sides=50), n_failed=(0, 1), subsets=1)
-    found = localisation_error(curved, n_failed=(0, 1), subsets=1)
-    for before, after in zip(straight, found, strict=True):
-        assert after.mean < 0.7 * before.mean
-    assert 0.15 < straight[0].mean < 0.3
-    assert 0.04 < found[0].mean < 0.12
-
-
-def test_localisation_error_depends_on_its_seed_and_not_on_cores(monkeypatch):
-    pad = Morphology.random(2, 3, seed=1)
-    asked: dict[str, Any] = {"presses": 100, "test": 100, "hidden": 8, "subsets": 3}
-    side_by_side, other = (localisation_error(pad, n_failed=(0, 1), seed=seed, **asked) for seed in (0, 1))
-    monkeypatch.setattr(os, "cpu_count", lambda: 1)
-    assert localisation_error(pad, n_failed=(0, 1), **asked) == side_by_side != other
+    errors = []
+    for pad, contact in ((square, Contact(sides=50)), (curved, PUBLISHED_CONTACT)):
+        presses = SimulatedPresses.simulate(pad, 32, 2000, 0, partial(signals, pad, contact=contact))
+        errors.append([presses.test_errors(presses.fit([failed], 50)[0], failed).mean() for failed in ((), (0,))])
+    straight, found = np.array(errors)
+    assert (found < 0.7 * straight).all()
+    assert 0.15 < straight[0] < 0.3
+    assert 0.04 < found[0] < 0.12
 
 
 @pytest.mark.parametrize("grid", [1, 4])
