@@ -1,14 +1,14 @@
 """Scores of a pad: the table of terms that `score`, the searches, design.json and the report have in common.
 
 To add a term, write a function of a `ScoredPad` and add a row to TERMS; it then appears in `score`, in design.json and
-in the report (published terms only in `score` and in designs for a shape). For a search to minimise it as well, add its
-weight to `SearchSettings`, 0 by default, and name in the row the key of the weight and its `loss`, the function that
-returns its value and gradient.
+in the report (published terms only in `score` and in designs for a shape). For a search to minimise it as well, follow
+`sharpness`: a weight in `SearchSettings`, 0 by default, a term of `SearchProblem.objective`, and its gradient, of
+`sharpness_loss`, in `GradientSearch`.
 
 To add a rule, see `padforge.design.objectives.rules`.
 """
 
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -76,9 +76,6 @@ class Term:
     name: str  # of the value, or the common prefix of several
     description: str  # text for people; `{}` stands for the suffix of the name
     compute: Callable[[ScoredPad], float | Mapping[object, float]]  # returns the value, or several by their suffix
-    weight: str | None = None  # key of its weight in `[search]`; None if no search minimises it
-    # returns its value in a search and its gradient (3, F, n) by the curves
-    loss: Callable[[FibreCurves, Contact, PadSettings], tuple[float, Array]] | None = None
     is_published: bool = False  # whether it belongs to the published method, whose contact is a shape
 
 
@@ -87,7 +84,8 @@ def sharpness(signals: Array) -> float:
     return float(np.abs(np.diff(signals, n=2, axis=1)).mean())
 
 
-def _sharpness_loss(curves: FibreCurves, contact: Contact, size: PadSettings) -> tuple[float, Array]:
+def sharpness_loss(curves: FibreCurves, contact: Contact, size: PadSettings) -> tuple[float, Array]:
+    """Return the sharpness in a search, and its gradient (3, F, n) by the curves."""
     signals, differentiate = curves.signals(serpentine_presses(size.sensed, SEARCH_SIDE), contact)
     signs = np.sign(np.diff(signals, n=2, axis=1))
     # the transpose of a second difference is the second difference of the padded array
@@ -121,8 +119,6 @@ TERMS = (
         "sharpness",
         "mean second difference of the signals along a serpentine, grid units",
         lambda s: sharpness(s.serpentine_signals.T),
-        weight="sharpness",
-        loss=_sharpness_loss,
     ),
     Term("penalty", "penalty of {} in the gradient search", _penalties),
     Term(
@@ -147,13 +143,6 @@ TERMS = (
 def terms_of(contact: Contact) -> list[str]:
     """Return the names of the rows of TERMS for pads designed for a contact; published ones need a shape."""
     return [term.name for term in TERMS if contact.model == "shape" or not term.is_published]
-
-
-def weighted_terms(search: SearchSettings) -> Iterator[tuple[float, Term]]:
-    """Yield the terms that a search minimises in addition to the expected error, with their weights above 0."""
-    for term in TERMS:
-        if term.weight is not None and (weight := getattr(search, term.weight)) > 0:
-            yield weight, term
 
 
 def describe_terms(names: Iterable[str]) -> dict[str, str]:

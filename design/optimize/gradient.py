@@ -15,7 +15,7 @@ from padforge.design.morphology import MARGIN, Array, Morphology, assemble_knots
 from padforge.design.objectives import criterion as objective
 from padforge.design.objectives.fibre_loss import failure_shares, sample_failures
 from padforge.design.objectives.penalties import penalties
-from padforge.design.objectives.score import weighted_terms
+from padforge.design.objectives.score import sharpness_loss
 from padforge.design.optimize.problem import SearchProblem
 from padforge.design.paths.curves import refine
 from padforge.design.paths.keep_outs import pass_keep_outs, straight_paths
@@ -377,7 +377,7 @@ class GradientSearch:
         return np.stack([result.grad_along, result.grad_across])
 
     def _objective(self, curves: FibreCurves, noise_factor: float) -> tuple[float, Array]:
-        """Return the sum of the relative error and the weighted terms, and its gradient (3, F, n) by the curves.
+        """Return the sum of the relative error and the weighted sharpness, and its gradient (3, F, n) by the curves.
 
         The relative error R depends on the errors e_ck under each contact c with k failed fibres. A step computes them
         on random presses and failures, under one contact alone; running means of earlier steps stand in for the others.
@@ -411,11 +411,10 @@ class GradientSearch:
         total, grad_means = objective.relative_error(self._mean_errors, straight_errors, shares)
         grad_errors = grad_means[drawn] @ means_of_sets
         gradient = differentiate(grad_errors) / probabilities[drawn]
-        # 5. the terms that `[search]` weighs
-        for weight, term in weighted_terms(search):
-            if term.loss is not None:
-                loss, grad_curves = term.loss(curves, self.problem.contacts[0], pad)
-                total, gradient = total + weight * loss, gradient + weight * grad_curves
+        # 5. the sharpness
+        if (weight := search.sharpness) > 0:
+            loss, grad_curves = sharpness_loss(curves, self.problem.contacts[0], pad)
+            total, gradient = total + weight * loss, gradient + weight * grad_curves
         return total, gradient
 
     def _errors(

@@ -13,7 +13,7 @@ from padforge.design.objectives.ambiguity import free_presses
 from padforge.design.objectives.criterion import criterion_errors, relative_error
 from padforge.design.objectives.fibre_loss import failure_shares
 from padforge.design.objectives.rules import Violation, check_rules
-from padforge.design.objectives.score import ScoredPad, weighted_terms
+from padforge.design.objectives.score import ScoredPad, sharpness
 from padforge.design.paths.keep_outs import check_fibre_ends
 from padforge.design.settings import Contact, PadSettings, RulesSettings, SearchSettings
 
@@ -57,14 +57,12 @@ class SearchProblem:
     def objective(self, pad: Morphology) -> float:
         """Return the objective of the search, always on the same presses.
 
-        It is the relative error over all contacts, plus the weighted terms under the main contact.
+        It is the relative error over all contacts, plus the weighted sharpness under the main contact.
         """
         shares = failure_shares(self.search.max_failures)
         error, _ = relative_error(self._criterion(pad), self.straight_errors, shares)
-        scored = self.scored(pad)
-        return error + sum(
-            weight * scored.terms([term.name])[term.name] for weight, term in weighted_terms(self.search)
-        )
+        weight = self.search.sharpness
+        return error + (weight * sharpness(self.scored(pad).serpentine_signals.T) if weight else 0.0)
 
     def scored(self, pad: Morphology) -> ScoredPad:
         """Return the scores of a pad under the main contact."""
