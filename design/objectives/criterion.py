@@ -24,12 +24,11 @@ presses of a coarse grid over the remaining pad whose responses resemble some pr
 """
 
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from padforge.common.compilation import kernel
 from padforge.design.contact import grid_positions, relative_stretch
 from padforge.design.kernels.error_bound import error_bound
 from padforge.design.kernels.leave_one_out import leave_one_out_errors
@@ -207,49 +206,14 @@ def confusable(near: Array, far: Array, masks: Array) -> Ints:
     if not far.shape[1]:
         return np.empty(0, np.int64)
     max_square = (MAX_PARTNER_DISTANCE * WIDTH) ** 2
-    squares = _min_squared_distances(np.ascontiguousarray(near.T), np.ascontiguousarray(far.T), masks, max_square)
+    touched = near.any(axis=1)  # other fibres, most of them on a large pad, are the same for all presses of the window
+    others = far[~touched].T ** 2 @ masks[:, ~touched].T
+    near, far, working = near[touched].T, far[touched].T, masks[:, touched].T
+    squares = np.full(len(far), max_square)
+    for i in np.flatnonzero(others.min(axis=1) < max_square):
+        squares[i] = ((far[i] - near) ** 2 @ working + others[i]).min()
     best = np.argsort(squares, kind="stable")[:MAX_PARTNERS]
     return np.sort(best[squares[best] < max_square])
-
-
-@kernel
-def _min_squared_distances(near: Any, far: Any, masks: Any, limit: float) -> Any:
-    """Compute the minimum squared distance (N,) of each row of far (N, F) to the rows of near (Q, F), under any mask.
-
-    `masks` (L, F) are the sets of working fibres. Distances of `limit` or more may be returned as `limit`.
-    """
-    sets, max_failures = len(masks), int(masks.shape[1] - masks.sum(axis=1).min())
-    out, largest = np.full(len(far), limit), np.empty(max_failures)
-    touched = np.array([f for f in range(near.shape[1]) if near[:, f].any()])
-    untouched = np.array([f for f in range(near.shape[1]) if not near[:, f].any()])
-    terms, untouched_square = np.empty(len(touched)), np.empty(sets)
-    for i in range(len(far)):
-        # 1. fibres that no press of the window stretches, most of them on a large pad, are the same for all rows
-        for k in range(sets):
-            untouched_square[k] = 0.0
-            for f in untouched:
-                untouched_square[k] += masks[k, f] * far[i, f] ** 2
-        min_untouched = untouched_square.min()
-        for q in range(len(near) if min_untouched < limit else 0):
-            # 2. a lower bound for all masks: the sum without its `max_failures` largest terms
-            total = min_untouched
-            largest[:] = 0.0
-            for j in range(len(touched)):
-                term = (far[i, touched[j]] - near[q, touched[j]]) ** 2
-                terms[j] = term
-                total += term
-                for k in range(max_failures):
-                    if term > largest[k]:
-                        term, largest[k] = largest[k], term
-            if total - largest.sum() >= out[i]:
-                continue
-            # 3. the distance under each mask
-            for k in range(sets):
-                square = untouched_square[k]
-                for j in range(len(touched)):
-                    square += masks[k, touched[j]] * terms[j]
-                out[i] = min(out[i], square)
-    return out
 
 
 def criterion(
