@@ -299,10 +299,9 @@ def _compile_build(fabrication: Fabrication, names: list[str], origin: Mapping[s
 def _write_files(out: Path, writers: Mapping[str, Callable[[Path], None]], result: Build) -> Build:
     """Write the files of a mould and their digests atomically, and delete those of an earlier mould."""
     try:
-        earlier = files.read_json(out / "fabrication.json", FORMAT).get("sha256")
+        earlier = files.read_json(out / "fabrication.json", FORMAT)["sha256"]
     except InputError:
         earlier = {}
-    earlier = earlier if isinstance(earlier, dict) else {}
     deleted = files.find_unchanged(out, earlier) - writers.keys()
     with files.atomic_files(out, without=deleted) as folder:
         for name, write in writers.items():

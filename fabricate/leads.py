@@ -15,7 +15,7 @@ import numpy as np
 import shapely
 
 from padforge.design.morphology import Array
-from padforge.design.paths.curves import cubic, quadratic
+from padforge.design.paths.curves import bezier_lengths, cubic, flatten_beziers, quadratic
 from padforge.design.settings import Layout
 from padforge.fabricate.settings import WELL_SLOT_MM, FabricationSettings
 
@@ -48,12 +48,7 @@ class Lead:
 
     def flatten_bends(self, tolerance_mm: float) -> Array:
         """Flatten the bends to corners (k, 2) after the fibre's end, within a tolerance."""
-        points = [np.empty((0, 2))]
-        for span in self.spans:
-            curvature = np.linalg.norm(np.diff(span, 2, axis=0), axis=1).max()
-            n_steps = max(1, int(np.ceil(np.sqrt(0.75 * curvature / tolerance_mm))))  # Wang's bound
-            points.append(cubic(span, np.arange(1, n_steps + 1) / n_steps))
-        return np.vstack(points)
+        return flatten_beziers(self.spans[None], tolerance_mm)[0][1:] if len(self.spans) else np.empty((0, 2))
 
     def trace(self, step: float, past_mm: float) -> tuple[Array, Array]:
         """Sample points (n, 2), mm, and headings (n,), at most `step` radians apart, up to `past_mm` past the edge."""
@@ -70,12 +65,8 @@ class Lead:
 
     @cached_property
     def length_mm(self) -> float:
-        """Length up to the edge, by Gauss-Legendre quadrature."""
-        nodes, weights = np.polynomial.legendre.leggauss(8)
-        u = ((nodes + 1) / 2)[:, None]
-        sides = 3 * np.diff(self.spans, axis=1)[:, :, None]  # control points of the derivatives
-        speed = sides[:, 0] * (1 - u) ** 2 + 2 * sides[:, 1] * u * (1 - u) + sides[:, 2] * u**2
-        return float((np.linalg.norm(speed, axis=-1) @ (weights / 2)).sum()) + self.run_mm
+        """Length up to the edge."""
+        return float(bezier_lengths(self.spans[None])[0]) + self.run_mm
 
     def scaled(self, factor: float) -> "Lead":
         """Return the lead scaled about the pad's middle."""

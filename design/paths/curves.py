@@ -84,8 +84,11 @@ def flatten(pad: Morphology, tolerance: float) -> list[Array]:
     Raises:
         InputError: a tolerance out of range.
     """
-    tolerance = check_float("tolerance", tolerance, 1e-8, 1e6)
-    curves = beziers(pad)
+    return flatten_beziers(beziers(pad), check_float("tolerance", tolerance, 1e-8, 1e6))
+
+
+def flatten_beziers(curves: Array, tolerance: float) -> list[Array]:
+    """Flatten rows (R, n, 4, 2) of cubic Bezier curves, each beginning where the one before ends, as `flatten` does."""
     second = np.linalg.norm(np.diff(curves, 2, axis=2), axis=3).max(axis=2)
     steps = np.maximum(1, np.ceil(np.sqrt(0.75 * second / tolerance))).astype(int).ravel()
     starts = np.cumsum(steps) - steps  # all spans at once: many take no longer than a few
@@ -97,9 +100,14 @@ def flatten(pad: Morphology, tolerance: float) -> list[Array]:
 
 def lengths(pad: Morphology) -> Array:
     """Compute the arc length of each fibre by Gauss-Legendre quadrature, to about 1e-5 where knots nearly coincide."""
+    return bezier_lengths(beziers(pad))
+
+
+def bezier_lengths(curves: Array) -> Array:
+    """Compute the lengths (R,) of rows (R, n, 4, 2) of cubic Bezier curves, as `lengths` does."""
     nodes, weights = np.polynomial.legendre.leggauss(32)
     u = ((nodes + 1) / 2)[:, None]
-    derivative = 3 * np.diff(beziers(pad), axis=2)[:, :, :, None, :]
+    derivative = 3 * np.diff(curves, axis=2)[:, :, :, None, :]
     speed = derivative[:, :, 0] * (1 - u) ** 2 + 2 * derivative[:, :, 1] * u * (1 - u) + derivative[:, :, 2] * u**2
     return (np.linalg.norm(speed, axis=-1) @ (weights / 2)).sum(axis=1)
 
