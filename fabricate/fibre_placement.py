@@ -10,6 +10,7 @@ import shapely
 from numpy.typing import NDArray
 
 from padforge.design.morphology import Array
+from padforge.design.paths.curves import arc_lengths
 from padforge.fabricate.checks import Finding, check_result
 from padforge.fabricate.plan import FibreLayer, Plan, fibre_layers, fibre_name, without
 from padforge.fabricate.settings import DispenserSettings
@@ -93,7 +94,7 @@ def _min_bend_radii(points: Array, headings: Array, positions: Array, diameter_m
     The radius is the diameter of the fibre, as an arc length, divided by the turn of the heading over that length.
     Pointwise curvature would be meaningless: a PCHIP curve is only C1, and its end slopes differ from the leads'.
     """
-    arc = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
+    arc = arc_lengths(points)
     turn = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(headings)))])
     corners = np.asarray(shapely.line_locate_point(shapely.LineString(points), shapely.points(positions)))
     half = diameter_mm / 2

@@ -81,22 +81,24 @@ def _duplicates(vertices: NDArray[np.float32]) -> NDArray[np.intp]:
 
 def _vertex_normals(vertices: NDArray[np.float32], triangles: NDArray[np.uint32]) -> NDArray[np.float64]:
     """Sum the unit normals (n, 3) of the triangles around every vertex."""
-    corners = vertices[triangles].astype(np.float64)
-    faces = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    faces /= np.maximum(np.linalg.norm(faces, axis=1, keepdims=True), np.finfo(float).tiny)
-    normals = np.zeros((len(vertices), 3))
+    normals, faces = np.zeros((len(vertices), 3)), unit_normals(vertices[triangles].astype(np.float64))
     for corner in range(3):
         np.add.at(normals, triangles[:, corner], faces)
     return normals
 
 
+def unit_normals(corners: np.ndarray) -> np.ndarray:
+    """Compute the unit normals (m, 3) of triangles (m, 3, 3); 0 for degenerate ones."""
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    lengths = np.linalg.norm(normals, axis=1, keepdims=True)
+    return np.divide(normals, lengths, out=np.zeros_like(normals), where=lengths > 0)
+
+
 def write_stl(path: Path, vertices: np.ndarray, triangles: np.ndarray) -> None:
     """Write a binary STL, mm: vertices (n, 3), triangles (m, 3) of vertex indices."""
     corners = vertices[triangles].astype("<f4")
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    lengths = np.linalg.norm(normals, axis=1, keepdims=True)
     records = np.zeros(len(corners), _STL_RECORD)
-    records["normal"] = np.divide(normals, lengths, out=np.zeros_like(normals), where=lengths > 0)
+    records["normal"] = unit_normals(corners)
     records["corners"] = corners
     path.write_bytes(b"padforge, mm".ljust(80) + np.uint32(len(records)).astype("<u4").tobytes() + records.tobytes())
 

@@ -342,7 +342,7 @@ def bend_radius(
     tangents there are unwrapped. Turns `out_of_plane` (n - 1,), rad, are those of `rolled_turns`. Returned are the
     radius, and the position (2,) of the middle of that bend.
     """
-    arc = _cumulative_length(points)
+    arc = arc_lengths(points)
     window = min(window, arc[-1])
     turn = np.concatenate([[0.0], np.cumsum(np.hypot(np.diff(headings), out_of_plane))])
     # A corner at either end of a window counts: a window starts before the turn at its first point (`turn` there,
@@ -352,7 +352,7 @@ def bend_radius(
     i, j = int(np.argmax(ahead)), int(np.argmax(behind))
     is_ahead = ahead[i] >= behind[j]
     angle, half = (ahead[i], turn[i] + ahead[i] / 2) if is_ahead else (behind[j], turn[j] - behind[j] / 2)
-    position = _interpolate(points, arc, np.interp(half, turn, arc))
+    position = interpolate(points, arc, np.interp(half, turn, arc))
     return (window / float(angle) if angle > 0 else np.inf), position
 
 
@@ -363,7 +363,7 @@ def fold_gap(line: Array, gap: float) -> tuple[float, Array] | None:
     points exactly `FOLD` gaps apart. Also returned is the middle (2,) of the two points; None if all keep the gap.
     """
     min_arc = FOLD * gap
-    arc = _cumulative_length(line)
+    arc = arc_lengths(line)
     if arc[-1] < min_arc:
         return None
     start, offset = _pairs_at_arc(line, arc, min_arc)
@@ -398,8 +398,8 @@ def _pairs_at_arc(line: Array, arc: Array, min_arc: float) -> tuple[Array, Array
     """Return points, and offsets to those exactly `min_arc` ahead: the smallest while both are on straight segments."""
     at = np.concatenate([arc, arc - min_arc])
     at = np.unique(at[(at >= 0) & (at <= arc[-1] - min_arc)])
-    here = _interpolate(line, arc, at)
-    offset = _interpolate(line, arc, at + min_arc) - here
+    here = interpolate(line, arc, at)
+    offset = interpolate(line, arc, at + min_arc) - here
     advance, step = np.diff(here, axis=0), np.diff(offset, axis=0)
     fraction = _closest_fraction(offset[:-1], step, 0, 1)
     return here[:-1] + fraction * advance, offset[:-1] + fraction * step
@@ -418,11 +418,11 @@ def _stationary(slopes: Array) -> Array:
     return np.clip(np.divide(first, bend, out=np.zeros_like(bend), where=bend != 0), 0, 1)
 
 
-def _cumulative_length(points: Array) -> Array:
+def arc_lengths(points: Array) -> Array:
     """Return the arc length (n,) of a polyline at each vertex."""
     return np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(points, axis=0).T))])
 
 
-def _interpolate(points: Array, arc: Array, where: Array | float) -> Array:
+def interpolate(points: Array, arc: Array, where: Array | float) -> Array:
     """Return the points (..., 2) of a polyline at arc lengths `where` (...)."""
     return np.stack([np.interp(where, arc, points[:, axis]) for axis in (0, 1)], axis=-1)

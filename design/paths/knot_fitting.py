@@ -10,6 +10,7 @@ import numpy as np
 
 from padforge.design.kernels.pchip import pchip_slopes
 from padforge.design.morphology import Array, Ints
+from padforge.design.paths.curves import arc_lengths, interpolate
 
 SAMPLES = 700  # samples of a polyline
 _MAX_STEP = 0.4  # largest shift of a knot along the axis in one fit, as a share of the way to its neighbour
@@ -38,9 +39,8 @@ def fit_knots(points: Array, tolerance: float, max_inner: int = 64) -> Array:
 
 def _sample(points: Array) -> tuple[Array, Array]:
     """Sample a polyline evenly (m, 2), and return the ratio of misfit along the normal to that across."""
-    arc = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(points, axis=0).T))])
-    at = np.linspace(0, arc[-1], SAMPLES)
-    samples = np.stack([np.interp(at, arc, points[:, axis]) for axis in (0, 1)], axis=1)
+    arc = arc_lengths(points)
+    samples = interpolate(points, arc, np.linspace(0, arc[-1], SAMPLES))
     samples[-1] = points[-1]
     samples = samples[np.append(True, samples[1:, 0] > np.maximum.accumulate(samples[:, 0])[:-1])]
     slope = np.gradient(samples[:, 1], samples[:, 0]) if len(samples) > 1 else np.zeros(1)

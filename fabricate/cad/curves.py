@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import BSpline
 from shapely.geometry.base import BaseGeometry
 
-from padforge.design.paths.curves import slopes
+from padforge.design.paths.curves import arc_lengths, slopes
 from padforge.fabricate.plan import Plan, polygon_rings
 
 Array = NDArray[np.float64]
@@ -239,8 +239,3 @@ def cut_spline(curve: BSpline) -> Iterator[BSpline]:
     for start, end in pairwise(cuts):
         first, last = np.searchsorted(curve.t, start), np.searchsorted(curve.t, end, side="right")
         yield BSpline(curve.t[first:last] - start, curve.c[first : last - 4], 3)
-
-
-def arc_lengths(points: Array) -> Array:
-    """Return the arc length (n,) of a polyline (n, 2) up to each vertex."""
-    return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])

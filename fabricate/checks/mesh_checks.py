@@ -14,7 +14,7 @@ from padforge.common.validation import check_float, check_int, check_type
 from padforge.design.morphology import Array
 from padforge.fabricate.checks import Finding, Status, check_result, surface
 from padforge.fabricate.checks.surface import SPECK_MM2, FaceMask, Slab, TriangleMesh, tested_width
-from padforge.fabricate.mesh import read_mesh
+from padforge.fabricate.mesh import read_mesh, unit_normals
 from padforge.fabricate.plan import areas, overlap, without
 from padforge.fabricate.settings import DEFAULTS, PrinterSettings
 
@@ -359,9 +359,7 @@ def _max_lean_deg(mesh: TriangleMesh, mask: FaceMask) -> float:
 def _faces_at_silicone(mesh: TriangleMesh, mask: FaceMask, lowest: Slab) -> FaceMask:
     """Return the faces of `mask` (m,) with silicone in front: an area enclosed by the solid, with a floor beneath."""
     faces = np.flatnonzero(mask & (mesh.centroids[:, 2] > lowest.middle_mm + _OFF_FACE_MM))
-    crosses = np.cross(*np.moveaxis(np.diff(mesh.corners[faces], axis=1), 1, 0))
-    normals = crosses / np.linalg.norm(crosses, axis=1, keepdims=True)
-    x, y, z = (mesh.centroids[faces] + _OFF_FACE_MM * normals).T
+    x, y, z = (mesh.centroids[faces] + _OFF_FACE_MM * unit_normals(mesh.corners[faces])).T
     height = np.unique(np.round(z / _OFF_FACE_MM), return_inverse=True)[1]
     largest = np.argsort(-np.bincount(height, mesh.areas[faces]), kind="stable")[:_MAX_HEIGHTS]
     result = np.zeros(len(mesh.triangles), dtype=bool)

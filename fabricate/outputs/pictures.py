@@ -19,6 +19,7 @@ from padforge.common.plotting import ALARM, FAINT, INK, PAPER
 from padforge.design.morphology import Array
 from padforge.fabricate.checks import Finding
 from padforge.fabricate.fibre_placement import Step, mirror_x
+from padforge.fabricate.mesh import unit_normals
 from padforge.fabricate.outputs import drawings
 from padforge.fabricate.plan import (
     FAMILIES,
@@ -125,7 +126,7 @@ def draw_findings(vertices: ArrayLike, triangles: ArrayLike, findings: Sequence[
 
     points = np.asarray(vertices, dtype=float)
     corners = points[np.asarray(triangles)]
-    upwards = corners[_normal_z(corners) > _FLAT]
+    upwards = corners[unit_normals(corners)[:, 2] > _FLAT]
     z = (upwards if len(upwards) else corners)[:, :, 2]  # the underside, if any, is hidden
     low, high, ground = float(z.min()), float(z.max()), float(points[:, 2].min())
     ramp = LinearSegmentedColormap.from_list("heights", _RAMP)
@@ -136,13 +137,6 @@ def draw_findings(vertices: ArrayLike, triangles: ArrayLike, findings: Sequence[
     picture.show(corners, ramp((corners[:, :, 2].mean(axis=1) - low) / ((high - low) or 1.0)))
     picture.colour_bar(ramp, f"{low - ground:.3g} mm", f"{high - ground:.3g} mm above the lowest point")
     picture.save(path, picture.mark(findings))
-
-
-def _normal_z(corners: Array) -> Array:
-    """Compute z of the unit normals (m,) of triangles (m, 3, 3); 0 for degenerate ones."""
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    lengths = np.linalg.norm(normals, axis=1)
-    return np.divide(normals[:, 2], lengths, out=np.zeros(len(lengths)), where=lengths > 0)
 
 
 def _draw_layer(picture: "_Picture", plan: Plan, layer: FibreLayer) -> list[Any]:
@@ -405,7 +399,7 @@ class _Picture:
         from matplotlib.colors import to_rgba_array
 
         faces = to_rgba_array(colours)
-        edges = np.where(np.abs(_normal_z(corners))[:, None] < _FLAT, to_rgba_array(_EDGE), faces)
+        edges = np.where(np.abs(unit_normals(corners)[:, 2:]) < _FLAT, to_rgba_array(_EDGE), faces)
         order = np.argsort(corners[:, :, 2].mean(axis=1), kind="stable")  # painter's algorithm: the lowest first
         style = {"facecolors": faces[order], "edgecolors": edges[order], "linewidths": 0.3}
         self.axes.add_collection(PolyCollection(list(corners[order, :, :2]), **style), autolim=False)

@@ -8,10 +8,10 @@ import shapely
 from scipy.spatial import KDTree
 
 from padforge.design.morphology import Morphology
+from padforge.design.paths.curves import arc_lengths
 from padforge.fabricate.cad.curves import (
     FINE_MM,
     OutlineCurve,
-    arc_lengths,
     find_joints,
     fit_spline,
     insert_joints,
