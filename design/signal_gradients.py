@@ -6,7 +6,7 @@ from functools import cached_property
 
 import numpy as np
 
-from padforge.design.contact import element_spacings, press_shape, search_precision, weight_table
+from padforge.design.contact import contact_law, element_spacings, press_shape, search_precision, weight_table
 from padforge.design.kernels.element_signals import element_signals, elements_gradient, fibre_elements
 from padforge.design.kernels.exact_gradient import signals_gradient
 from padforge.design.kernels.exact_signals import exact_signals
@@ -52,16 +52,16 @@ class FibreCurves:
 
         They are exact for a shape, and of the `search_precision` for a layer or a profile.
         """
-        t, v, d, ends, shape = self.along, self.across, self.slope, self.ends, press_shape(contact, self.unit_mm)
+        t, v, d, ends = self.along, self.across, self.slope, self.ends
         out = np.zeros((len(presses), len(t)))
         if contact.model != "shape":  # elements are cut once for both directions
-            law, table = shape[2], weight_table(contact, self.unit_mm)
+            law, table = contact_law(contact, self.unit_mm), weight_table(contact, self.unit_mm)
             spacings = element_spacings(contact, self.unit_mm, search_precision(contact))
             elements = fibre_elements(t, v, d, ends.horizontals, presses, law, spacings)
             element_signals(t, v, elements, presses, law, table, out)
             kernel = lambda upstream: elements_gradient(t, v, d, elements, presses, upstream, law, table)  # noqa: E731
         else:
-            max_offsets = compute_max_offsets(v[None], ends)
+            shape, max_offsets = press_shape(contact, self.unit_mm), compute_max_offsets(v[None], ends)
             curves = t[None], v[None], d[None]
             exact_signals(curves, max_offsets, ends, presses, shape, 0, len(presses), out[None])
             kernel = lambda upstream: signals_gradient(t, v, d, max_offsets[0], ends, presses, upstream, shape)  # noqa: E731
