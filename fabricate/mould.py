@@ -74,9 +74,9 @@ def terraces(height_mm: float, terrace_mm: float) -> list[float]:
 def mould_body(plan: Plan, wells: Sequence[BaseGeometry] = ()) -> Body:
     """Build the mould of a compensated plan: tray, ridges with wells if any, exits, numbers, pillars and pins."""
     ridges = []
-    for layer, top_outline in enumerate(plan.ridges):
-        with_wells = (top_outline | wells[layer]) if wells else top_outline
-        ridges += ridge_prisms(plan, plan.layer_fibres(layer), with_wells)
+    for layer, fibres in enumerate(plan.layers):
+        top_outline = (plan.ridges[layer] | wells[layer]) if wells else plan.ridges[layer]
+        ridges += ridge_prisms(plan, fibres, top_outline)
     tray = tray_body(plan)
     return replace(tray, adds=(*ridges, *(number for number in number_prisms(plan) if number), *tray.adds))
 
@@ -148,8 +148,7 @@ def conductive_plan(plan: Plan) -> Plan:
 def well_outlines(plan: Plan, sides: int = 64) -> list[BaseGeometry]:
     """Return the outlines of the wells at the ends of the ridges of every layer, as regular polygons, mm."""
     wells = [fibre_wells(plan, fibre, sides) for fibre in range(plan.pad.layout.fibres)]
-    layers = [plan.layer_fibres(layer) for layer in range(len(plan.heights_mm))]
-    return [shapely.union_all([wells[fibre] for fibre in fibres]) for fibres in layers]
+    return [shapely.union_all([wells[fibre] for fibre in fibres]) for fibres in plan.layers]
 
 
 def fibre_wells(plan: Plan, fibre: int, sides: int) -> BaseGeometry:

@@ -316,11 +316,17 @@ class Plan:
         return assign_layers(self.pad.layout.counts, clashes, self.settings.pad.deep_family == "horizontal")
 
     @cached_property
+    def layers(self) -> tuple[tuple[int, ...], ...]:
+        """Indices of the fibres of every layer, ascending, the shallowest layer first."""
+        fibres = list(enumerate(self.layer_indices))
+        layers = range(1 + max(self.layer_indices))
+        return tuple(tuple(fibre for fibre, index in fibres if index == layer) for layer in layers)
+
+    @cached_property
     def common_tracks(self) -> list[CommonTrack]:
         """Stretches in which tracks of different depths lie over each other, leads included."""
         stretches = []
-        for layer in range(max(self.layer_indices)):
-            shallow = self.layer_fibres(layer)
+        for layer, shallow in enumerate(self.layers[:-1]):
             deep = [fibre for fibre, index in enumerate(self.layer_indices) if index > layer]
             lines = [[shapely.get_coordinates(self.lines[fibre]) for fibre in fibres] for fibres in (shallow, deep)]
             shared = curves.common_stretches(*lines, self.settings.mould.ridge_width_mm)
@@ -339,8 +345,7 @@ class Plan:
         mould = self.settings.mould
         has_shallow = self.pad.layout.counts[self.settings.pad.deep_family == "horizontal"] > 0
         lowest_mm = mould.shallow_ridge_height_mm if has_shallow else mould.deep_ridge_height_mm
-        layers = range(1 + max(self.layer_indices))
-        return tuple(round(lowest_mm + layer * mould.level_step_mm, 9) for layer in layers)
+        return tuple(round(lowest_mm + layer * mould.level_step_mm, 9) for layer in range(len(self.layers)))
 
     @cached_property
     def silicone_mm(self) -> float:
@@ -367,18 +372,10 @@ class Plan:
         bands = shapely.buffer(lines, half, quad_segs=math.ceil(math.pi / 2 / chord), cap_style="flat")
         return shapely.union_all(bands).simplify(_OUTLINE_SHARE * tolerance)
 
-    def layer_fibres(self, layer: int) -> list[int]:
-        """Return the indices of the fibres of a layer, ascending.
-
-        Args:
-            layer: its index, from the lowest, 0.
-        """
-        return [fibre for fibre, index in enumerate(self.layer_indices) if index == layer]
-
     @cached_property
     def ridges(self) -> tuple[BaseGeometry, ...]:
         """Outlines of the tops of the ridges of every layer, mm."""
-        return tuple(self.outline(self.layer_fibres(layer)) for layer in range(len(self.heights_mm)))
+        return tuple(map(self.outline, self.layers))
 
     @cached_property
     def numbers(self) -> list[BaseGeometry | None]:
@@ -531,15 +528,13 @@ class FibreLayer:
 
 def fibre_layers(plan: Plan) -> list[FibreLayer]:
     """Return the layers of a plan in the order of fibre placement, the deepest first."""
-    indices = range(len(plan.heights_mm))
-    fibres = [tuple(plan.layer_fibres(layer)) for layer in indices]
-    families = [plan.family(members[0]) for members in fibres]
+    families = [plan.family(fibres[0]) for fibres in plan.layers]
     layers = []
     for index, family in enumerate(families):
         white = _MAX_WHITE * families[index + 1 :].count(family) / families.count(family)
         tint = bytes(round(value + white * (255 - value)) for value in bytes.fromhex(FAMILY_COLOURS[family][1:]))
         colour = f"#{tint.hex()}"
-        layers.append(FibreLayer(family, index, plan.depths_mm[index], fibres[index], colour))
+        layers.append(FibreLayer(family, index, plan.depths_mm[index], plan.layers[index], colour))
     return layers[::-1]
 
 

@@ -103,10 +103,9 @@ def _points_in(polygons: Iterable[Any]) -> list[Position]:
     return [polygon.representative_point().coords[0] for polygon in polygons]
 
 
-def _ridge_middles(plan: Plan, layer: int) -> list[tuple[float, ...]]:
-    """Return the middle of every ridge of a layer, along its centre line."""
-    lines = [line for line, index in zip(plan.lines, plan.layer_indices, strict=True) if index == layer]
-    return [line.interpolate(0.5, normalized=True).coords[0] for line in lines]
+def _ridge_middles(plan: Plan, fibres: Iterable[int]) -> list[tuple[float, ...]]:
+    """Return the middle of the ridge of every fibre, along its centre line."""
+    return [plan.lines[fibre].interpolate(0.5, normalized=True).coords[0] for fibre in fibres]
 
 
 def _check_ridge_width(plan: Plan) -> Finding:
@@ -114,7 +113,7 @@ def _check_ridge_width(plan: Plan) -> Finding:
     width, limit = plan.settings.mould.ridge_width_mm, plan.settings.printer.line_mm
     name = "two pixels" if plan.settings.printer.resin else "the nozzle"
     passed = width >= limit - 1e-9
-    positions = [] if passed else chain(*(_ridge_middles(plan, layer) for layer in range(len(plan.heights_mm))))
+    positions = [] if passed else _ridge_middles(plan, chain(*plan.layers))
     message = f"ridges are {width:g} mm wide, {name} {limit:g} mm"
     return check_result("ridge_width", passed, width, limit, message, positions)
 
@@ -149,7 +148,7 @@ def _check_slenderness(plan: Plan) -> Finding:
     ratio = height / plan.settings.mould.ridge_width_mm
     status: Status = "pass" if ratio <= _SLENDER + 1e-9 else "warn" if ratio <= _MAX_SLENDERNESS + 1e-9 else "fail"
     message = f"the tallest ridges, {height:g} mm, are {ratio:.1f} times as tall as wide"
-    positions = [] if status == "pass" else _ridge_middles(plan, len(plan.heights_mm) - 1)
+    positions = [] if status == "pass" else _ridge_middles(plan, plan.layers[-1])
     return check_result("slenderness", status, ratio, _SLENDER, message, positions)
 
 
@@ -201,7 +200,8 @@ def _check_silicone_wall(plan: Plan) -> Finding:
     if plan.feet.area:
         around = without(around, plan.feet)
     silicones = [
-        without(around, plan.outline(plan.layer_fibres(layer), height)) for layer, height in enumerate(plan.heights_mm)
+        without(around, plan.outline(fibres, height))
+        for fibres, height in zip(plan.layers, plan.heights_mm, strict=True)
     ]
     patches = [find_thin_patches(silicone, limit, plan.cavity) for silicone in silicones]
     positions = _points_in(chain(*patches))
@@ -383,10 +383,10 @@ def compute_bending_strains(plan: Plan) -> list[tuple[float, float, Position]]:
         return []
     neutral = plan.thickness_mm / 2
     strains = []
-    for layer, depth in enumerate(plan.depths_mm):
+    for fibres, depth in zip(plan.layers, plan.depths_mm, strict=True):
         z = neutral - depth + plan.settings.fibre.material.diameter_mm / 2
-        lines = [line for line, index in zip(plan.lines, plan.layer_indices, strict=True) if index == layer]
-        segments = np.concatenate([np.stack([xy[:-1], xy[1:]]) for xy in map(shapely.get_coordinates, lines)], axis=1)
+        paths = [shapely.get_coordinates(plan.lines[fibre]) for fibre in fibres]
+        segments = np.concatenate([np.stack([xy[:-1], xy[1:]]) for xy in paths], axis=1)
         steps = segments[1] - segments[0]
         squares = steps[:, 0] ** 2 / (steps**2).sum(axis=1)  # cos(a)^2
         worst = int(squares.argmin() if z < 0 else squares.argmax())
