@@ -121,12 +121,12 @@ def element_spacings(law: WeightLaw, precision: float) -> tuple[float, float]:
 
     The error relative to the largest signal is at most `precision`; for a layer this is the RMS error near the press.
     """
-    families = law.profile[: 1 + int((law.profile[0] != law.profile[1]).any())]
+    families = range(1 + int((law.profile[0] != law.profile[1]).any()))
     far = 0.5 * law.near * math.sqrt(precision / LAYER_PRECISION)  # the midpoint rule has an error of second order
-    return min(_fine_spacing(profile, law, precision) for profile in families), far
+    return min(_fine_spacing(family, law, precision) for family in families), far
 
 
-def _fine_spacing(profile: Array, law: WeightLaw, precision: float) -> float:
+def _fine_spacing(family: int, law: WeightLaw, precision: float) -> float:
     end = law.radius
     distances, shifts = end * np.arange(32) / 32, np.arange(16)[:, None] / 16
     if law.edge:  # outside the edge of a contact, strains are smooth
@@ -137,9 +137,10 @@ def _fine_spacing(profile: Array, law: WeightLaw, precision: float) -> float:
         """Return the signals (distances, shifts) of elements of this spacing that begin at shifted positions."""
         width = len(rule) * spacing
         begin = width * (np.arange(-math.ceil(end / width) - 1, math.ceil(end / width) + 1) + shifts)
-        nodes = (begin[..., None] + width * rule).reshape(len(shifts), -1)
-        lengths = np.tile(width * weights, begin.shape[-1])
-        return np.stack([straight_weights(nodes, distance, profile, law) @ lengths for distance in distances])
+        points = (begin[..., None] + width * rule).reshape(len(shifts), -1, 1) * [1.0, 0.0]
+        lengths, presses = np.tile(width * weights, begin.shape[-1]), distances[:, None] * [0.0, 1.0]
+        tangents = np.tile([1.0, 0.0], (len(lengths), 1))
+        return np.stack([sum_elements(row, lengths, tangents, presses, law, family) for row in points], axis=1)
 
     spacing = end / 4
     for _ in range(24):  # down to 1 / 200, for steep profiles
@@ -150,15 +151,6 @@ def _fine_spacing(profile: Array, law: WeightLaw, precision: float) -> float:
             break
         spacing *= 0.8
     return spacing
-
-
-@kernel
-def straight_weights(along: Any, distance: float, profile: Any, law: Any) -> Any:
-    """Return the weights of elements at coordinates of any shape along a straight fibre at a distance to the press."""
-    out = np.empty(along.shape)
-    for i, at in np.ndenumerate(along):
-        out[i] = weigh_profile(at, distance, 1.0, 0.0, profile, law)
-    return out
 
 
 @kernel(inline="always")
