@@ -211,18 +211,13 @@ def select_frame(shape: Any, family: int) -> Any:
     return (chains[0] if family == 0 else chains[1]), extents[family], framed
 
 
-@kernel
-def max_offsets(across: Any, ends: Any) -> Any:
+def max_offsets(across: Array, ends: Ends) -> Array:
     """Compute the largest offset (P, 2) of the fibres of each family from their own level."""
-    population, fibres, _ = across.shape
-    out = np.zeros((population, 2))
-    for p in range(population):
-        for f in range(fibres):
-            family = 0 if f < ends.horizontals else 1
-            level = (f + 1) * ends.spacing_y if family == 0 else (f - ends.horizontals + 1) * ends.spacing_x
-            for v in across[p, f]:
-                out[p, family] = max(out[p, family], abs(v - level))
-    return out
+    horizontals, verticals, spacing_y, spacing_x = ends
+    levels = np.append(spacing_y * np.arange(1, horizontals + 1), spacing_x * np.arange(1, verticals + 1))
+    offsets = np.abs(across - levels[:, None])
+    families = offsets[:, :horizontals], offsets[:, horizontals:]
+    return np.stack([family.max(axis=(1, 2), initial=0.0) for family in families], axis=1)
 
 
 @kernel
