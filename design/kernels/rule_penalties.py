@@ -267,36 +267,3 @@ def sum_crossings(
                 grad_q[j, 0] -= hx - dqx
                 grad_q[j, 1] -= hy - dqy
     return count, flatness
-
-
-@kernel
-def sum_end_slopes(points: Any, slope: Any, shares: Any, zone: float, weight: float, grad_slope: Any) -> float:
-    """Integrate the excess of slopes over 1 (45 degrees) within `zone` of either end of their fibre.
-
-    The gradient is by the slopes; points and shares are treated as constants.
-    """
-    total, (fibres, n) = 0.0, slope.shape
-    for f in range(fibres):
-        for i in range(n):
-            along, steep = points[f, i, 0], abs(slope[f, i]) - 1
-            if steep > 0 and (along < zone or along > points[f, n - 1, 0] - zone):
-                total += weight * shares[f, i] * steep
-                grad_slope[f, i] += weight * shares[f, i] * math.copysign(1.0, slope[f, i])
-    return total
-
-
-@kernel
-def add_arc_gradient(points: Any, grad_arc: Any, grad_points: Any) -> None:
-    """Add the gradient by points of sum(grad_arc * arc), with the arc lengths of the polylines through the points."""
-    for f in range(len(points)):
-        later = 0.0  # sum of the gradients by the later arc lengths
-        for i in range(points.shape[1] - 1, 0, -1):
-            later += grad_arc[f, i]
-            dx, dy = points[f, i, 0] - points[f, i - 1, 0], points[f, i, 1] - points[f, i - 1, 1]
-            step = math.hypot(dx, dy)
-            if later != 0 and step > 0:
-                px, py = later * dx / step, later * dy / step
-                grad_points[f, i, 0] += px
-                grad_points[f, i, 1] += py
-                grad_points[f, i - 1, 0] -= px
-                grad_points[f, i - 1, 1] -= py

@@ -23,10 +23,8 @@ from padforge.design.kernels.pchip import (
     sample_spans,
 )
 from padforge.design.kernels.rule_penalties import (
-    add_arc_gradient,
     sum_closeness,
     sum_crossings,
-    sum_end_slopes,
     sum_excess_turns,
     sum_order,
 )
@@ -170,7 +168,12 @@ def penalties(
     fibres = FibreSamples(along, across, knot_slope, points, slope, arc, pad, rules, margin, all_bends)
     gradient = Gradient(slope, along)
     values = {name: value for name, penalty in PENALTIES.items() if (value := penalty(fibres, gradient)) is not None}
-    add_arc_gradient(points, gradient.arc, gradient.points)
+    # each arc length is a sum over the steps before it
+    steps, later = np.diff(points, axis=1), gradient.arc[:, :0:-1].cumsum(axis=1)[:, ::-1, None]
+    length = np.hypot(*np.moveaxis(steps, -1, 0))[..., None]
+    pull = np.divide(later * steps, length, out=np.zeros_like(steps), where=length > 0)
+    gradient.points[:, :-1] -= pull
+    gradient.points[:, 1:] += pull
     add_samples_gradient(
         along,
         across,
@@ -304,8 +307,11 @@ def _end_slopes(fibres: FibreSamples, gradient: Gradient) -> float | None:
     zone = fibres.rules.border_mm / fibres.layout.unit_mm
     if zone == 0:
         return None
-    weight = 1 / len(fibres.arc) / fibres.mean_run
-    return sum_end_slopes(fibres.points, fibres.slope, fibres.shares, zone, weight, gradient.slope)
+    along, steep = fibres.points[..., 0], np.abs(fibres.slope) - 1
+    counts = (steep > 0) & ((along < zone) | (along > along[:, -1:] - zone))
+    weights = 1 / len(fibres.arc) / fibres.mean_run * fibres.shares * counts
+    gradient.slope += weights * np.sign(fibres.slope)
+    return float((weights * steep).sum())
 
 
 def _keep_outs(fibres: FibreSamples, gradient: Gradient) -> float | None:
