@@ -19,7 +19,7 @@ from padforge.common.mat_files import load_mat
 from padforge.common.validation import InputError, check_array, check_int, check_mapping, check_path, naming_file
 from padforge.design.kernels.geometry import INVERSE_SQUARE, MANHATTAN, UNIFORM, Ends, WeightLaw, frame_shape
 from padforge.design.published.kernels import quantized_signals
-from padforge.design.settings import DEFAULT_PITCH_MM, MAX_FIBRES, Contact, Counts, Layout, Pitch
+from padforge.design.settings import DEFAULT_PITCH_MM, FAMILIES, MAX_FIBRES, Contact, Counts, Layout, Pitch
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -324,7 +324,7 @@ def _validate(knots: Array, layout: Layout) -> None:
         if low < 0 or high > limit:
             worst = low if low < 0 else high
             raise InputError(f"a knot lies at {'xy'[axis]} = {worst:g}, allowed is 0 to {limit:g} grid units")
-    for axis, (rows, name) in enumerate(zip(layout.families, ("horizontal", "vertical"), strict=True)):
+    for axis, (rows, name) in enumerate(zip(layout.families, FAMILIES, strict=True)):
         along, across = knots[rows, :, axis], knots[rows, :, 1 - axis]
         coincident = (np.diff(along, axis=1) < MIN_SPAN).any(axis=1)
         if coincident.any():

@@ -11,6 +11,7 @@ from padforge.common.page import PageSection, collapsible, columns, figures, hea
 from padforge.common.plotting import (
     ALARM,
     FAINT,
+    FAMILY_COLOURS,
     HORIZONTAL,
     INK,
     PAPER,
@@ -30,7 +31,7 @@ from padforge.design.contact import (
 from padforge.design.layer import LayerPress, reduced_modulus_kpa
 from padforge.design.morphology import Array, Morphology
 from padforge.design.paths.curves import crossings, flatten
-from padforge.design.settings import Contact, Corners, PadSettings, RulesSettings
+from padforge.design.settings import FAMILIES, Contact, Corners, PadSettings, RulesSettings
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -38,7 +39,6 @@ if TYPE_CHECKING:
 
     from padforge.design.objectives.rules import Violation
 
-FAMILIES = (("horizontal", HORIZONTAL), ("vertical", VERTICAL))
 FORMAT = "padforge-design/1"  # format of design.json
 TOLERANCE = 1e-3  # deviation of drawn curves from exact ones, grid units
 
@@ -74,8 +74,8 @@ def draw_plan(
     for fibre, points in enumerate(flatten(pad, TOLERANCE)):
         family = pad.layout.family(fibre)
         x, y = pad.to_mm(points).T
-        name, color = FAMILIES[family]
-        gid = f"{name}-{fibre + 1 - pad.layout.families[family].start}"  # import_plan reads these names
+        color = FAMILY_COLOURS[family]
+        gid = pad.layout.fibre_name(fibre).replace(" ", "-")  # import_plan reads these names
         (line,) = axes.plot(x, y, color=color, linewidth=1.6, solid_capstyle="round", gid=gid)
         line.get_path().should_simplify = False
         ha, va, dx, dy = (("right", "center", 0.02, 0), ("center", "top", 0, 0.02))[family]
@@ -216,7 +216,7 @@ def draw_press(contact: Contact, pitch_mm: float) -> "Figure":
     section.set(xlabel="x (mm)", ylabel="height (mm)", xlim=(-far, far), ylim=(-0.05 * thickness, top), aspect="equal")
     add_caption(section, f"{contact.tool} of {contact.tool_radius_mm:g} mm, {contact.depth_mm:g} mm deep")
 
-    for (name, color), (distance, plain, directed) in zip(FAMILIES, families, strict=True):
+    for name, color, (distance, plain, directed) in zip(FAMILIES, FAMILY_COLOURS, families, strict=True):
         weights.plot(distance, plain + directed, color=color, label=f"{name}, lengthwise")
         weights.plot(distance, plain, "--", color=color, label=f"{name}, crosswise")
     weights.axhline(0, color=FAINT, linewidth=0.8)
@@ -261,7 +261,7 @@ def press_sections(
     force_n = press.force_n(reduced_modulus_kpa(modulus_kpa))
     rows = []
     families = zip(FAMILIES, contact.fibre_depths_mm, half_widths_mm(contact), fibre_strains(contact), strict=True)
-    for (name, _), depth, width, (squeeze, stretch) in families:
+    for name, depth, width, (squeeze, stretch) in families:
         result = "-" if max_strain is None else "pass" if stretch <= max_strain else "warn"
         bears = "-" if max_strain is None else f"{max_strain:.0%}"
         rows.append([name, depth, f"{width:.1f}", f"{squeeze:.0%}", f"{stretch:.0%}", bears, result])

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 
 DEFAULT_PITCH_MM = 11.25  # pitch of the built pad
 MAX_FIBRES = 1024  # fibres of one family, also of a pad made of tiles
+FAMILIES = ("horizontal", "vertical")
 
 Pair = tuple[float, float]
 Tool = Literal["dome", "ball", "flat", "finger"]  # shapes of tools that press a layer
@@ -82,6 +83,11 @@ class Layout:
     def family(self, fibre: int) -> int:
         """Family of a fibre by its index: 0 horizontal, 1 vertical. It is also the axis that the fibre runs along."""
         return int(fibre >= self.horizontals)
+
+    def fibre_name(self, fibre: int) -> str:
+        """Name of a fibre by its index, such as "horizontal 1"; each family counts from 1."""
+        family = self.family(fibre)
+        return f"{FAMILIES[family]} {fibre - self.families[family].start + 1}"
 
     @property
     def is_square(self) -> bool:

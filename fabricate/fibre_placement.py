@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from padforge.design.morphology import Array
 from padforge.design.paths.curves import arc_lengths
 from padforge.fabricate.checks import Finding, check_result
-from padforge.fabricate.plan import FibreLayer, Plan, fibre_layers, fibre_name, without
+from padforge.fabricate.plan import FibreLayer, Plan, fibre_layers, without
 from padforge.fabricate.settings import DispenserSettings
 
 TOLERANCE_MM = 0.005  # maximum distance of a toolpath from its curve: a tenth of a fine gantry's repeatability
@@ -186,7 +186,7 @@ def gcode(plan: Plan, steps: Sequence[Step]) -> str:
     ]
     for number, step in enumerate(steps, 1):
         for stroke in step.strokes:
-            name = f"fibre {stroke.fibre + 1}, {fibre_name(plan, stroke.fibre)}"
+            name = f"fibre {stroke.fibre + 1}, {plan.pad.layout.fibre_name(stroke.fibre)}"
             (start_x, start_y), *corners = stroke.positions_mm.tolist()
             end_x, end_y = corners[-1]
             program.move_to(start_x, start_y, height, dispenser.travel_mm_s)

@@ -16,17 +16,15 @@ import shapely
 from shapely import affinity
 from shapely.geometry.base import BaseGeometry
 
-from padforge.common.plotting import HORIZONTAL, VERTICAL
+from padforge.common.plotting import FAMILY_COLOURS
 from padforge.common.validation import InputError, check_type
 from padforge.design.morphology import Array, Morphology
 from padforge.design.paths import curves
 from padforge.design.paths.keep_outs import keep_outs
-from padforge.design.settings import Layout, is_hole
+from padforge.design.settings import FAMILIES, Layout, is_hole
 from padforge.fabricate.leads import Leads, lead_spacing, one_side_leads, straight_leads
 from padforge.fabricate.settings import DEFAULTS, FabricationSettings
 
-FAMILIES = ("horizontal", "vertical")
-FAMILY_COLOURS = (HORIZONTAL, VERTICAL)
 INTO_WALL_MM = 0.5
 """Depth of ridges in the walls: the tracks open to the pad's sides, and no two faces of the mould coincide."""
 COVER_MM = 1.0
@@ -536,8 +534,3 @@ def fibre_layers(plan: Plan) -> list[FibreLayer]:
         colour = f"#{tint.hex()}"
         layers.append(FibreLayer(family, index, plan.depths_mm[index], plan.layers[index], colour))
     return layers[::-1]
-
-
-def fibre_name(plan: Plan, fibre: int) -> str:
-    """Return the name of a fibre, such as "horizontal 1"; each family counts from 1."""
-    return f"{FAMILIES[plan.family(fibre)]} {fibre - plan.pad.layout.families[plan.family(fibre)].start + 1}"

@@ -13,12 +13,11 @@ from padforge.design.morphology import Array, Morphology
 from padforge.design.paths.curves import add_spare_knots, flatten
 from padforge.design.paths.drawing_files import DrawnCurve, DrawnPlan, read_dxf, read_svg
 from padforge.design.paths.knot_fitting import fit_knots
-from padforge.design.settings import Layout
+from padforge.design.settings import FAMILIES, Layout
 
 READERS = {".svg": read_svg, ".dxf": read_dxf}
 MAX_BYTES = 2**22  # size of a drawing; drawings of fibres are far smaller
 MAX_KNOTS = 64  # inner knots of a fibre, as of `[search] knots`
-_FAMILIES = "horizontal", "vertical"
 _MAX_BACKTRACK_MM = 2e-4  # largest step backwards along the axis: files are rounded
 _MARGIN_MM = 1.0  # curves farther beyond the pad than this are leads to its other sides, which are ignored
 _FLATNESS_MM = 1e-3  # tolerance to which curves are compared
@@ -189,7 +188,7 @@ def _assign_to_family(name: str, drawn: str, line: Array, family: int, layout: L
     if backtrack.max() > _MAX_BACKTRACK_MM:
         at = int(np.argmax(backtrack > _MAX_BACKTRACK_MM))
         position = _format_position(np.array([t[at], v[at]]), family)
-        expected = f"a curve that goes on along {'xy'[family]} as a {_FAMILIES[family]} fibre does"
+        expected = f"a curve that goes on along {'xy'[family]} as a {FAMILIES[family]} fibre does"
         raise InputError(f"{name}: turns back at {position}, expected {expected}")
     is_ascending = np.append(True, t[1:] > np.maximum.accumulate(t)[:-1] + 1e-7)
     t, v = t[is_ascending], v[is_ascending]
@@ -210,7 +209,7 @@ def _match_fibres(paths: Sequence[_FibrePath], layout: Layout, tolerance_mm: flo
     by_fibre: dict[int, _FibrePath] = {}
     for path in paths:
         family = layout.family(path.fibre)
-        name = _fibre_name(path.fibre, layout)
+        name = layout.fibre_name(path.fibre)
         if path.error_mm > tolerance_mm:
             allowed = f"{tolerance_mm:g} mm (--tolerance-mm) on a pad of {layout}"
             error = f"{path.error_mm:.3g} mm from where {name} ends; allowed is {allowed}"
@@ -225,7 +224,7 @@ def _match_fibres(paths: Sequence[_FibrePath], layout: Layout, tolerance_mm: flo
         by_fibre[path.fibre] = path
     for fibre in range(layout.fibres):
         if fibre not in by_fibre:
-            raise InputError(f"no curve is {_fibre_name(fibre, layout)}, expected one a fibre on a pad of {layout}")
+            raise InputError(f"no curve is {layout.fibre_name(fibre)}, expected one a fibre on a pad of {layout}")
     return [by_fibre[fibre] for fibre in range(layout.fibres)]
 
 
@@ -255,11 +254,6 @@ def _check_fit(line: Array, path: _FibrePath, layout: Layout, tolerance_mm: floa
         error = f"{MAX_KNOTS} knots keep within {error_mm:.3g} mm of it, at {position}"
         raise InputError(f"{path.name}: {error}; allowed is {tolerance_mm:g} mm (--tolerance-mm)")
     return ImportedFibre(path.name, path.error_mm, error_mm)
-
-
-def _fibre_name(fibre: int, layout: Layout) -> str:
-    family = layout.family(fibre)
-    return f"{_FAMILIES[family]} {fibre - layout.families[family].start + 1}"
 
 
 def _format_position(point: Array, family: int) -> str:

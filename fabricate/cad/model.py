@@ -40,12 +40,13 @@ from OCP.GProp import GProp_GProps
 from OCP.Standard import Standard_Failure, Standard_NullObject
 from shapely import affinity
 
+from padforge.common.plotting import FAMILY_COLOURS
 from padforge.common.validation import InputError
 from padforge.design.morphology import Morphology
 from padforge.fabricate import mould
 from padforge.fabricate.mesh import build_mesh
 from padforge.fabricate.mould import BODY_COLOURS, Body, Prism
-from padforge.fabricate.plan import FAMILY_COLOURS, Plan, fibre_name, polygon_rings
+from padforge.fabricate.plan import Plan, polygon_rings
 from padforge.fabricate.settings import DEFAULTS, FabricationSettings
 
 from .curves import FINE_MM, OutlineCurve, find_joints, fit_arc, insert_joints, ring_curves
@@ -142,7 +143,7 @@ def _ridge_part(plan: Plan, fibre: int, printed: str) -> CadPart:
     That mesh has finely drawn outlines. The outlines of the printed mesh are drawn within the mould's tolerance, which
     would change the volume of a narrow ridge by a thousandth.
     """
-    name, colour = fibre_name(plan, fibre), FAMILY_COLOURS[plan.family(fibre)]
+    name, colour = plan.pad.layout.fibre_name(fibre), FAMILY_COLOURS[plan.family(fibre)]
     top = plan.outline([fibre], 0.0, FINE_MM)
     top = top | mould.fibre_wells(plan, fibre, _WELL_SIDES) if printed == "conductive" else top
     prisms = mould.ridge_prisms(plan, [fibre], top, FINE_MM)

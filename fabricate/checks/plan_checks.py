@@ -14,12 +14,12 @@ from shapely import ops
 from padforge.common.validation import InputError
 from padforge.design.morphology import Array, Morphology
 from padforge.design.paths.curves import bend_radius, beziers, flatten, slope_beziers, trace_curve
-from padforge.design.settings import CAST_SHARE, contact_designed_for
+from padforge.design.settings import CAST_SHARE, FAMILIES, contact_designed_for
 from padforge.fabricate.checks import Finding, Position, Status, check_result, grade
 from padforge.fabricate.checks.mesh_checks import check_triangles
 from padforge.fabricate.checks.surface import find_thin_patches
 from padforge.fabricate.mesh import mesh_arrays, mould_mesh, read_mesh
-from padforge.fabricate.plan import COVER_MM, FAMILIES, INTO_WALL_MM, Plan, overlap, without
+from padforge.fabricate.plan import COVER_MM, INTO_WALL_MM, Plan, overlap, without
 from padforge.fabricate.settings import DEFAULTS, FabricationSettings
 
 CheckedMesh = tuple[NDArray[np.floating], NDArray[np.integer], list[Finding]]

@@ -12,9 +12,11 @@ from xml.etree.ElementTree import Element, SubElement, indent, tostring
 
 import numpy as np
 
+from padforge.common.plotting import FAMILY_COLOURS
 from padforge.design.morphology import Array
 from padforge.design.paths.curves import beziers
-from padforge.fabricate.plan import FAMILIES, FAMILY_COLOURS, Plan, fibre_layers, fibre_name, polygon_rings
+from padforge.design.settings import FAMILIES
+from padforge.fabricate.plan import Plan, fibre_layers, polygon_rings
 
 Bounds = tuple[float, float, float, float]
 
@@ -161,7 +163,7 @@ def tracks_svg(plan: Plan) -> str:
             start, end = map(_pair, sheet.ends[fibre])
             spans = [list(map(_pair, span)) for span in sheet.spans[fibre]]
             curves = "".join(f"C{' '.join(span[1:])}" for span in spans)
-            name = fibre_name(plan, fibre).replace(" ", "-")
+            name = plan.pad.layout.fibre_name(fibre).replace(" ", "-")
             SubElement(layer, "path", {"id": name, "d": f"M{start}L{spans[0][0]}{curves}L{end}"})
     add_layer("numbers", "sensor numbers", sheet.numbers)
     scale = add_layer("scale", f"scale bar, {SCALE_MM:g} mm", sheet.notes)

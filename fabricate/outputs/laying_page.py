@@ -14,7 +14,7 @@ import numpy as np
 from padforge.design.settings import is_hole
 from padforge.fabricate.materials import PLASTICS, PRODUCTS, divider_ohm
 from padforge.fabricate.outputs.drawings import CROSSING_LINK, MIRRORED, ORIENTATION_LINK, orientation_sentence
-from padforge.fabricate.plan import Plan, fibre_layers, fibre_name, overlap
+from padforge.fabricate.plan import Plan, fibre_layers, overlap
 from padforge.fabricate.settings import MouldSettings, PrinterSettings
 
 Document = Mapping[str, Any]
@@ -133,7 +133,7 @@ def _fibres(plan: Plan) -> list[dict[str, Any]]:
         ohm = None if ohm_per_mm is None else ohm_per_mm * cut_mm
         entries.append({
             "number": fibre + 1,
-            "fibre": fibre_name(plan, fibre),
+            "fibre": plan.pad.layout.fibre_name(fibre),
             "level": layer,
             "ridge_mm": plan.shrinkage_compensated.heights_mm[layer],
             "depth_mm": plan.depths_mm[layer],
@@ -170,7 +170,7 @@ def _crossings(plan: Plan) -> dict[str, Any]:
         # Fibres lie at the bottom of their tracks, so that the gap is the difference of depths less one diameter.
         gap = abs(depths[0] - depths[1]) - plan.settings.fibre.material.diameter_mm
         position = [round(x, 3) for x in plan.pad.to_mm(crossing.position).tolist()]
-        table.append([*(fibre_name(plan, fibre) for fibre in pair), *position, *depths, round(gap, 3)])
+        table.append([*map(plan.pad.layout.fibre_name, pair), *position, *depths, round(gap, 3)])
     return {
         "total": len(table),
         "same_family": len(plan.clashes),

@@ -15,15 +15,14 @@ import numpy as np
 import shapely
 from numpy.typing import ArrayLike, NDArray
 
-from padforge.common.plotting import ALARM, FAINT, INK, PAPER
+from padforge.common.plotting import ALARM, FAINT, FAMILY_COLOURS, INK, PAPER
 from padforge.design.morphology import Array
+from padforge.design.settings import FAMILIES
 from padforge.fabricate.checks import Finding
 from padforge.fabricate.fibre_placement import Step, mirror_x
 from padforge.fabricate.mesh import unit_normals
 from padforge.fabricate.outputs import drawings
 from padforge.fabricate.plan import (
-    FAMILIES,
-    FAMILY_COLOURS,
     INTO_WALL_MM,
     FibreLayer,
     Plan,

@@ -13,11 +13,12 @@ from numpy.typing import NDArray
 
 from padforge.common import page
 from padforge.common.files import find_unchanged
+from padforge.common.plotting import FAMILY_COLOURS
 from padforge.common.validation import InputError
+from padforge.design.settings import FAMILIES
 from padforge.fabricate.mesh import read_mesh
 from padforge.fabricate.outputs import drawings
 from padforge.fabricate.outputs.laying_page import laying_page
-from padforge.fabricate.plan import FAMILIES, FAMILY_COLOURS
 
 MAX_BYTES = 3_000_000  # maximum size of a packed mesh; base64 makes 4 MB of it, half of the maximum of a page
 _STEPS = np.iinfo(np.uint16).max  # steps of a coordinate along a side of the bounding box
