@@ -32,7 +32,7 @@ from padforge.design.morphology import (
 )
 from padforge.design.paths.curves import lengths
 from padforge.design.published.kernels import quantized_signals
-from padforge.design.settings import DEFAULT_PITCH_MM, PUBLISHED_CONTACT, Contact, Layout, Rectangle
+from padforge.design.settings import PUBLISHED_CONTACT, Contact, Layout, Rectangle
 
 _WEIGHTS = {"uniform": geometry.UNIFORM, "inverse_square": geometry.INVERSE_SQUARE, "inverse": geometry.INVERSE}
 _LENGTHS = {"manhattan": geometry.MANHATTAN, "euclidean": geometry.EUCLIDEAN}
@@ -89,23 +89,21 @@ def signals(
         InputError: presses of the wrong shape or not finite, or a precision out of range.
     """
     contact = or_default("contact", contact, Contact)
-    along, across, ends, batch = fibre_axes(pad)
+    along, across, layout, batch = fibre_axes(pad)
     centres, press_counts = check_presses(presses, several=True)
-    fibres = along.shape[1]
+    fibres, unit_mm = layout.fibres, layout.unit_mm
     check_memory(len(along) * len(centres) * fibres)
     out = np.zeros((len(along), len(centres), fibres))
-    unit_mm = grid_unit_mm(pad)
     if contact.model == "shape":
-        shape, max_offsets = press_shape(contact, unit_mm), geometry.max_offsets(across, ends)
-        curves = along, across, population_slopes(along, across)
-        where = curves, max_offsets, ends, centres, shape
+        curves, max_offsets = (along, across, population_slopes(along, across)), geometry.max_offsets(across, layout)
+        where = curves, max_offsets, fibre_ends(layout), centres, press_shape(contact, unit_mm)
         map_chunks(lambda begin, end: exact_signals(*where, begin, end, out), len(along) * len(centres), 2000)
     elif len(centres):
         precision = check_float("precision", precision, 1e-6, 1.0)  # that of a `weight_table` is about 1e-7
         law, spacings = contact_law(contact, unit_mm), element_spacings(contact, unit_mm, precision)
         for t, v, pad_signals in zip(along, across, out, strict=True):
             slope = population_slopes(t[None], v[None])[0]
-            elements = element_signals.fibre_elements(t, v, slope, ends.horizontals, centres, law, spacings)
+            elements = element_signals.fibre_elements(t, v, slope, layout.horizontals, centres, law, spacings)
             if sensitivity is not None:
                 element_signals.weigh_elements(elements, t, sensitivity)
             table = weight_table(contact, unit_mm)
@@ -249,13 +247,11 @@ def _sum_simultaneous(signals: Array, shape: tuple[int, ...]) -> Array:
     return signals[..., 0, :] if shape[-2] == 1 else signals.sum(axis=-2)
 
 
-def fibre_axes(
-    pad: Morphology | Array, layout: Layout | None = None
-) -> tuple[Array, Array, geometry.Ends, tuple[int, ...]]:
+def fibre_axes(pad: Morphology | Array, layout: Layout | None = None) -> tuple[Array, Array, Layout, tuple[int, ...]]:
     """Split a pad, or knots (..., F, N + 2, 2) of a population, into coordinates along and across each fibre's axis.
 
-    Knots are in grid units; their layout is that of a square pad if None. Returned are the coordinates along and
-    across, both (P, F, N + 2), the positions of the fibre ends, and the population's shape.
+    Knots are in grid units; without a layout they are of a square pad of the default pitch. Returned are the
+    coordinates along and across, both (P, F, N + 2), the layout, and the population's shape.
 
     Raises:
         InputError: knots of another shape, beyond MAX_COORDINATE, or not ascending along the axis.
@@ -266,18 +262,12 @@ def fibre_axes(
     fibres = knots.shape[-3] if knots.ndim >= 3 else 0
     if not fibres or knots.shape[-1] != 2 or knots.shape[-2] < 2 or (layout is None and fibres % 2):
         raise InputError(f"knots have shape {knots.shape}, expected (..., 2 M, N + 2, 2)")
-    ends = fibre_ends(check_layout(fibres, layout))
+    layout = check_layout(fibres, layout)
     # in C order, since kernels would take seconds to compile for another memory order
-    along, across = split_axes(np.ascontiguousarray(knots).reshape(-1, *knots.shape[-3:]), ends.horizontals)
+    along, across = split_axes(np.ascontiguousarray(knots).reshape(-1, *knots.shape[-3:]), layout.horizontals)
     if not is_pad and not (np.diff(along) >= MIN_SPAN).all():
         raise InputError(f"knots do not ascend by {MIN_SPAN:g} or more along the fibre's axis")
-    return along, across, ends, knots.shape[:-3]
-
-
-def grid_unit_mm(pad: Morphology | Array, layout: Layout | None = None) -> float:
-    """Return the grid unit of a pad or of knots, mm: the default pitch for knots without a layout."""
-    layout = pad.layout if isinstance(pad, Morphology) else layout
-    return layout.unit_mm if layout else DEFAULT_PITCH_MM
+    return along, across, layout, knots.shape[:-3]
 
 
 def press_shape(contact: Contact, unit_mm: float) -> PressShape:
@@ -434,15 +424,15 @@ def signals_quantized(
         InputError: presses of the wrong shape or not finite, or fewer than 2 samples.
     """
     contact = or_default("contact", contact, Contact, PUBLISHED_CONTACT)
-    along, across, ends, batch = fibre_axes(pad)
+    along, across, layout, batch = fibre_axes(pad)
     pads, fibres, _ = along.shape
-    shape, samples = press_shape(contact, grid_unit_mm(pad)), check_samples(samples, fibres)
+    shape, samples = press_shape(contact, layout.unit_mm), check_samples(samples, fibres)
     centres, press_counts = check_presses(presses, several=True)
     check_memory(pads * len(centres) * fibres)
     out = np.zeros((pads, len(centres), fibres))
 
     def compute(begin: int, end: int) -> None:
-        quantized_signals(along, across, ends.horizontals, centres, shape, samples, begin, end, out)
+        quantized_signals(along, across, layout.horizontals, centres, shape, samples, begin, end, out)
 
     map_chunks(compute, pads * fibres, max(1, 200_000 // (samples + len(centres))))
     return _sum_simultaneous(out, (*batch, *press_counts, fibres))

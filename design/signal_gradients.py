@@ -10,11 +10,10 @@ from padforge.design.contact import contact_law, element_spacings, press_shape, 
 from padforge.design.kernels.element_signals import element_signals, elements_gradient, fibre_elements
 from padforge.design.kernels.exact_gradient import signals_gradient
 from padforge.design.kernels.exact_signals import exact_signals
-from padforge.design.kernels.geometry import Ends
 from padforge.design.kernels.geometry import max_offsets as compute_max_offsets
 from padforge.design.kernels.pchip import arc_lengths_gradient, fibre_slopes_gradient, population_slopes
-from padforge.design.morphology import Array
-from padforge.design.settings import Contact
+from padforge.design.morphology import Array, fibre_ends
+from padforge.design.settings import Contact, Layout
 
 Differentiate = Callable[[Array], Array]
 """From the derivatives (F, Q) of a value by signals to those (3, F, n) by along, across and slope of the curves."""
@@ -30,8 +29,7 @@ class FibreCurves:
 
     along: Array  # knots along the fibres; float64, shape (F, n)
     across: Array  # and across them; shape (F, n)
-    ends: Ends  # where fibres end
-    unit_mm: float  # grid unit, mm
+    layout: Layout  # where fibres end
 
     @cached_property
     def slope(self) -> Array:
@@ -52,17 +50,17 @@ class FibreCurves:
 
         They are exact for a shape, and of the `search_precision` for a layer or a profile.
         """
-        t, v, d, ends = self.along, self.across, self.slope, self.ends
+        t, v, d, unit_mm = self.along, self.across, self.slope, self.layout.unit_mm
         out = np.zeros((len(presses), len(t)))
         if contact.model != "shape":  # elements are cut once for both directions
-            law, table = contact_law(contact, self.unit_mm), weight_table(contact, self.unit_mm)
-            spacings = element_spacings(contact, self.unit_mm, search_precision(contact))
-            elements = fibre_elements(t, v, d, ends.horizontals, presses, law, spacings)
+            law, table = contact_law(contact, unit_mm), weight_table(contact, unit_mm)
+            spacings = element_spacings(contact, unit_mm, search_precision(contact))
+            elements = fibre_elements(t, v, d, self.layout.horizontals, presses, law, spacings)
             element_signals(t, v, elements, presses, law, table, out)
             kernel = lambda upstream: elements_gradient(t, v, d, elements, presses, upstream, law, table)  # noqa: E731
         else:
-            shape, max_offsets = press_shape(contact, self.unit_mm), compute_max_offsets(v[None], ends)
-            curves = t[None], v[None], d[None]
+            shape, ends = press_shape(contact, unit_mm), fibre_ends(self.layout)
+            curves, max_offsets = (t[None], v[None], d[None]), compute_max_offsets(v[None], self.layout)
             exact_signals(curves, max_offsets, ends, presses, shape, 0, len(presses), out[None])
             kernel = lambda upstream: signals_gradient(t, v, d, max_offsets[0], ends, presses, upstream, shape)  # noqa: E731
         return out.T, lambda grad_signals: np.asarray(kernel(np.ascontiguousarray(grad_signals.T)))

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from padforge.common.compilation import kernel
 from padforge.design.kernels.pchip import piece_of
-from padforge.design.settings import profile_spline
+from padforge.design.settings import Layout, profile_spline
 
 Array = NDArray[np.float64]
 
@@ -211,13 +211,10 @@ def select_frame(shape: Any, family: int) -> Any:
     return (chains[0] if family == 0 else chains[1]), extents[family], framed
 
 
-def max_offsets(across: Array, ends: Ends) -> Array:
+def max_offsets(across: Array, layout: Layout) -> Array:
     """Compute the largest offset (P, 2) of the fibres of each family from their own level."""
-    horizontals, verticals, spacing_y, spacing_x = ends
-    levels = np.append(spacing_y * np.arange(1, horizontals + 1), spacing_x * np.arange(1, verticals + 1))
-    offsets = np.abs(across - levels[:, None])
-    families = offsets[:, :horizontals], offsets[:, horizontals:]
-    return np.stack([family.max(axis=(1, 2), initial=0.0) for family in families], axis=1)
+    offsets = np.abs(across - layout.levels[:, None])
+    return np.stack([offsets[:, rows].max(axis=(1, 2), initial=0.0) for rows in layout.families], axis=1)
 
 
 @kernel

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from padforge.common.parallel import State
-from padforge.design.morphology import MARGIN, Array, Morphology, assemble_knots, fibre_ends, split_axes
+from padforge.design.morphology import MARGIN, Array, Morphology, assemble_knots, split_axes
 from padforge.design.objectives import criterion as objective
 from padforge.design.objectives.fibre_loss import failure_shares, sample_failures
 from padforge.design.objectives.penalties import penalties
@@ -67,7 +67,6 @@ class Parametrization:
 
     Attributes:
         layout: number and spacing of the fibres.
-        ends: positions at which the fibres end.
         spans: logits of the spans; shape (F, N + 1).
         across: logits of the coordinates across; shape (F, N).
         floor: minimum span, grid units.
@@ -75,7 +74,7 @@ class Parametrization:
     """
 
     def __init__(self, layout: Layout, spans: Array, across: Array, floor: float, border: float) -> None:
-        self.layout, self.ends = layout, fibre_ends(layout)
+        self.layout = layout
         self.spans, self.across, self.floor, self.border = spans, across, floor, border
         self._length, self._width, self._level = (x[:, None] for x in (*_sides(layout), layout.levels))
         self._free_length = self._length - spans.shape[1] * floor  # distributed by the softmax; shape (F, 1)
@@ -367,7 +366,7 @@ class GradientSearch:
             self.done = n_steps + 1 >= REPAIR_STEPS or self._check_rules()
 
     def _curves(self) -> FibreCurves:
-        return FibreCurves(*self.fibres.axes(), self.fibres.ends, self.problem.pad.layout.unit_mm)
+        return FibreCurves(*self.fibres.axes(), self.problem.pad.layout)
 
     def _penalty_gradient(
         self, curves: FibreCurves, rules: RulesSettings, margin: float, all_bends: bool = True

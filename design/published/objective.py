@@ -13,7 +13,6 @@ from padforge.design.contact import (
     check_presses,
     check_samples,
     fibre_axes,
-    grid_unit_mm,
     press_shape,
     serpentine_presses,
     signals,
@@ -148,18 +147,15 @@ def published_terms(
     signals are rounded up to `levels` levels.
     """
     alpha, beta, gamma = weights
-    along, across, ends, _ = fibre_axes(pads, layout)
+    along, across, layout, _ = fibre_axes(pads, layout)
     samples, levels = check_samples(samples, along.shape[1]), check_int("levels", levels, 1, MAX_LEVELS)
-    if presses is None:  # a copy, for a read-only array has kernels compiled anew
-        layout = pads.layout if isinstance(pads, Morphology) else layout
-        positions = published_presses(layout or ends.horizontals).copy()
-    else:
-        positions = check_presses(presses)[0]
-    shape = press_shape(or_default("contact", contact, Contact, PUBLISHED_CONTACT), grid_unit_mm(pads, layout))
+    # a copy, for a read-only array has kernels compiled anew
+    positions = published_presses(layout).copy() if presses is None else check_presses(presses)[0]
+    shape = press_shape(or_default("contact", contact, Contact, PUBLISHED_CONTACT), layout.unit_mm)
     terms = np.zeros((len(along), 4))
 
     def work(begin: int, end: int) -> None:
-        kernels.published_terms(along, across, ends.horizontals, positions, shape, samples, levels, begin, end, terms)
+        kernels.published_terms(along, across, layout.horizontals, positions, shape, samples, levels, begin, end, terms)
 
     map_chunks(work, len(along), min_chunk=8)
 

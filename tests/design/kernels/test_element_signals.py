@@ -41,7 +41,7 @@ def curves(pad, move: np.ndarray | float = 0.0):
     """Fibres as a search takes them, with knots moved by (2, F, n)."""
     axes = fibre_axes(pad)
     along, across = np.array([axes[0][0], axes[1][0]]) + move
-    return FibreCurves(along, across, axes[2], pad.unit_mm)
+    return FibreCurves(along, across, pad.layout)
 
 
 @pytest.mark.parametrize("contact", CONTACTS.values(), ids=CONTACTS)

@@ -9,7 +9,6 @@ from scipy.interpolate import PchipInterpolator
 
 from padforge.design import Morphology
 from padforge.design.contact import fibre_axes
-from padforge.design.morphology import fibre_ends
 from padforge.design.objectives.penalties import COMMON_WEIGHT, penalties
 from padforge.design.objectives.rules import check_rules
 from padforge.design.paths.curves import crossings, lengths, refine
@@ -88,9 +87,7 @@ class Slopes(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx, along, across):
-        ctx.curves = FibreCurves(
-            along.detach().numpy(), across.detach().numpy(), fibre_ends(Layout.create(len(along) // 2)), 1.0
-        )
+        ctx.curves = FibreCurves(along.detach().numpy(), across.detach().numpy(), Layout.create(len(along) // 2))
         return torch.from_numpy(ctx.curves.slope)
 
     @staticmethod

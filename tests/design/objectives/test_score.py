@@ -34,13 +34,13 @@ def test_sharpness_has_a_closed_form():
 
 
 def test_sharpness_has_a_gradient():
-    travel, cross, ends, _ = fibre_axes(Morphology.random(3, 4, seed=2))
+    travel, cross, *_ = fibre_axes(Morphology.random(3, 4, seed=2))
     knots, move = np.array([travel[0], cross[0]]), np.random.default_rng(3).standard_normal((2, 6, 6))
     size = PadSettings(grid=3)
 
     def loss(step):
         along, across = knots + step * move
-        curves = FibreCurves(along, across, ends, size.layout.unit_mm)
+        curves = FibreCurves(along, across, size.layout)
         value, gradient = sharpness_loss(curves, Contact(), size)
         return value, (curves.by_knots(gradient) * move).sum()
 
