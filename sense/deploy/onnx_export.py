@@ -25,7 +25,7 @@ from torch.nn import functional
 from padforge.common.files import atomic_file
 from padforge.common.parallel import one_thread
 from padforge.common.validation import Fault, InputError
-from padforge.sense.arrays import Array, Indices
+from padforge.sense.arrays import Array, Indices, press_bounds
 from padforge.sense.localizer import moments
 from padforge.sense.localizer.bayes import PREFIX, BayesianLocalizer
 from padforge.sense.localizer.features import (
@@ -92,9 +92,8 @@ class _FeatureModule(nn.Module):
 
     def forward(self, readings: Tensor, down_command: Tensor, up_command: Tensor) -> tuple[Tensor, Tensor]:
         """Return the scaled features (Q, C, F + G), and whether each window is complete (Q, K)."""
-        n_readings = torch.ones_like(readings[:, 0], dtype=torch.int64).sum()[None]  # a shape would be traced as fixed
-        previous_end = torch.cat([torch.zeros_like(up_command[:1]), up_command[:-1]])
-        until = torch.cat([down_command[1:], n_readings])
+        n_readings = torch.ones_like(readings[:, 0], dtype=torch.int64).sum()  # a shape would be traced as fixed
+        previous_end, until = press_bounds(down_command, up_command, n_readings, torch)
         baseline = mean_at_rest(readings, down_command, previous_end, torch)
         windows = windows_from_rest(readings, baseline, down_command, up_command, until, torch)
         windows = functional.pad(windows, (0, len(moments.MODULATED)))

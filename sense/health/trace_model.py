@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from padforge.common.parallel import one_thread
-from padforge.sense.arrays import MIN_SCALE_V, Array, Floats, Indices, Mask
+from padforge.sense.arrays import MIN_SCALE_V, Array, Floats, Indices, Mask, press_bounds
 
 Weights = Mapping[str, Floats]
 """`first.w` (E, C, N, H), `first.mask` (E, C, H), `first.b` (E, H), `hidden.w` (E, H, H), `hidden.b` (E, H), `last.w`
@@ -65,7 +65,7 @@ def bound_presses(readings: Array, down_command: Indices, up_command: Indices) -
     # The last press is not cut short by another one: its remaining readings are missing, and not repeated.
     missing = max(int(up_command[-1]) + RELEASED - len(readings), 0)
     readings = np.pad(readings, ((0, missing), (0, 0)), constant_values=np.nan) if missing else readings
-    return readings, np.concatenate([[0], up_command[:-1]]), np.append(down_command[1:], len(readings))
+    return readings, *press_bounds(down_command, up_command, len(readings))
 
 
 def extract_traces(readings: Array, down_command: Indices, up_command: Indices) -> Array:
