@@ -13,14 +13,15 @@ import numpy as np
 
 from padforge.common.parallel import one_thread
 from padforge.sense.arrays import MIN_SCALE_V, Array, Floats, Indices, Mask, press_bounds
+from padforge.sense.localizer import moments
 
 Weights = Mapping[str, Floats]
 """`first.w` (E, C, N, H), `first.mask` (E, C, H), `first.b` (E, H), `hidden.w` (E, H, H), `hidden.b` (E, H), `last.w`
 (E, C, H, 2 T) and `last.b` (E, C, 2 T), for E members, N inputs a fibre, H hidden units and T targets a fibre."""
 
-REST = 10  # readings of a trace before the probe is sent down
-HELD = 20  # readings of a trace after it was sent down
-RELEASED = 20  # readings of a trace after it was sent up
+REST = -moments.REST[0]  # readings of a trace before the probe is sent down: those of the windows of a localizer
+HELD = moments.PRESS_WINDOWS[-1][1]  # readings of a trace after it was sent down
+RELEASED = moments.RELEASE_WINDOWS[-1][1]  # readings of a trace after it was sent up
 TRACE = REST + HELD + RELEASED
 COMPONENTS = 6  # principal components of a response: 99.7 % of the variance on the published pad
 INPUTS = 2 * COMPONENTS + 1  # inputs of a fibre: response, baseline and history

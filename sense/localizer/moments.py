@@ -109,7 +109,7 @@ POSSIBLE_SLIDE_THRESHOLD = 1.75
 BAYES_STAGES = (12, 13, 14, 15, 17)
 """Complete windows from which on a Bayesian localizer of its own answers. Before the release has shown, at 12, it errs
 by a third more than a network."""
-RESIDUAL_PHASE = Phase(N_PRESS_WINDOWS + 3, (0.15, 0.1, 0.15, 0.1, 0.05, 0.45))
+RESIDUAL_PHASE = Phase(BAYES_STAGES[0], (0.15, 0.1, 0.15, 0.1, 0.05, 0.45))
 """Phase of the network that corrects the Bayesian localizers."""
 
 

@@ -18,6 +18,7 @@ from padforge.sense.localizer.evaluation import BUILT_PAD, reserve_lines
 from padforge.sense.recording.recording import Recording
 from padforge.sense.recording.run_directory import JOURNAL, read_journal
 
+MAP, BY_LOSS, BY_MOMENT = "error_map.png", "error_by_loss.png", "error_by_moment.png"
 NUMBERS = ("one", "two", "three")
 
 Errors = Mapping[tuple[int, ...], float]
@@ -93,8 +94,8 @@ def calibration_sections(folder: Path, document: Mapping[str, Any]) -> list[Page
         ),
         figures(
             [
-                (folder / "error_map.png", "True positions of presses, and the errors of the predicted ones."),
-                (folder / "error_by_loss.png", "Error by number of failed fibres."),
+                (folder / MAP, "True positions of presses, and the errors of the predicted ones."),
+                (folder / BY_LOSS, "Error by number of failed fibres."),
             ]
         ),
         heading("Idle share"),
@@ -124,7 +125,7 @@ def _moment_errors(folder: Path, rows: Sequence[Mapping[str, Any]]) -> list[str]
     return [
         heading("While a press is read"),
         table(head, cells),
-        figures([(folder / "error_by_moment.png", caption)]),
+        figures([(folder / BY_MOMENT, caption)]),
     ]
 
 
