@@ -36,9 +36,9 @@ from padforge.sense.localizer.features import (
     windows_from_rest,
 )
 from padforge.sense.localizer.model import MEASURE_COLUMNS, UNIFORM, LocalizerModel
-from padforge.sense.localizer.network import Weights, combine_members
+from padforge.sense.localizer.network import Weights, combine_members, network_inputs
 from padforge.sense.localizer.scaler import MAX_INPUT
-from padforge.sense.localizer.torch_network import EnsembleMlp, network_inputs
+from padforge.sense.localizer.torch_network import EnsembleMlp
 from padforge.sense.recording.frames import frame_rate_hz, framed
 from padforge.sense.recording.recording import Recording
 
@@ -152,7 +152,7 @@ class _LocalizerModule(nn.Module):
         scaled, complete = self.features(readings, down_command, up_command)
         fibre_mask = fibre_mask & ~torch.isnan(scaled).any(dim=2)  # otherwise a missing reading makes predictions NaN
         n_complete = complete.sum(dim=1)
-        x = network_inputs(scaled, fibre_mask, complete)
+        x = network_inputs(scaled, fibre_mask, complete, torch)
         targets, std = self._predict(scaled, fibre_mask, x, n_complete)
         *followed, moved = self._follow(scaled, fibre_mask, complete)
         slid = (n_complete >= moments.N_PRESS_WINDOWS) & (moved > moments.SLIDE_THRESHOLD)
@@ -196,7 +196,7 @@ class _LocalizerModule(nn.Module):
         network, n_timed = self.networks[moments.SLIDE_NETWORK], moments.N_TIMED
 
         def predict_from(scaled: Tensor, n_complete: int) -> tuple[Tensor, Tensor]:
-            x = network_inputs(scaled, fibre_mask, complete & (torch.arange(n_timed) < n_complete))
+            x = network_inputs(scaled, fibre_mask, complete & (torch.arange(n_timed) < n_complete), torch)
             return combine_members(network(x.expand(network.n_members, -1, -1)), torch)
 
         targets, std = predict_from(scaled, moments.N_PRESS_WINDOWS)

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from padforge.benchmarks import harness
 from padforge.benchmarks import localizer as bench
 from padforge.common.progress import ignore_progress
-from padforge.sense.localizer import network, torch_network, training
+from padforge.sense.localizer import network, training
 from padforge.sense.localizer.features import N_FEATURES
 from padforge.sense.localizer.moments import N_PRESS_WINDOWS, N_TIMED, PHASES, RESIDUAL_PHASE
 from padforge.sense.localizer.press_sampler import PressSampler, sample_fibre_dropout
@@ -31,7 +31,7 @@ def test_forward_agrees_with_torch(seed: int, layers: int, n_timed: int) -> None
     features = torch.randn(7, 3, 5, generator=generator)
     fibre_mask = torch.rand(7, 3, generator=generator) < 0.6
     seen = torch.rand(7, n_timed, generator=generator) < 0.6
-    x = torch_network.network_inputs(features, fibre_mask, seen)
+    x = network.network_inputs(features, fibre_mask, seen, torch)
     expected = ensemble(x[None]).detach().numpy()
     weights = EnsembleMlp.join(parameters(ensemble))
     inputs = network.network_inputs(features.numpy(), fibre_mask.numpy(), seen.numpy())
