@@ -27,7 +27,7 @@ from padforge.common.parallel import one_thread
 from padforge.common.validation import Fault, InputError
 from padforge.sense.arrays import Array, Indices, press_bounds
 from padforge.sense.localizer import moments
-from padforge.sense.localizer.bayes import PREFIX, BayesianLocalizer
+from padforge.sense.localizer.bayes import BayesianLocalizer
 from padforge.sense.localizer.features import (
     compute_features,
     compute_history,
@@ -110,8 +110,8 @@ class _BayesModule(nn.Module):
         super().__init__()
         self.residual, self.n_stages = EnsembleMlp.from_numpy(residual_network), len(stages)
         for number, stage in enumerate(stages):
-            for name, array in stage.to_arrays(number).items():  # in single precision, which is exact
-                self.register_buffer(name.replace(".", "_"), torch.from_numpy(array))
+            for name, array in vars(stage.map_arrays(torch.from_numpy)).items():
+                self.register_buffer(f"bayes_{number}_{name}", array)
 
     def forward(self, scaled: Tensor, fibre_mask: Tensor, x: Tensor, n_complete: Tensor) -> Tensor:
         """Return the outputs (1, Q, 4) of presses from their scaled features and network inputs x."""
@@ -124,8 +124,8 @@ class _BayesModule(nn.Module):
         return corrected + functional.pad(position, (0, 2))
 
     def _predict(self, number: int, scaled: Tensor, fibre_mask: Tensor) -> tuple[Tensor, Tensor]:
-        names = (f"{PREFIX}{number}.{each.name}".replace(".", "_") for each in fields(BayesianLocalizer))
-        stage = BayesianLocalizer(*(getattr(self, name).double() for name in names))
+        names = (each.name for each in fields(BayesianLocalizer))
+        stage = BayesianLocalizer(*(getattr(self, f"bayes_{number}_{name}").double() for name in names))
         position, summary = stage.predict(scaled.double(), fibre_mask, _Traceable())
         return position.float(), summary.float()
 

@@ -14,13 +14,13 @@ from pydantic_core import PydanticCustomError
 
 from padforge.sense.arrays import MAX_MM, MAX_VOLTS, MIN_SCALE_V, Array, Floats, Indices, Mask, masked_mean
 from padforge.sense.localizer.features import PressFeatures
+from padforge.sense.localizer.model_files import DOCUMENT_CONFIG
 from padforge.sense.localizer.moments import LATEST_WINDOWS, PRESS_WINDOWS
 from padforge.sense.localizer.response_model import ResponseModel, interpolate_grid, leverages, remove_history
 from padforge.sense.localizer.response_process import ResponseFit, ResponsePrior, fit_response
 
 MAX_INPUT = 1e4  # scaled features are clipped to it; no press exceeds it
 MAX_LEVERAGE = 0.9  # limits the leave-one-out residual of an isolated press to ten times its residual
-DOCUMENT_CONFIG = ConfigDict(extra="forbid", allow_inf_nan=False, strict=True)
 
 
 def array_field(low: float, high: float) -> tuple[PlainValidator, PlainSerializer]:
