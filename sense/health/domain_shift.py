@@ -112,8 +112,7 @@ def _compare(localizer: LocalizerModel, presses: ScaledFeatures, failed: tuple[i
     """
     scaler = localizer.scaler
     localization = localizer.predict_features(presses, failed)
-    positions = (localization.positions_mm - scaler.origin_mm) / scaler.scale_mm
-    expected = interpolate_grid(localizer.table, positions)
+    expected = interpolate_grid(localizer.table, scaler.scale_positions(localization.positions_mm))
     if scaler.measures:
         expected = expected * (localization.measures["depth_mm"].values / scaler.measures[0].origin)[:, None, None]
     expected_v, response_v = (part * scaler.scale_v + scaler.mean_v for part in (expected, presses.inputs))

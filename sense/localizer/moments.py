@@ -41,6 +41,8 @@ RELEASE_WINDOWS: tuple[Window, ...] = ((0, 1), (1, 2), (2, 3), (3, 4), (4, 6), (
 """Windows after the probe was sent up: the release depends on the position as much as the press does."""
 LATEST_WINDOWS: tuple[Window, ...] = ((-1, 0), (-2, -1))
 """Windows before the latest reading, or before the release if that is earlier: they locate a finger that moves."""
+PRESS_MIDDLES = np.array([(first + end - 1) / 2 for first, end in PRESS_WINDOWS])
+"""Middles of `PRESS_WINDOWS`."""
 N_PRESS_WINDOWS = len(PRESS_WINDOWS)
 N_TIMED = len(PRESS_WINDOWS) + len(RELEASE_WINDOWS)
 """Windows of a press that are complete one after the other."""
