@@ -93,7 +93,7 @@ def table(
 
     Of `shades`, cells by row and column have a background from white at 0 to red at 1.
     """
-    cells = [[_text(value) for value in row] for row in rows]
+    cells = [[cell_text(value) for value in row] for row in rows]
     kinds = [_column_style(column) for column in zip(*cells, strict=True)] or [""] * len(header)
     body = [
         [
@@ -153,7 +153,8 @@ def _embed_picture(path: Path, caption: str) -> dict[str, Any]:
     return {"caption": caption, "size": size, "source": source}
 
 
-def _text(value: object) -> str:
+def cell_text(value: object) -> str:
+    """Return a value as tables show it: "-" for None, numbers with four digits."""
     if value is None:
         return "-"
     if isinstance(value, bool):

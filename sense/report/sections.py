@@ -169,7 +169,7 @@ def _describe_losses(errors: Errors) -> Iterator[str]:
     """Describe the errors by set of failed fibres: the worst ones in words, all as tables."""
     fibres = 1 + max(fibre for failed in errors for fibre in failed)
     counts = sorted({len(failed) for failed in errors} - {0})
-    worst_sets = [_worst(errors, count) for count in counts]
+    worst_sets = [max((each for each in errors if len(each) == count), key=errors.__getitem__) for count in counts]
     worst = "; ".join(
         f"of {_fibre_count(len(failed))}, {_names(failed)} ({errors[failed]:.2f} mm)" for failed in worst_sets
     )
@@ -195,10 +195,6 @@ def _describe_losses(errors: Errors) -> Iterator[str]:
     ranked = sorted(errors.items(), key=lambda item: -item[1])[:10]
     rows = [[_names(failed), f"{error:.2f}"] for failed, error in ranked if failed]
     yield collapsible("The worst sets", [table(["failed", "mean (mm)"], rows)])
-
-
-def _worst(errors: Errors, count: int) -> tuple[int, ...]:
-    return max((failed for failed in errors if len(failed) == count), key=errors.__getitem__)
 
 
 def _error_cells(row: Mapping[str, Any], *more: str) -> list[object]:
