@@ -41,8 +41,10 @@ def reduced_modulus_kpa(modulus_kpa: float) -> float:
     return modulus_kpa / (1 - 0.5**2)
 
 
-REDUCED_MODULUS_KPA = reduced_modulus_kpa(55)
-"""E* of Ecoflex 00-20, kPa, from the modulus at 100 % strain in the manufacturer's data sheet."""
+SILICONE, MODULUS_KPA = "Ecoflex 00-20", 55
+"""Silicone of a pad where no other is stated, and its modulus at 100 % strain in the manufacturer's data sheet."""
+REDUCED_MODULUS_KPA = reduced_modulus_kpa(MODULUS_KPA)
+"""E* of that silicone, kPa."""
 TERMS = 16
 """Number of Legendre polynomials of phi, with which forces have a relative error of 1e-6 up to a contact radius of ten
 thicknesses, and of 5e-4 at MAX_CONTACT.

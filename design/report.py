@@ -28,7 +28,7 @@ from padforge.design.contact import (
     half_widths_mm,
     profile_weights,
 )
-from padforge.design.layer import LayerPress, reduced_modulus_kpa
+from padforge.design.layer import MODULUS_KPA, SILICONE, LayerPress, reduced_modulus_kpa
 from padforge.design.morphology import Array, Morphology
 from padforge.design.paths.curves import crossings, flatten
 from padforge.design.settings import FAMILIES, Contact, Corners, PadSettings, RulesSettings
@@ -257,7 +257,7 @@ def press_sections(
     if contact.model != "layer":
         return []
     press = contact_press(contact)
-    silicone_name, modulus_kpa = silicone or ("Ecoflex 00-20", 55)
+    silicone_name, modulus_kpa = silicone or (SILICONE, MODULUS_KPA)
     force_n = press.force_n(reduced_modulus_kpa(modulus_kpa))
     rows = []
     families = zip(FAMILIES, contact.fibre_depths_mm, half_widths_mm(contact), fibre_strains(contact), strict=True)

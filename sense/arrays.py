@@ -26,6 +26,15 @@ def masked_mean(values: Array, mask: Mask) -> Array:
     return np.where(mask, values, 0.0).sum(axis=0) / np.maximum(mask.sum(axis=0), 1)
 
 
+def press_bounds(down_command: Any, up_command: Any, n_readings: Any, xp: Any = np) -> tuple[Any, Any]:
+    """Return the first reading (Q,) after the previous press, and the first of the next one or the end of the readings.
+
+    All arrays are of the module `xp`, numpy or torch.
+    """
+    previous_end = xp.concat([xp.zeros_like(up_command[:1]), up_command[:-1]])
+    return previous_end, xp.concat([down_command[1:], xp.atleast_1d(n_readings)])
+
+
 def check_numbers(values: ArrayLike, kind: type[np.generic], name: str, copy: bool = True) -> NDArray[Any]:
     """Convert values to an array of float64 or int64; raise InputError if they are anything else, or too many."""
     allowed = "real numbers" if kind is np.float64 else f"whole numbers up to {MAX_INDEX}"

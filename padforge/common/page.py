@@ -6,7 +6,7 @@ Their layout is in the templates `page.html`, `elements.html` and `page.css`.
 import base64
 import hashlib
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from importlib import resources
@@ -86,12 +86,21 @@ def paragraph(text: str) -> str:
     return _element("paragraph", text)
 
 
-def table(header: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
-    """Return a table; the words pass, warn and fail are coloured, columns of numbers right-aligned."""
-    cells = [[_text(value) for value in row] for row in rows]
+def table(
+    header: Sequence[str], rows: Sequence[Sequence[object]], shades: Mapping[tuple[int, int], float] | None = None
+) -> str:
+    """Return a table; the words pass, warn and fail are coloured, columns of numbers right-aligned.
+
+    Of `shades`, cells by row and column have a background from white at 0 to red at 1.
+    """
+    cells = [[cell_text(value) for value in row] for row in rows]
     kinds = [_column_style(column) for column in zip(*cells, strict=True)] or [""] * len(header)
     body = [
-        [(text, text if text in _RESULTS else kind) for text, kind in zip(row, kinds, strict=True)] for row in cells
+        [
+            (text, text if text in _RESULTS else kind, (shades or {}).get((i, j)))
+            for j, (text, kind) in enumerate(zip(row, kinds, strict=True))
+        ]
+        for i, row in enumerate(cells)
     ]
     return _element("table", list(zip(header, kinds, strict=True)), body)
 
@@ -144,7 +153,8 @@ def _embed_picture(path: Path, caption: str) -> dict[str, Any]:
     return {"caption": caption, "size": size, "source": source}
 
 
-def _text(value: object) -> str:
+def cell_text(value: object) -> str:
+    """Return a value as tables show it: "-" for None, numbers with four digits."""
     if value is None:
         return "-"
     if isinstance(value, bool):

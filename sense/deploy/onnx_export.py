@@ -25,9 +25,9 @@ from torch.nn import functional
 from padforge.common.files import atomic_file
 from padforge.common.parallel import one_thread
 from padforge.common.validation import Fault, InputError
-from padforge.sense.arrays import Array, Indices
+from padforge.sense.arrays import Array, Indices, press_bounds
 from padforge.sense.localizer import moments
-from padforge.sense.localizer.bayes import PREFIX, BayesianLocalizer
+from padforge.sense.localizer.bayes import BayesianLocalizer
 from padforge.sense.localizer.features import (
     compute_features,
     compute_history,
@@ -36,9 +36,9 @@ from padforge.sense.localizer.features import (
     windows_from_rest,
 )
 from padforge.sense.localizer.model import MEASURE_COLUMNS, UNIFORM, LocalizerModel
-from padforge.sense.localizer.network import Weights, combine_members
+from padforge.sense.localizer.network import Weights, combine_members, network_inputs
 from padforge.sense.localizer.scaler import MAX_INPUT
-from padforge.sense.localizer.torch_network import EnsembleMlp, network_inputs
+from padforge.sense.localizer.torch_network import EnsembleMlp
 from padforge.sense.recording.frames import frame_rate_hz, framed
 from padforge.sense.recording.recording import Recording
 
@@ -92,9 +92,8 @@ class _FeatureModule(nn.Module):
 
     def forward(self, readings: Tensor, down_command: Tensor, up_command: Tensor) -> tuple[Tensor, Tensor]:
         """Return the scaled features (Q, C, F + G), and whether each window is complete (Q, K)."""
-        n_readings = torch.ones_like(readings[:, 0], dtype=torch.int64).sum()[None]  # a shape would be traced as fixed
-        previous_end = torch.cat([torch.zeros_like(up_command[:1]), up_command[:-1]])
-        until = torch.cat([down_command[1:], n_readings])
+        n_readings = torch.ones_like(readings[:, 0], dtype=torch.int64).sum()  # a shape would be traced as fixed
+        previous_end, until = press_bounds(down_command, up_command, n_readings, torch)
         baseline = mean_at_rest(readings, down_command, previous_end, torch)
         windows = windows_from_rest(readings, baseline, down_command, up_command, until, torch)
         windows = functional.pad(windows, (0, len(moments.MODULATED)))
@@ -111,8 +110,8 @@ class _BayesModule(nn.Module):
         super().__init__()
         self.residual, self.n_stages = EnsembleMlp.from_numpy(residual_network), len(stages)
         for number, stage in enumerate(stages):
-            for name, array in stage.to_arrays(number).items():  # in single precision, which is exact
-                self.register_buffer(name.replace(".", "_"), torch.from_numpy(array))
+            for name, array in vars(stage.map_arrays(torch.from_numpy)).items():
+                self.register_buffer(f"bayes_{number}_{name}", array)
 
     def forward(self, scaled: Tensor, fibre_mask: Tensor, x: Tensor, n_complete: Tensor) -> Tensor:
         """Return the outputs (1, Q, 4) of presses from their scaled features and network inputs x."""
@@ -125,8 +124,8 @@ class _BayesModule(nn.Module):
         return corrected + functional.pad(position, (0, 2))
 
     def _predict(self, number: int, scaled: Tensor, fibre_mask: Tensor) -> tuple[Tensor, Tensor]:
-        names = (f"{PREFIX}{number}.{each.name}".replace(".", "_") for each in fields(BayesianLocalizer))
-        stage = BayesianLocalizer(*(getattr(self, name).double() for name in names))
+        names = (each.name for each in fields(BayesianLocalizer))
+        stage = BayesianLocalizer(*(getattr(self, f"bayes_{number}_{name}").double() for name in names))
         position, summary = stage.predict(scaled.double(), fibre_mask, _Traceable())
         return position.float(), summary.float()
 
@@ -153,7 +152,7 @@ class _LocalizerModule(nn.Module):
         scaled, complete = self.features(readings, down_command, up_command)
         fibre_mask = fibre_mask & ~torch.isnan(scaled).any(dim=2)  # otherwise a missing reading makes predictions NaN
         n_complete = complete.sum(dim=1)
-        x = network_inputs(scaled, fibre_mask, complete)
+        x = network_inputs(scaled, fibre_mask, complete, torch)
         targets, std = self._predict(scaled, fibre_mask, x, n_complete)
         *followed, moved = self._follow(scaled, fibre_mask, complete)
         slid = (n_complete >= moments.N_PRESS_WINDOWS) & (moved > moments.SLIDE_THRESHOLD)
@@ -197,7 +196,7 @@ class _LocalizerModule(nn.Module):
         network, n_timed = self.networks[moments.SLIDE_NETWORK], moments.N_TIMED
 
         def predict_from(scaled: Tensor, n_complete: int) -> tuple[Tensor, Tensor]:
-            x = network_inputs(scaled, fibre_mask, complete & (torch.arange(n_timed) < n_complete))
+            x = network_inputs(scaled, fibre_mask, complete & (torch.arange(n_timed) < n_complete), torch)
             return combine_members(network(x.expand(network.n_members, -1, -1)), torch)
 
         targets, std = predict_from(scaled, moments.N_PRESS_WINDOWS)

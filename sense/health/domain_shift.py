@@ -10,7 +10,7 @@ from math import exp, hypot, sqrt
 
 import numpy as np
 
-from padforge.sense.arrays import Array, Mask
+from padforge.sense.arrays import Array, Mask, press_bounds
 from padforge.sense.health.health_model import HealthModel
 from padforge.sense.localizer.features import mean_at_rest
 from padforge.sense.localizer.model import LocalizerModel
@@ -68,7 +68,7 @@ def detect_shifts(
 def rest_levels(recording: Recording) -> Array:
     """Return the baselines (Q, C) before the presses of a recording, V; NaN where a reading is missing."""
     frames = framed(recording)
-    previous_end = np.concatenate([[0], frames.up_command[:-1]])
+    previous_end, _ = press_bounds(frames.down_command, frames.up_command, len(frames.readings))
     return mean_at_rest(frames.readings, frames.down_command, previous_end)
 
 
@@ -112,8 +112,7 @@ def _compare(localizer: LocalizerModel, presses: ScaledFeatures, failed: tuple[i
     """
     scaler = localizer.scaler
     localization = localizer.predict_features(presses, failed)
-    positions = (localization.positions_mm - scaler.origin_mm) / scaler.scale_mm
-    expected = interpolate_grid(localizer.table, positions)
+    expected = interpolate_grid(localizer.table, scaler.scale_positions(localization.positions_mm))
     if scaler.measures:
         expected = expected * (localization.measures["depth_mm"].values / scaler.measures[0].origin)[:, None, None]
     expected_v, response_v = (part * scaler.scale_v + scaler.mean_v for part in (expected, presses.inputs))

@@ -45,16 +45,16 @@ _CHUNK = 64  # presses that are compared with the library at once
 class FaultLikelihoods:
     """Distribution of healthy presses about the predictions of the networks."""
 
-    std_scale: Array  # a predicted deviation s is calibrated to hypot(std_scale s, std_floor); shape (C, T)
+    std_scale: Array  # a predicted deviation s is calibrated to hypot(std_scale s, std_floor); shape (L, T)
     std_floor: Array
-    noise_floor: Array  # noise of the components of a response; shape (C, D)
-    library_mean: Array  # predictions for other presses; shape (LIBRARY, C, D)
+    noise_floor: Array  # noise of the components of a response; shape (L, D)
+    library_mean: Array  # predictions for other presses; shape (LIBRARY, L, D)
     library_std: Array
-    noise_v: Array  # median noise; shape (C,), V
-    log_noise_mean: Array  # median and deviation of the logarithm of the noise over its median; shape (C,)
+    noise_v: Array  # median noise; shape (L,), V
+    log_noise_mean: Array  # median and deviation of the logarithm of the noise over its median; shape (L,)
     log_noise_std: Array
-    constant_share: Array  # share of presses in which the fibre is constant; shape (C,)
-    step_filters: Array  # matched filters of a step; shape (C, S, TRACE), 1/V
+    constant_share: Array  # share of presses in which the fibre is constant; shape (L,)
+    step_filters: Array  # matched filters of a step; shape (L, S, TRACE), 1/V
     rest_autocorr: Array  # correlation of the rest's residual with that of the press before, of all fibres; shape (1,)
     innovation_std: Array  # standard deviation of the uncorrelated part of that residual; shape (1,)
 
@@ -62,7 +62,7 @@ class FaultLikelihoods:
     def fit(
         cls, traces: Array, targets: Array, mean: Array, std: Array, target_scale_v: Array, rng: np.random.Generator
     ) -> "FaultLikelihoods":
-        """Fit to healthy traces, targets, and predictions (Q, C, T) by members that were not trained on the press."""
+        """Fit to healthy traces, targets, and predictions (Q, L, T) by members that were not trained on the press."""
         std_scale, std_floor = _calibrate_std(targets - mean, std)
         noise_v = np.median(estimate_noise(traces), axis=0)
         noise_v = np.where(noise_v > MIN_SCALE_V, noise_v, MIN_RELATIVE_NOISE * target_scale_v[:, 0])
@@ -92,20 +92,20 @@ class FaultLikelihoods:
         )
 
     def log_likelihood_healthy(self, targets: Array, mean: Array, std: Array) -> Array:
-        """Compute the log-likelihood (..., C) of the responses (..., C, T) of healthy fibres, up to a constant."""
+        """Compute the log-likelihood (..., L) of the responses (..., L, T) of healthy fibres, up to a constant."""
         part = slice(0, COMPONENTS)
         return _log_t(targets[..., part], mean[..., part], self._calibrated(std)[..., part]).sum(axis=-1)
 
     def largest_step(self, traces: Array) -> Array:
-        """Compute the likeliest step (Q, C) within traces (Q, C, TRACE), signed, in deviations of healthy ones."""
+        """Compute the likeliest step (Q, L) within traces (Q, L, TRACE), signed, in deviations of healthy ones."""
         responses = traces - traces[..., :REST].mean(axis=-1, keepdims=True)
         steps = np.einsum("csw,qcw->qcs", self.step_filters, responses)
         return np.take_along_axis(steps, np.abs(steps).argmax(axis=-1)[..., None], axis=-1)[..., 0]
 
     def log_likelihood_ratios(self, traces: Array, targets: Array, mean: Array, std: Array) -> tuple[Array, Array]:
-        """Compute the log-likelihood ratios (Q, C, H) of all hypotheses against health, for successive presses.
+        """Compute the log-likelihood ratios (Q, L, H) of all hypotheses against health, for successive presses.
 
-        Traces (Q, C, TRACE) are in V; targets, their predicted mean and std are (Q, C, T). The first press is its own
+        Traces (Q, L, TRACE) are in V; targets, their predicted mean and std are (Q, L, T). The first press is its own
         predecessor. Returns `llr_continuing` if the fault was present at the press before, and `llr_onset` if it
         has begun since; 0 for a fibre that misses readings.
         """
@@ -131,7 +131,7 @@ class FaultLikelihoods:
         return llr_continuing, llr_onset
 
     def _response_llrs(self, targets: Array, mean: Array, std: Array) -> list[Array]:
-        """Return the ratios (Q, C) of `GAINS`, and of an inconsistent response."""
+        """Return the ratios (Q, L) of `GAINS`, and of an inconsistent response."""
         targets = np.nan_to_num(targets)
         healthy = self.log_likelihood_healthy(targets, mean, std)
         response, mean = targets[..., :COMPONENTS], mean[..., :COMPONENTS]
@@ -152,7 +152,7 @@ class FaultLikelihoods:
 
 
 def _calibrate_std(residual: Array, std: Array) -> tuple[Array, Array]:
-    """Choose the scale and floor (C, T) that make residuals (Q, C, T) of predictions most likely.
+    """Choose the scale and floor (L, T) that make residuals (Q, L, T) of predictions most likely.
 
     A network trained on few presses is overconfident where it should be least certain; the floor corrects that.
     """
@@ -223,7 +223,7 @@ class ExceedanceModel:
 
     @classmethod
     def fit(cls, llrs: Sequence[tuple[Array, Array]]) -> "ExceedanceModel":
-        """Fit to the ratios (Q, C, H), continuing and onset, of successive healthy presses, by the number of failures.
+        """Fit to the ratios (Q, L, H), continuing and onset, of successive healthy presses, by the number of failures.
 
         Those of several sets of failed fibres follow one another; the sums run on from one to the next.
 

@@ -1,15 +1,13 @@
 """Model of a healthy pad, whose fibres predict each other: training on a recording, and files."""
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
-from pydantic import Field, JsonValue
+from pydantic import ConfigDict, Field, JsonValue, TypeAdapter
 
-from padforge.common.files import read_json
-from padforge.common.settings import Settings, validate
 from padforge.common.validation import InputError
 from padforge.sense.arrays import MAX_FIBRES, MAX_RATE_HZ, MIN_RATE_HZ, MIN_SCALE_V, Array, Indices
 from padforge.sense.health.fault_likelihoods import HYPOTHESES, MAX_HEIGHT, ExceedanceModel, FaultLikelihoods
@@ -22,7 +20,7 @@ from padforge.sense.health.trace_model import (
     predict_fibres,
     train_networks,
 )
-from padforge.sense.localizer.model_files import files_of, select_arrays
+from padforge.sense.localizer.model_files import DOCUMENT_CONFIG, files_of, select_arrays
 
 FORMAT = "padforge-health/1"
 COMMANDED, DETECTED = "health", "health_live"
@@ -39,21 +37,24 @@ BLOCK = 50  # successive presses of a fold; neighbouring presses share their dri
 SUBSETS = 4  # random sets of failed fibres of a size in the fit of `ExceedanceModel`
 
 
-class HealthDocument(Settings):
-    """The JSON file of a `HealthModel`."""
+@dataclass(frozen=True, kw_only=True)
+class HealthDocument:
+    """Content of the JSON file of a model, by these names."""
 
-    format: Literal["padforge-health/1"] = FORMAT
-    fibres: int = Field(ge=1, le=MAX_FIBRES)
-    dead: list[Annotated[int, Field(ge=0, lt=MAX_FIBRES)]]
-    rate_hz: float = Field(ge=MIN_RATE_HZ, le=MAX_RATE_HZ)
-    false_alarm_rate: float = Field(gt=0, le=MAX_FALSE_ALARM_RATE)
-    presses: int = Field(ge=MIN_PRESSES)
-    weights_sha256: str = Field(pattern="^[0-9a-f]{64}$")
-    provenance: dict[str, JsonValue]
+    __pydantic_config__: ClassVar[ConfigDict] = DOCUMENT_CONFIG
+    fibres: Annotated[int, Field(ge=1, le=MAX_FIBRES)]  # number of fibres, C
+    dead: tuple[Annotated[int, Field(ge=0, lt=MAX_FIBRES)], ...]  # indices of fibres that were dead in the recording
+    rate_hz: Annotated[float, Field(ge=MIN_RATE_HZ, le=MAX_RATE_HZ)]  # readings per second of the recording
+    false_alarm_rate: Annotated[float, Field(gt=0, le=MAX_FALSE_ALARM_RATE)]  # false alarms per press on a healthy pad
+    presses: Annotated[int, Field(ge=MIN_PRESSES)]  # number of training presses
+    provenance: Mapping[str, JsonValue] = field(default_factory=dict)  # origin of the model
 
 
-@dataclass(frozen=True)
-class HealthModel:
+_DOCUMENT = TypeAdapter(HealthDocument)
+
+
+@dataclass(frozen=True, kw_only=True)
+class HealthModel(HealthDocument):
     """Model of a healthy pad. Its arrays are of the L living fibres: those of the C fibres that were not dead."""
 
     pca: TracePCA  # reduces traces to the inputs and targets of the networks
@@ -61,12 +62,6 @@ class HealthModel:
     likelihoods: FaultLikelihoods  # distribution of healthy presses about the predictions
     exceedance: ExceedanceModel  # of the cumulative sums of healthy presses
     rest_range_v: Array  # lowest and highest baseline; shape (2, L), V
-    fibres: int  # number of fibres, C
-    dead: tuple[int, ...]  # indices of fibres that were dead in the recording
-    rate_hz: float  # readings per second of the recording
-    presses: int  # number of training presses
-    false_alarm_rate: float = FALSE_ALARM_RATE  # false alarms per press on a healthy pad
-    provenance: Mapping[str, Any] = field(default_factory=dict)  # origin of the model, JSON
 
     @property
     def living(self) -> Indices:
@@ -88,13 +83,9 @@ class HealthModel:
         Raises:
             InputError: the folder cannot be written.
         """
-        keys = ("fibres", "dead", "rate_hz", "false_alarm_rate", "presses")
-        document = {"format": FORMAT, **{key: getattr(self, key) for key in keys}}
-        document |= {"weights_sha256": "", "provenance": dict(self.provenance)}
-        parts = {"pca": asdict(self.pca), "weights": self.weights, "likelihoods": asdict(self.likelihoods)}
-        parts["exceedance"] = asdict(self.exceedance)
-        arrays = {f"{part}.{key}": np.asarray(value) for part, values in parts.items() for key, value in values.items()}
-        files_of(folder, name).write(document, arrays | {"rest_range_v": self.rest_range_v})
+        document = _DOCUMENT.dump_python(self, warnings=False)
+        parts = {name: part for name, part in vars(self).items() if name not in document}
+        files_of(folder, name).write(FORMAT, document, parts)
 
     @classmethod
     def load(cls, folder: str | Path, name: str = COMMANDED) -> "HealthModel":
@@ -108,16 +99,15 @@ class HealthModel:
             InputError: a file is missing, torn or of another kind, or the two do not belong together.
         """
         files = files_of(folder, name)
-        document = validate(HealthDocument, read_json(files.document, FORMAT), f"{files.document}:")
-        arrays = files.read_arrays(document.weights_sha256)
+        document, digest = files.read_document(FORMAT, _DOCUMENT)
+        arrays = files.read_arrays(digest)
         return cls(
-            TracePCA(**select_arrays(arrays, "pca.")),
-            select_arrays(arrays, "weights."),
-            FaultLikelihoods(**select_arrays(arrays, "likelihoods.")),
-            ExceedanceModel(**select_arrays(arrays, "exceedance.")),
-            arrays["rest_range_v"],
-            dead=tuple(document.dead),
-            **document.model_dump(exclude={"format", "dead", "weights_sha256"}),
+            **vars(document),
+            pca=TracePCA(**select_arrays(arrays, "pca.")),
+            weights=select_arrays(arrays, "weights."),
+            likelihoods=FaultLikelihoods(**select_arrays(arrays, "likelihoods.")),
+            exceedance=ExceedanceModel(**select_arrays(arrays, "exceedance.")),
+            rest_range_v=arrays["rest_range_v"],
         )
 
 

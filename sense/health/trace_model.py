@@ -12,15 +12,16 @@ from dataclasses import dataclass
 import numpy as np
 
 from padforge.common.parallel import one_thread
-from padforge.sense.arrays import MIN_SCALE_V, Array, Floats, Indices, Mask
+from padforge.sense.arrays import MIN_SCALE_V, Array, Floats, Indices, Mask, press_bounds
+from padforge.sense.localizer import moments
 
 Weights = Mapping[str, Floats]
-"""`first.w` (E, C, N, H), `first.mask` (E, C, H), `first.b` (E, H), `hidden.w` (E, H, H), `hidden.b` (E, H), `last.w`
-(E, C, H, 2 T) and `last.b` (E, C, 2 T), for E members, N inputs a fibre, H hidden units and T targets a fibre."""
+"""`first.w` (E, L, N, H), `first.mask` (E, L, H), `first.b` (E, H), `hidden.w` (E, H, H), `hidden.b` (E, H), `last.w`
+(E, L, H, 2 T) and `last.b` (E, L, 2 T), for E members, N inputs a fibre, H hidden units and T targets a fibre."""
 
-REST = 10  # readings of a trace before the probe is sent down
-HELD = 20  # readings of a trace after it was sent down
-RELEASED = 20  # readings of a trace after it was sent up
+REST = -moments.REST[0]  # readings of a trace before the probe is sent down: those of the windows of a localizer
+HELD = moments.PRESS_WINDOWS[-1][1]  # readings of a trace after it was sent down
+RELEASED = moments.RELEASE_WINDOWS[-1][1]  # readings of a trace after it was sent up
 TRACE = REST + HELD + RELEASED
 COMPONENTS = 6  # principal components of a response: 99.7 % of the variance on the published pad
 INPUTS = 2 * COMPONENTS + 1  # inputs of a fibre: response, baseline and history
@@ -42,7 +43,7 @@ LOG_STD = (-4.0, 2.0)  # range of the logarithm of a predicted standard deviatio
 
 
 def extract_trace(readings: Array, down_command: int, up_command: int, first: int, end: int) -> Array:
-    """Extract the trace (C, TRACE) of a press from the readings (R, C) from `first` to before `end`.
+    """Extract the trace (L, TRACE) of a press from the readings (R, L) from `first` to before `end`.
 
     Before `first` and from `end` on, the nearest reading is repeated; after the release all are NaN if the press ends
     before it.
@@ -65,11 +66,11 @@ def bound_presses(readings: Array, down_command: Indices, up_command: Indices) -
     # The last press is not cut short by another one: its remaining readings are missing, and not repeated.
     missing = max(int(up_command[-1]) + RELEASED - len(readings), 0)
     readings = np.pad(readings, ((0, missing), (0, 0)), constant_values=np.nan) if missing else readings
-    return readings, np.concatenate([[0], up_command[:-1]]), np.append(down_command[1:], len(readings))
+    return readings, *press_bounds(down_command, up_command, len(readings))
 
 
 def extract_traces(readings: Array, down_command: Indices, up_command: Indices) -> Array:
-    """Extract the traces (Q, C, TRACE) of all presses of (R, C) readings."""
+    """Extract the traces (Q, L, TRACE) of all presses of (R, L) readings."""
     readings, first, end = bound_presses(readings, down_command, up_command)
     presses = zip(down_command, up_command, first, end, strict=True)
     return np.stack([extract_trace(readings, *press) for press in presses])
@@ -79,9 +80,9 @@ def extract_traces(readings: Array, down_command: Indices, up_command: Indices) 
 class TraceHistory:
     """State of the fibres after earlier presses."""
 
-    level: Array  # running level of the rest; shape (C,), V; NaN before the first press
-    n_presses: Indices  # presses in it; shape (C,)
-    residue: Array  # decaying sum of earlier responses; shape (C, D)
+    level: Array  # running level of the rest; shape (L,), V; NaN before the first press
+    n_presses: Indices  # presses in it; shape (L,)
+    residue: Array  # decaying sum of earlier responses; shape (L, D)
 
     @classmethod
     def initial(cls, fibres: int) -> "TraceHistory":
@@ -93,13 +94,13 @@ class TraceHistory:
 class TracePCA:
     """Principal components of the responses, and the scales of inputs and targets of the network."""
 
-    components: Array  # principal directions of each fibre's responses; shape (C, TRACE, D)
-    input_scale_v: Array  # shape (C, N)
-    target_scale_v: Array  # shape (C, T)
+    components: Array  # principal directions of each fibre's responses; shape (L, TRACE, D)
+    input_scale_v: Array  # shape (L, N)
+    target_scale_v: Array  # shape (L, T)
 
     @classmethod
     def fit_transform(cls, traces: Array) -> tuple["TracePCA", Floats, Array]:
-        """Fit to healthy traces (Q, C, TRACE); return also their inputs (Q, C, N) and targets (Q, C, T)."""
+        """Fit to healthy traces (Q, L, TRACE); return also their inputs (Q, L, N) and targets (Q, L, T)."""
         responses = traces - traces[:, :, :REST].mean(axis=2, keepdims=True)
         moments = np.einsum("qcw,qcv->cwv", responses, responses) / len(responses)
         components = np.linalg.eigh(moments)[1][:, :, : -COMPONENTS - 1 : -1]
@@ -114,7 +115,7 @@ class TracePCA:
         return pca, *pca.scale(inputs, targets)
 
     def project(self, trace: Array, history: TraceHistory) -> tuple[Array, Array]:
-        """Compute the unscaled inputs (C, N) and targets (C, T) of a trace (C, TRACE), and update the history.
+        """Compute the unscaled inputs (L, N) and targets (L, T) of a trace (L, TRACE), and update the history.
 
         A fibre with NaN in its trace has NaN, and its history stays.
         """
@@ -132,17 +133,17 @@ class TracePCA:
         return inputs, targets
 
     def scale(self, inputs: Array, targets: Array) -> tuple[Floats, Array]:
-        """Scale inputs (..., C, N) and targets (..., C, T); inputs of missing fibres become 0."""
+        """Scale inputs (..., L, N) and targets (..., L, T); inputs of missing fibres become 0."""
         scaled = np.nan_to_num(np.clip(inputs / self.input_scale_v, -MAX_INPUT, MAX_INPUT))
         return scaled.astype(np.float32), targets / self.target_scale_v
 
 
 def predict_fibres(weights: Weights, inputs: Floats, fibre_mask: Mask) -> tuple[Array, Array]:
-    """Predict the targets (Q, C, T) of each fibre from scaled inputs (Q, C, N) of the *other* valid ones.
+    """Predict the targets (Q, L, T) of each fibre from scaled inputs (Q, L, N) of the *other* valid ones.
 
     Returns the mean and the standard deviation of the mixture of the members.
     """
-    # The first layer without a fibre is the sum over all minus the term of this fibre, computed once for all C.
+    # The first layer without a fibre is the sum over all minus the term of this fibre, computed once for all L.
     terms = np.einsum("qcn,ecnh->eqch", inputs, weights["first.w"]) + weights["first.mask"][:, None]
     terms = np.where(fibre_mask[:, :, None], terms, np.float32(0))
     h = _silu(terms.sum(axis=2, keepdims=True) - terms + weights["first.b"][:, None, None])
@@ -158,7 +159,7 @@ def _silu(x: Floats) -> Floats:
 
 
 def train_networks(inputs: Floats, targets: Array, rows: list[Indices], rng: np.random.Generator) -> dict[str, Floats]:
-    """Train one member on each set of presses (`rows`), of scaled inputs (Q, C, N) and targets (Q, C, T)."""
+    """Train one member on each set of presses (`rows`), of scaled inputs (Q, L, N) and targets (Q, L, T)."""
     import torch
     from torch.nn.functional import silu
 

@@ -31,7 +31,6 @@ N_SUMMARY = 9  # entries of a posterior summary, see `BayesianLocalizer.predict`
 MIN_EXPONENT = -60.0
 """Exponents are clipped to it: smaller ones are negligible, and ten times slower to exponentiate. The expected error of
 a design (`bayes_error`) has the same limit for the same reason, but importing it from there would take seconds."""
-PREFIX = "bayes."  # of the names of the arrays in files
 _CHUNK = 2**15
 
 
@@ -168,12 +167,7 @@ class BayesianLocalizer:
 
     def map_arrays(self, function: Callable[[Any], Any]) -> "BayesianLocalizer":
         """Apply a function to every array in single precision, for example to convert it to torch."""
-        return BayesianLocalizer(*map(function, self.to_arrays().values()))
-
-    def to_arrays(self, number: int = 0) -> dict[str, Any]:
-        """Return the arrays of the `number`-th stage by their names in files, in single precision, which is exact."""
-        prefix = f"{PREFIX}{number}."
-        return {prefix + field.name: getattr(self, field.name).astype(np.float32) for field in fields(self)}
+        return BayesianLocalizer(*(function(getattr(self, each.name).astype(np.float32)) for each in fields(self)))
 
 
 def fit_stages(

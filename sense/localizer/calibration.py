@@ -247,8 +247,7 @@ def fit_model(
 
     # 2. Tests for single presses, networks and Bayesian localizers
     left_out = leave_one_out_residuals(presses, table, leverage)
-    centring = scaler.mean_v / scaler.scale_v
-    tests = tuple(SinglePressTest.fit(table, left_out, centring, n_complete) for n_complete in stages(n_timed))
+    tests = tuple(SinglePressTest.fit(table, left_out, scaler.centring, n) for n in stages(n_timed))
     bayes, residual_network, trained_share = (), {}, 1.0
     if is_ensemble:
         trained = train_members(presses, table, options, rng, on_progress, time_budget, leverage)
@@ -380,7 +379,7 @@ def _calibrate_scales(
     since training presses are augmented by the response that it predicts them with. After `n_trained` presses, the mean
     of the scales is known from other pads, and these presses determine the ratios between members alone.
     """
-    positions = (positions_mm - model.scaler.origin_mm) / model.scaler.scale_mm
+    positions = model.scaler.scale_positions(positions_mm)
     subsets = [
         failed for n_failed in range(levels) for failed in failure_subsets(model.fibres, n_failed, SCALE_SUBSETS)
     ]

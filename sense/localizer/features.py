@@ -12,7 +12,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from padforge.sense.arrays import Array, Indices, Mask
+from padforge.sense.arrays import Array, Indices, Mask, press_bounds
 from padforge.sense.localizer.moments import (
     LATEST_WINDOWS,
     MODULATED,
@@ -75,7 +75,7 @@ def compute_features(
     (Q, C, J) of the presses takes longest, and is given if it was computed before.
     """
     filled = interpolate_gaps(readings)
-    _, next_begin = _neighbours(down_command, up_command, len(readings))
+    _, next_begin = press_bounds(down_command, up_command, len(readings))
     until = next_begin if until is None else np.clip(until, down_command + 1, next_begin)
     fibre_mask = valid_fibres(readings, down_command, up_command, until)
     if is_published:
@@ -113,7 +113,7 @@ def interpolate_gaps(readings: Array) -> Array:
 
 def window_means(readings: Array, down_command: Indices, up_command: Indices, until: Indices) -> Array:
     """Return (Q, C, F) means over the windows of press, release and latest readings, V, relative to the baseline."""
-    previous_end, _ = _neighbours(down_command, up_command, len(readings))
+    previous_end, _ = press_bounds(down_command, up_command, len(readings))
     baseline = mean_at_rest(readings, down_command, previous_end)
     return windows_from_rest(readings, baseline, down_command, up_command, until)
 
@@ -179,7 +179,7 @@ def _slow_median(readings: Any, down_command: Any, length: int, xp: Any) -> Any:
 
 def _running_medians(readings: Array, down_command: Indices, up_command: Indices) -> Array:
     """Return the published features (Q, C, 3), V: the running medians before, in and after the press."""
-    previous_end, next_begin = _neighbours(down_command, up_command, len(readings))
+    previous_end, next_begin = press_bounds(down_command, up_command, len(readings))
     window = (-(MEDIAN_WIDTH // 2), MEDIAN_WIDTH // 2 + 1)
     ranges = (
         (down_command - MEDIAN_OFFSET, previous_end, down_command),
@@ -188,11 +188,6 @@ def _running_medians(readings: Array, down_command: Indices, up_command: Indices
     )
     medians = [np.median(_gather(readings, middle, window, low, high, np), axis=1) for middle, low, high in ranges]
     return np.stack(medians, axis=2)
-
-
-def _neighbours(down_command: Indices, up_command: Indices, n_readings: int) -> tuple[Indices, Indices]:
-    """Return the first reading (Q,) after the previous press, and the first of the next press."""
-    return np.concatenate([[0], up_command[:-1]]), np.concatenate([down_command[1:], [n_readings]])
 
 
 def _gather(readings: Any, origin: Any, window: Window, low: Any, high: Any, xp: Any) -> Any:

@@ -3,24 +3,22 @@
 A localizer trained on presses of several depths also predicts depth, and force if that was known.
 """
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
-from pydantic import ConfigDict, Field, JsonValue, TypeAdapter, ValidationError
+from pydantic import ConfigDict, Field, JsonValue, TypeAdapter
 
-from padforge.common.files import read_json, reraise_write_error, write_text
-from padforge.common.validation import InputError, check_type, short_repr
+from padforge.common.files import reraise_write_error, write_text
+from padforge.common.validation import InputError, short_repr
 from padforge.sense.arrays import MAX_RATE_HZ, MIN_RATE_HZ, Array, Floats, Indices, Mask
 from padforge.sense.formats.columns import join_names
-from padforge.sense.localizer.bayes import PREFIX as BAYES
 from padforge.sense.localizer.bayes import BayesianLocalizer
 from padforge.sense.localizer.features import FeatureSet, PressFeatures, compute_features
-from padforge.sense.localizer.model_files import check_same_pad, files_of, select_arrays
+from padforge.sense.localizer.model_files import DOCUMENT_CONFIG, check_same_pad, files_of, select_arrays
 from padforge.sense.localizer.moments import (
     BAYES_STAGES,
     N_PRESS_WINDOWS,
@@ -33,8 +31,7 @@ from padforge.sense.localizer.moments import (
     count_complete,
 )
 from padforge.sense.localizer.network import Networks, Sliding, Weights, predict
-from padforge.sense.localizer.scaler import DOCUMENT_CONFIG, FeatureScaler, ScaledFeatures, array_field
-from padforge.sense.localizer.single_press import PREFIX as SINGLE_PRESS
+from padforge.sense.localizer.scaler import FeatureScaler, ScaledFeatures, array_field
 from padforge.sense.localizer.single_press import SinglePressTest, find_misfits, find_unlike, is_other_pad, stages
 from padforge.sense.recording.frames import framed
 from padforge.sense.recording.recording import Recording
@@ -42,7 +39,8 @@ from padforge.sense.settings import Method, Split
 
 FORMAT = "padforge-localizer/1"
 NAME = "localizer"  # of its files, `localizer.json` and `localizer.safetensors`
-TABLE = "table"  # name of the response table among the arrays
+TABLE, BAYES, SINGLE_PRESS = "table", "bayes", "single_press"
+"""Names, among the arrays, of the response table, the Bayesian localizers and the tests for single presses."""
 UNIFORM = (3**-0.5, (2 / np.pi) ** 0.5, 1.1150)
 """Standard deviation and radii of 50 and 90 % of a uniform distribution over a square of half-width 1."""
 MEASURE_COLUMNS = {"depth_mm": ("depth_mm", "depth_r90_mm"), "force_n": ("force_n", "force_r90_n")}
@@ -365,15 +363,9 @@ class LocalizerModel(LocalizerDocument):
         Raises:
             InputError: the folder cannot be written.
         """
-        document = {"format": FORMAT, **_DOCUMENT.dump_python(self, warnings=False)}
-        networks = {**self.networks, RESIDUAL: self.residual_network}
-        arrays = {f"{name}.{part}": array for name, network in networks.items() for part, array in network.items()}
-        arrays |= {TABLE: self.table}
-        for number, stage in enumerate(self.bayes):
-            arrays |= stage.to_arrays(number)
-        for number, test in enumerate(self.single_press):
-            arrays |= test.to_arrays(number)
-        files_of(folder, NAME).write(document, arrays)
+        parts = {**self.networks, RESIDUAL: self.residual_network, TABLE: self.table, SINGLE_PRESS: self.single_press}
+        parts[BAYES] = tuple(stage.map_arrays(np.asarray) for stage in self.bayes)
+        files_of(folder, NAME).write(FORMAT, _DOCUMENT.dump_python(self, warnings=False), parts)
 
     @classmethod
     def load(cls, folder: str | Path) -> "LocalizerModel":
@@ -387,19 +379,22 @@ class LocalizerModel(LocalizerDocument):
         """
         files = files_of(folder, NAME)
         try:
-            content = read_json(files.document, FORMAT)
+            document, digest = files.read_document(FORMAT, _DOCUMENT)
         except InputError as error:
             if not isinstance(error.__cause__, FileNotFoundError):
                 raise
             name = files.document.name
             raise InputError(f"{folder}: no {name}, expected a folder that `padforge sense calibrate` wrote") from error
-        document, digest = _read_document(content, str(files.document))
+        scaler = document.scaler
+        # an empty list has no last axis
+        coef = scaler.history_coef.reshape(*scaler.history_mean_v.shape, scaler.mean_v.shape[-1])
+        document = replace(document, scaler=replace(scaler, history_coef=coef))
         n_timed = len(document.interval_factors) - 1
         arrays = files.read_arrays(digest)
         residual_network = select_arrays(arrays, f"{RESIDUAL}.")
         n_stages = (len(BAYES_STAGES) if n_timed else 1) if residual_network else 0
-        bayes = [select_arrays(arrays, f"{BAYES}{number}.") for number in range(n_stages)]
-        tests = [select_arrays(arrays, f"{SINGLE_PRESS}{number}.") for number in range(len(stages(n_timed)))]
+        bayes = [select_arrays(arrays, f"{BAYES}.{number}.") for number in range(n_stages)]
+        tests = [select_arrays(arrays, f"{SINGLE_PRESS}.{number}.") for number in range(len(stages(n_timed)))]
         return cls(
             **vars(document),
             networks={name: select_arrays(arrays, f"{name}.") for name in PHASES[n_timed]},
@@ -408,19 +403,3 @@ class LocalizerModel(LocalizerDocument):
             residual_network=residual_network,
             single_press=tuple(SinglePressTest(**test) for test in tests),
         )
-
-
-def _read_document(document: Mapping[str, Any], where: str) -> tuple[LocalizerDocument, str]:
-    """Return the document of a localizer, checked, and the digest of its arrays; `where` is its path."""
-    values = {name: value for name, value in document.items() if name not in ("format", "weights_sha256")}
-    try:
-        read = _DOCUMENT.validate_json(json.dumps(values))
-    except ValidationError as error:
-        first = error.errors()[0]
-        key = ".".join(map(str, first["loc"]))
-        raise InputError(f"{where}: {key} is {short_repr(first['input'])}: {first['msg'].lower()}") from error
-    scaler = read.scaler
-    # an empty list has no last axis
-    coef = scaler.history_coef.reshape(*scaler.history_mean_v.shape, scaler.mean_v.shape[-1])
-    digest = check_type(f"{where}: weights_sha256", document.get("weights_sha256"), str)
-    return replace(read, scaler=replace(scaler, history_coef=coef)), digest

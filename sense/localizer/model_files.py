@@ -3,18 +3,23 @@
 import hashlib
 import json
 from collections.abc import Mapping
+from dataclasses import fields, is_dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import ConfigDict, TypeAdapter, ValidationError
 from safetensors.numpy import load, save
 
-from padforge.common.files import atomic_files, read_bytes
-from padforge.common.validation import InputError, check_path
+from padforge.common.files import atomic_files, read_bytes, read_json
+from padforge.common.validation import InputError, check_path, check_type, short_repr
 from padforge.sense.recording.frames import FRAME_S
 
+DOCUMENT_CONFIG = ConfigDict(extra="forbid", allow_inf_nan=False, strict=True)  # of dataclasses that are documents
 RATE_TOLERANCE = 0.25  # share by which there may be fewer readings a second than a model was learnt from
+
+T = TypeVar("T")
 
 
 class ModelFiles(NamedTuple):
@@ -23,14 +28,30 @@ class ModelFiles(NamedTuple):
     document: Path
     weights: Path
 
-    def write(self, document: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]]) -> None:
-        """Write a document with "weights_sha256" added, and arrays, together or not at all."""
-        content = save({name: np.ascontiguousarray(array) for name, array in arrays.items()})
-        document = {**document, "weights_sha256": hashlib.sha256(content).hexdigest()}
+    def write(self, form: str, document: Mapping[str, Any], parts: Mapping[str, Any]) -> None:
+        """Write a document, with its format and "weights_sha256" added, and parts, together or not at all.
+
+        Parts are arrays, or mappings, dataclasses and tuples of them, named by their path, such as `bayes.0.grid`.
+        """
+        content = save(_flatten(parts))
+        document = {"format": form, **document, "weights_sha256": hashlib.sha256(content).hexdigest()}
         text = json.dumps(document, indent=1, allow_nan=False) + "\n"
         with atomic_files(self.document.parent) as stage:
             (stage / self.weights.name).write_bytes(content)
             (stage / self.document.name).write_text(text, encoding="utf-8")
+
+    def read_document(self, form: str, kind: "TypeAdapter[T]") -> tuple[T, str]:
+        """Read a document of a format, checked, and the digest of its arrays."""
+        document = read_json(self.document, form)
+        values = {name: value for name, value in document.items() if name not in ("format", "weights_sha256")}
+        try:
+            read = kind.validate_json(json.dumps(values))
+        except ValidationError as error:
+            first = error.errors()[0]
+            key = ".".join(map(str, first["loc"]))
+            message = f"{key} is {short_repr(first['input'])}: {first['msg'].lower()}"
+            raise InputError(f"{self.document}: {message}") from error
+        return read, check_type(f"{self.document}: weights_sha256", document.get("weights_sha256"), str)
 
     def read_arrays(self, digest: str) -> dict[str, NDArray[Any]]:
         """Read the arrays that were written with a document of this digest."""
@@ -46,6 +67,18 @@ def files_of(folder: str | Path, name: str) -> ModelFiles:
     """Return the files of a model in a folder."""
     folder = check_path("folder", folder)
     return ModelFiles(folder / f"{name}.json", folder / f"{name}.safetensors")
+
+
+def _flatten(part: Any, path: str = "") -> dict[str, NDArray[Any]]:
+    """Return the arrays of a part by their path."""
+    if isinstance(part, np.ndarray):
+        return {path: np.ascontiguousarray(part)}
+    if is_dataclass(part):
+        part = {each.name: getattr(part, each.name) for each in fields(part)}
+    items = enumerate(part) if isinstance(part, tuple) else part.items()
+    return {
+        name: array for key, each in items for name, array in _flatten(each, f"{path}.{key}" if path else key).items()
+    }
 
 
 def select_arrays(arrays: Mapping[str, NDArray[Any]], prefix: str) -> dict[str, NDArray[Any]]:

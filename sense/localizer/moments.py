@@ -41,6 +41,8 @@ RELEASE_WINDOWS: tuple[Window, ...] = ((0, 1), (1, 2), (2, 3), (3, 4), (4, 6), (
 """Windows after the probe was sent up: the release depends on the position as much as the press does."""
 LATEST_WINDOWS: tuple[Window, ...] = ((-1, 0), (-2, -1))
 """Windows before the latest reading, or before the release if that is earlier: they locate a finger that moves."""
+PRESS_MIDDLES = np.array([(first + end - 1) / 2 for first, end in PRESS_WINDOWS])
+"""Middles of `PRESS_WINDOWS`."""
 N_PRESS_WINDOWS = len(PRESS_WINDOWS)
 N_TIMED = len(PRESS_WINDOWS) + len(RELEASE_WINDOWS)
 """Windows of a press that are complete one after the other."""
@@ -109,7 +111,7 @@ POSSIBLE_SLIDE_THRESHOLD = 1.75
 BAYES_STAGES = (12, 13, 14, 15, 17)
 """Complete windows from which on a Bayesian localizer of its own answers. Before the release has shown, at 12, it errs
 by a third more than a network."""
-RESIDUAL_PHASE = Phase(N_PRESS_WINDOWS + 3, (0.15, 0.1, 0.15, 0.1, 0.05, 0.45))
+RESIDUAL_PHASE = Phase(BAYES_STAGES[0], (0.15, 0.1, 0.15, 0.1, 0.05, 0.45))
 """Phase of the network that corrects the Bayesian localizers."""
 
 

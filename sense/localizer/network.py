@@ -50,13 +50,16 @@ def check_weights(weights: Weights) -> None:
             raise InputError(f"{name} is up to {largest:g}, allowed is up to {MAX_WEIGHT:g}")
 
 
-def network_inputs(features: Floats, fibre_mask: Mask, complete: Mask) -> Floats:
-    """Return (Q, C F + C + K) inputs of a network from (Q, C, F) features and the (Q, C) and (Q, K) masks."""
-    untimed = np.ones((len(complete), features.shape[2] - complete.shape[1]), bool)
-    mask = fibre_mask[:, :, None] & np.hstack([complete, untimed])[:, None]
+def network_inputs(features: Any, fibre_mask: Any, complete: Any, xp: Any = np) -> Any:
+    """Return (Q, C F + C + K) inputs of a network from (Q, C, F) features and the (Q, C) and (Q, K) masks.
+
+    All arrays are of the module `xp`, numpy or torch.
+    """
+    untimed = xp.ones_like(features[:, 0, complete.shape[1] :], dtype=xp.bool)
+    mask = fibre_mask[:, :, None] & xp.concat([complete, untimed], axis=1)[:, None]
     # Masked features are replaced, not multiplied, by 0, since they may be NaN.
-    masked = np.where(mask, features, np.float32(0)).reshape(len(features), np.prod(features.shape[1:]))
-    return np.concatenate([masked, fibre_mask.astype(np.float32), complete.astype(np.float32)], axis=1)
+    masked = xp.where(mask, features, 0.0).reshape(-1, features.shape[1] * features.shape[2])
+    return xp.concat([masked, fibre_mask, complete], axis=1)
 
 
 def forward(weights: Weights, x: Floats) -> Floats:

@@ -7,12 +7,11 @@ import numpy as np
 from padforge.sense.arrays import Array, Mask
 from padforge.sense.localizer.features import PressFeatures
 from padforge.sense.localizer.model import LocalizerModel
-from padforge.sense.localizer.moments import N_PRESS_WINDOWS, PRESS_WINDOWS
+from padforge.sense.localizer.moments import N_PRESS_WINDOWS, PRESS_MIDDLES
 from padforge.sense.localizer.response_model import interpolate_grid
 
 MAX_RATIO = 0.9  # of successive changes of a response that relaxes
 MIN_V2 = 1e-15  # lower limit of sums of squares, V^2
-_MIDDLES = np.array([(first + end - 1) / 2 for first, end in PRESS_WINDOWS])
 
 
 @dataclass(frozen=True)
@@ -32,7 +31,7 @@ class PressCourse:
     def fit(cls, model: LocalizerModel, features: PressFeatures, position_mm: Array) -> "PressCourse":
         """Fit the proportion to the features of one press at a position (2,); the localizer is of windows."""
         scaler = model.scaler
-        position = (position_mm - scaler.origin_mm)[None] / scaler.scale_mm
+        position = scaler.scale_positions(position_mm[None])
         scaled = np.stack([interpolate_grid(model.table, position)[0], scaler.transform(features).inputs[0]])
         expected, measured = (scaler.uncentre(scaled) * scaler.scale_v).swapaxes(1, 2)
         latest, mask = max(int(features.complete[0, :N_PRESS_WINDOWS].sum()) - 1, 0), features.fibre_mask[0]
@@ -57,10 +56,10 @@ class PressCourse:
 
     def response(self, frames: Array) -> Array:
         """Return the response (n, C), V, at frames (n,) after the command down; it relaxes on after the windows."""
-        weights = np.stack([np.interp(frames, _MIDDLES, row) for row in np.eye(len(_MIDDLES))], axis=1)
+        weights = np.stack([np.interp(frames, PRESS_MIDDLES, row) for row in np.eye(N_PRESS_WINDOWS)], axis=1)
         earlier, later = np.diff(self.pressed[-3:], axis=0)
         ratio = float(np.clip((earlier * later).sum() / max((earlier**2).sum(), MIN_V2), 0.0, MAX_RATIO))
-        steps = np.maximum(frames - _MIDDLES[-1], 0.0) / (_MIDDLES[-1] - _MIDDLES[-2])
+        steps = np.maximum(frames - PRESS_MIDDLES[-1], 0.0) / (PRESS_MIDDLES[-1] - PRESS_MIDDLES[-2])
         return weights @ self.pressed + (ratio * (1 - ratio**steps) / (1 - ratio))[:, None] * later
 
     def _share(self, expected: Array) -> float:

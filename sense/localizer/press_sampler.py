@@ -15,7 +15,14 @@ import torch
 from padforge.common.compilation import kernel
 from padforge.sense.arrays import Array, Floats, Indices, Mask
 from padforge.sense.localizer.bayes import N_SUMMARY, BayesianLocalizer
-from padforge.sense.localizer.moments import LATEST_WINDOWS, N_PRESS_WINDOWS, PRESS_WINDOWS, Phase, bayes_stage
+from padforge.sense.localizer.moments import (
+    LATEST_WINDOWS,
+    N_PRESS_WINDOWS,
+    PRESS_MIDDLES,
+    PRESS_WINDOWS,
+    Phase,
+    bayes_stage,
+)
 from padforge.sense.localizer.response_model import interpolate_grid
 from padforge.sense.localizer.scaler import TrainingPresses
 
@@ -29,7 +36,6 @@ LAST_INSTANT_WINDOW = 4  # last of `PRESS_WINDOWS` that responds without delay
 N_LATEST = len(LATEST_WINDOWS)
 _HOLD = PRESS_WINDOWS[-1][1]
 _ENDS = np.array([0, *(end for _, end in PRESS_WINDOWS), _HOLD + 1])  # of `PRESS_WINDOWS`, with one before and after
-_MIDDLES = np.array([(first + end - 1) / 2 for first, end in PRESS_WINDOWS])
 _WINDOW_OF = np.array([max(sum(first <= n for first, _ in PRESS_WINDOWS) - 1, 0) for n in range(_HOLD)])
 """Window of each reading after the probe was sent down."""
 
@@ -249,10 +255,10 @@ def _trace_slide(
     cells, fractions = np.empty((n_increments, n_windows, 2), np.int64), np.empty((n_increments, n_windows, 2))
     for k in range(n_windows):
         windows[k] = k if k < N_PRESS_WINDOWS else latest_windows[k - N_PRESS_WINDOWS]
-        time = _MIDDLES[k] if k < N_PRESS_WINDOWS else end - (k - N_PRESS_WINDOWS)
+        time = PRESS_MIDDLES[k] if k < N_PRESS_WINDOWS else end - (k - N_PRESS_WINDOWS)
         for n in range(n_increments):
-            delayed = time - (_MIDDLES[LAST_INSTANT_WINDOW + n] - _MIDDLES[LAST_INSTANT_WINDOW])
-            age = max(end - max(delayed, _MIDDLES[1]), 0.0)  # the finger does not slide before it has sunk in
+            delayed = time - (PRESS_MIDDLES[LAST_INSTANT_WINDOW + n] - PRESS_MIDDLES[LAST_INSTANT_WINDOW])
+            age = max(end - max(delayed, PRESS_MIDDLES[1]), 0.0)  # the finger does not slide before it has sunk in
             x = min(max(target[0] - age * velocity[0], -1.0), 1.0)
             y = min(max(target[1] - age * velocity[1], -1.0), 1.0)
             cells[n, k, 0], cells[n, k, 1], fractions[n, k, 0], fractions[n, k, 1] = _locate(x, y, side)

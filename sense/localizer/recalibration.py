@@ -232,9 +232,8 @@ def refit(
     networks = {name: weights for name, weights in start.networks.items() if not only_last or name in last}
     rng = np.random.default_rng([seed, len(features)])
     retrained = retrain(networks, start.residual_network, presses, table, start.max_failures, rng, bayes)
-    centring = start.scaler.mean_v / start.scaler.scale_v
     tests = [
-        SinglePressTest.fit(table, presses, centring, n_complete, test).calibrated(presses)
+        SinglePressTest.fit(table, presses, start.scaler.centring, n_complete, test).calibrated(presses)
         for n_complete, test in zip(stages(n_timed), start.single_press, strict=True)
     ]
     changed = replace(

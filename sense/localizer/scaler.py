@@ -14,13 +14,13 @@ from pydantic_core import PydanticCustomError
 
 from padforge.sense.arrays import MAX_MM, MAX_VOLTS, MIN_SCALE_V, Array, Floats, Indices, Mask, masked_mean
 from padforge.sense.localizer.features import PressFeatures
+from padforge.sense.localizer.model_files import DOCUMENT_CONFIG
 from padforge.sense.localizer.moments import LATEST_WINDOWS, PRESS_WINDOWS
 from padforge.sense.localizer.response_model import ResponseModel, interpolate_grid, leverages, remove_history
 from padforge.sense.localizer.response_process import ResponseFit, ResponsePrior, fit_response
 
 MAX_INPUT = 1e4  # scaled features are clipped to it; no press exceeds it
 MAX_LEVERAGE = 0.9  # limits the leave-one-out residual of an isolated press to ten times its residual
-DOCUMENT_CONFIG = ConfigDict(extra="forbid", allow_inf_nan=False, strict=True)
 
 
 def array_field(low: float, high: float) -> tuple[PlainValidator, PlainSerializer]:
@@ -145,9 +145,14 @@ class FeatureScaler:
         """Scale (..., C, F + G) windows without history and modulations."""
         return np.clip((windows - self.mean_v) / self.scale_v, -MAX_INPUT, MAX_INPUT).astype(np.float32)
 
+    @property
+    def centring(self) -> Array:
+        """What scaling subtracts from windows, scaled; shape (C, F + G)."""
+        return self.mean_v / self.scale_v
+
     def uncentre(self, scaled: Floats) -> Array:
         """Undo the centring of (..., C, F + G) scaled windows, so that 0 is no response."""
-        return scaled + self.mean_v / self.scale_v
+        return scaled + self.centring
 
     @property
     def depth_gain(self) -> float:
@@ -157,7 +162,11 @@ class FeatureScaler:
     def scale_targets(self, positions_mm: Array, measures: Mapping[str, Array] | None = None) -> Floats:
         """Return the scaled targets (Q, 2 + T) of (Q, 2) positions and (Q,) values of each measure."""
         columns = [target.transform((measures or {})[target.name]) for target in self.measures]
-        return np.column_stack([(positions_mm - self.origin_mm) / self.scale_mm, *columns]).astype(np.float32)
+        return np.column_stack([self.scale_positions(positions_mm), *columns]).astype(np.float32)
+
+    def scale_positions(self, positions_mm: Array) -> Array:
+        """Scale (Q, 2) positions, mm."""
+        return (positions_mm - self.origin_mm) / self.scale_mm
 
     def positions_mm(self, targets: Floats) -> Array:
         """Return the positions of (Q, 2) scaled ones, mm."""
@@ -219,7 +228,7 @@ def refit_response(
     relative_depth = 1 + presses.depth_gain * presses.targets[:, 2] if presses.depth_gain else None
     positions, windows = presses.targets[:, :2].astype(np.float64), scaler.uncentre(presses.inputs)[..., :n_windows]
     fit, refitted = fit_response(positions, windows, presses.fibre_mask, prior, relative_depth), table.copy()
-    refitted[..., :n_windows] = fit.table - scaler.uncentre(np.zeros_like(table[0, 0]))[:, :n_windows]
+    refitted[..., :n_windows] = fit.table - scaler.centring[:, :n_windows]
     return refitted, fit
 
 

@@ -7,7 +7,7 @@ one. The distributions of both quantities are calibrated on presses that were no
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import combinations
 from math import sqrt
@@ -51,7 +51,6 @@ OTHER_PAD = (
     "these presses are unlike those of the calibration: another pad, or one cast again; radii do not hold; recalibrate"
 )
 """What `is_other_pad` means, for people."""
-PREFIX = "single_press."  # of the names of the arrays in files
 _CHUNK = 256
 
 
@@ -218,10 +217,6 @@ class SinglePressTest:
         """Pairs of positions (P, P) that are distant enough for two presses."""
         distance = np.linalg.norm(self.positions[:, None] - self.positions, axis=2)
         return distance > (MIN_CELLS - 0.5) * distance[distance > 0].min(initial=np.inf)
-
-    def to_arrays(self, number: int) -> dict[str, Array]:
-        """Return the arrays of the `number`-th stage by their names in files."""
-        return {f"{PREFIX}{number}.{field.name}": getattr(self, field.name) for field in fields(self)}
 
 
 def find_unlike(tests: Sequence[SinglePressTest], presses: ScaledFeatures) -> Mask:

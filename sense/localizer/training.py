@@ -211,7 +211,7 @@ def run_trainings(
 
     def train(number: int) -> tuple[Weights, int]:
         task, seed = tasks[number], seeds[number]
-        training = Training(presses, table, task.options, seed, task.phase, task.bayes, task.start, task.spread)
+        training = Training(presses, table, task, seed)
         fitted = fit_network(
             dict(training.network.named_parameters()),
             training.loss,
@@ -269,7 +269,8 @@ def train_members(
     else:
         has_bayes = not presses.depth_gain
         with one_thread():
-            pace_s = Training(presses, table, options, 0, next(iter(phases.values()))).measure_pace()
+            name, phase = next(iter(phases.items()))
+            pace_s = Training(presses, table, TrainingTask(name, phase, options, steps), 0).measure_pace()
         length = sum(phase.length for phase in phases.values())
         members = max(1, min(round(cores * time_budget / (pace_s * MIN_LENGTHS * steps * length)), MAX_MEMBERS))
     fitted = presses.inputs, presses.fibre_mask, presses.targets
@@ -335,26 +336,16 @@ def train_published(train: TrainingPresses, early_stop: TrainingPresses, rng: np
 class Training:
     """A network and its loss, on the CPU: a GPU is no faster, since it waits for batches and kernel launches."""
 
-    def __init__(
-        self,
-        presses: TrainingPresses,
-        table: Floats,
-        options: LocalizerSettings,
-        seed: int,
-        phase: Phase,
-        bayes: Sequence[BayesianLocalizer] = (),
-        start: Weights | None = None,
-        spread: float = 1.0,
-    ) -> None:
-        rng = np.random.default_rng(seed)
+    def __init__(self, presses: TrainingPresses, table: Floats, task: TrainingTask, seed: int) -> None:
+        rng, options = np.random.default_rng(seed), task.options
         self.n_steps = 0  # batches so far
-        self._recent, self._reuses = deque[tuple[Floats, Floats]](maxlen=RECENT_BATCHES), bool(bayes)
-        self._sampler = sampler = PressSampler(presses, table, options.max_failures, rng, phase, bayes)
+        self._recent, self._reuses = deque[tuple[Floats, Floats]](maxlen=RECENT_BATCHES), bool(task.bayes)
+        self._sampler = sampler = PressSampler(presses, table, options.max_failures, rng, task.phase, task.bayes)
         self._batch, targets = min(options.batch, len(presses.inputs)), sampler.targets
         self._bounds = low, high = targets[:, :3].min(axis=0), targets[:, :3].max(axis=0)
         spacing = math.sqrt((high - low)[:2].prod() / len(np.unique(targets[:, :2], axis=0)))
         with_depth = POSITION_AUGMENTATION, POSITION_AUGMENTATION, DEPTH_AUGMENTATION
-        self._std = np.float32(with_depth if sampler.depth_gain else (spread * AUGMENTATION * spacing,) * 2)
+        self._std = np.float32(with_depth if sampler.depth_gain else (task.spread * AUGMENTATION * spacing,) * 2)
         self._force_per_depth = 0.0
         if sampler.depth_gain:
             centred = (targets - targets.mean(axis=0))[:, 2:]
@@ -363,9 +354,9 @@ class Training:
         generator = torch.Generator().manual_seed(seed)
         self.network = EnsembleMlp.random(sampler.n_inputs, n_outputs, options, generator)
         self._directions, self._shrinkage = self._fit_directions()
-        if start is not None:
-            first = self.scale_up(torch.from_numpy(start["first.w"]).mT).mT
-            self.network = EnsembleMlp.from_numpy({**start, "first.w": first.contiguous().numpy()})
+        if task.start is not None:
+            first = self.scale_up(torch.from_numpy(task.start["first.w"]).mT).mT
+            self.network = EnsembleMlp.from_numpy({**task.start, "first.w": first.contiguous().numpy()})
 
     def weights(self, fitted: Weights) -> Weights:
         """Return weights for unscaled inputs, from `fitted` parameters for scaled ones."""

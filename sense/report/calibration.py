@@ -21,12 +21,12 @@ from padforge.sense.health.fault_detector import HEALTH_FILES, FaultDetector
 from padforge.sense.localizer.calibration import calibrate, missing_target_lines
 from padforge.sense.localizer.evaluation import Evaluation
 from padforge.sense.recording.recording import Recording
+from padforge.sense.report.sections import BY_LOSS, BY_MOMENT, MAP
 from padforge.sense.settings import LocalizerSettings
 from padforge.sense.studies.fibre_loss import draw_errors_by_loss
 
 _log = logging.getLogger(__name__)
 
-MAP, BY_LOSS, BY_MOMENT = "error_map.png", "error_by_loss.png", "error_by_moment.png"
 FILES = ("localizer.json", "localizer.safetensors", "calibration.json", MAP, BY_LOSS, BY_MOMENT, *sorted(HEALTH_FILES))
 """Names of all files of a calibration; those of health and of moments where these can be learnt."""
 

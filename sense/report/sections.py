@@ -6,7 +6,6 @@ be read.
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
-from html import escape
 from math import isnan
 from pathlib import Path
 from statistics import median
@@ -14,16 +13,13 @@ from typing import Any
 
 from padforge.common.files import read_bytes
 from padforge.common.page import PageSection, collapsible, columns, figures, heading, paragraph, table
-from padforge.common.plotting import ALARM, INK
 from padforge.common.validation import InputError
 from padforge.sense.localizer.evaluation import BUILT_PAD, reserve_lines
 from padforge.sense.recording.recording import Recording
 from padforge.sense.recording.run_directory import JOURNAL, read_journal
 
+MAP, BY_LOSS, BY_MOMENT = "error_map.png", "error_by_loss.png", "error_by_moment.png"
 NUMBERS = ("one", "two", "three")
-CELL = 40
-MAX_NUMBERED = 16
-"""Fibres up to which cells of the chart have numbers; with more, they are too small to be read on a phone."""
 
 Errors = Mapping[tuple[int, ...], float]
 """Mean error, mm, by indices of failed fibres, ascending."""
@@ -98,8 +94,8 @@ def calibration_sections(folder: Path, document: Mapping[str, Any]) -> list[Page
         ),
         figures(
             [
-                (folder / "error_map.png", "True positions of presses, and the errors of the predicted ones."),
-                (folder / "error_by_loss.png", "Error by number of failed fibres."),
+                (folder / MAP, "True positions of presses, and the errors of the predicted ones."),
+                (folder / BY_LOSS, "Error by number of failed fibres."),
             ]
         ),
         heading("Idle share"),
@@ -129,7 +125,7 @@ def _moment_errors(folder: Path, rows: Sequence[Mapping[str, Any]]) -> list[str]
     return [
         heading("While a press is read"),
         table(head, cells),
-        figures([(folder / "error_by_moment.png", caption)]),
+        figures([(folder / BY_MOMENT, caption)]),
     ]
 
 
@@ -170,22 +166,23 @@ def fibre_loss_sections(folder: Path, document: Mapping[str, Any]) -> list[PageS
 
 
 def _describe_losses(errors: Errors) -> Iterator[str]:
-    """Describe the errors by set of failed fibres: the worst ones in words, all as a chart and as tables."""
+    """Describe the errors by set of failed fibres: the worst ones in words, all as tables."""
     fibres = 1 + max(fibre for failed in errors for fibre in failed)
     counts = sorted({len(failed) for failed in errors} - {0})
-    worst_sets = [_worst(errors, count) for count in counts]
+    worst_sets = [max((each for each in errors if len(each) == count), key=errors.__getitem__) for count in counts]
     worst = "; ".join(
         f"of {_fibre_count(len(failed))}, {_names(failed)} ({errors[failed]:.2f} mm)" for failed in worst_sets
     )
     intact = f" With all fibres the error is {errors[()]:.2f} mm." if () in errors else ""
     yield paragraph(f"The worst loss: {worst}.{intact}")
-    chart: list[str] = []
+    pairs: list[str] = []
     if {1, 2} <= set(counts):
         few = {failed: error for failed, error in errors.items() if len(failed) <= 2}
-        chart = [
-            f"<figure>{loss_chart(few, fibres)}<figcaption>Mean error in mm without two fibres, given by the row and"
-            " the column; on the diagonal, without one. Darker is worse.</figcaption></figure>"
-        ]
+        caption = (
+            "Mean error in mm without two fibres, given by the row and the column; on the diagonal, without one. Darker"
+            " is worse."
+        )
+        pairs = [_loss_table(few, fibres), paragraph(caption)]
     head = ["fibre", *("alone (mm)" if count == 1 else f"with {_fibre_count(count - 1)} more" for count in counts)]
 
     def mean_with(fibre: int, count: int) -> str:
@@ -194,14 +191,10 @@ def _describe_losses(errors: Errors) -> Iterator[str]:
 
     rows = [[fibre + 1, *(mean_with(fibre, count) for count in counts)] for fibre in range(fibres)]
     means = [table(head, rows), paragraph("Mean error over the sets of failed fibres that a fibre is in.")]
-    yield columns(*([chart] if chart else []), means)
+    yield columns(*([pairs] if pairs else []), means)
     ranked = sorted(errors.items(), key=lambda item: -item[1])[:10]
     rows = [[_names(failed), f"{error:.2f}"] for failed, error in ranked if failed]
     yield collapsible("The worst sets", [table(["failed", "mean (mm)"], rows)])
-
-
-def _worst(errors: Errors, count: int) -> tuple[int, ...]:
-    return max((failed for failed in errors if len(failed) == count), key=errors.__getitem__)
 
 
 def _error_cells(row: Mapping[str, Any], *more: str) -> list[object]:
@@ -217,65 +210,17 @@ def _names(failed: Sequence[int]) -> str:
     return f"{', '.join(first)} and {last}" if first else last
 
 
-def loss_chart(errors: Errors, fibres: int) -> str:
-    """Draw an SVG triangle: the error without one fibre on its diagonal, without two below it; darker is worse.
-
-    The errors are those of all sets of one and of two of the `fibres`, and of the empty set if known.
-    """
+def _loss_table(errors: Errors, fibres: int) -> str:
+    """Write a triangle: the error without one fibre on its diagonal, without two below it; darker is worse."""
     low, high = min(errors.values()), max(errors.values())
-    numbered = fibres <= MAX_NUMBERED
-    size = 14 if numbered else 3 * fibres // 2
-    left, top = 2 * size, 6
-    width = left + fibres * CELL + size // 2
-    height = top + fibres * CELL + 4 * size
-    shapes: list[str] = []
-    for fibre in range(fibres):
-        if numbered or (fibre + 1) % 5 == 0:
-            middle = (fibre + 0.5) * CELL
-            shapes.append(_svg_text(str(fibre + 1), left - 0.7 * size, top + middle + size / 3, size))
-            shapes.append(_svg_text(str(fibre + 1), left + middle, top + fibres * CELL + 1.2 * size, size))
-    shapes += _colour_scale(low, high, size, left, height)
-    for failed, error in errors.items():
-        if not failed:
-            continue
-        x, y, share = left + failed[0] * CELL, top + failed[-1] * CELL, (error - low) / ((high - low) or 1.0)
-        shapes.append(
-            f'<rect x="{x + 1}" y="{y + 1}" width="{CELL - 2}" height="{CELL - 2}" rx="3" fill="{_shade(share)}">'
-            f"<title>without {_names(failed)}: {error:.2f} mm</title></rect>"
-        )
-        if numbered:
-            bold = ' font-weight="700"' if len(failed) == 1 else ""
-            colour = f' fill="{INK if share < 0.65 else "#ffffff"}" pointer-events="none"'
-            text = f"{error:.2f}" if error < 10 else f"{error:.1f}"
-            shapes.append(_svg_text(text, x + CELL / 2, y + CELL / 2 + 5, 14, bold + colour))
-    worst = (_worst(errors, count) for count in (1, 2))
-    described = "; ".join(f"worst without {_names(failed)}: {errors[failed]:.2f} mm" for failed in worst)
-    label = escape(f"Error without one and without two fibres; {described}.")
-    return (
-        f'<svg viewBox="0 0 {width} {height}" style="max-width:{1.7 * width:.0f}px" role="img"'
-        f' aria-label="{label}" font-family="system-ui, sans-serif" text-anchor="middle" fill="{INK}">'
-        f"{''.join(shapes)}</svg>"
-    )
-
-
-def _colour_scale(low: float, high: float, size: int, left: int, height: int) -> Iterator[str]:
-    """Draw the scale of colours, from the least error to the greatest, in the lower left corner."""
-    y = height - 1.4 * size
-    yield _svg_text(f"{low:.2f}", left + 1.3 * size, y + 0.9 * size, size)
-    for step in range(5):
-        x = left + (2.9 + 1.4 * step) * size
-        yield f'<rect x="{x:.1f}" y="{y:.1f}" width="{1.4 * size:.1f}" height="{size}" fill="{_shade(step / 4)}"/>'
-    yield _svg_text(f"{high:.2f} mm", left + 10.3 * size, y + 0.9 * size, size, ' text-anchor="start"')
-
-
-def _svg_text(text: str, x: float, y: float, size: int, style: str = "") -> str:
-    return f'<text x="{x:.1f}" y="{y:.1f}" font-size="{size}"{style}>{text}</text>'
-
-
-def _shade(share: float) -> str:
-    """Return a colour from nearly white at 0 to ALARM at 1."""
-    pale = 1 - (0.06 + 0.94 * share)
-    return "#" + "".join(f"{round(part + pale * (255 - part)):02x}" for part in bytes.fromhex(ALARM[1:]))
+    cells = {(failed[-1], failed[0] + 1): error for failed, error in errors.items() if failed}
+    columns = range(1, fibres + 1)
+    rows = [
+        [row + 1, *(f"{cells[row, column]:.2f}" if (row, column) in cells else "" for column in columns)]
+        for row in range(fibres)
+    ]
+    shades = {cell: (error - low) / ((high - low) or 1.0) for cell, error in cells.items()}
+    return table(["", *map(str, columns)], rows, shades)
 
 
 def find_studies(folder: Path) -> Iterator[tuple[Path, dict[str, Any]]]:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from padforge.common.validation import InputError, check_int
-from padforge.sense.arrays import MAX_FIBRES, Array, Indices, check_stream
+from padforge.sense.arrays import MAX_FIBRES, Array, Indices, check_stream, press_bounds
 from padforge.sense.signals.detector_kernels import FURTHER, Change, State, detect, initial_state
 
 P_REJECT, P_ACCEPT = 1e-3, 1e-9  # probabilities that white noise makes a block leave the levels, and makes a change
@@ -116,7 +116,8 @@ def estimate_commands(presses: Presses, times_s: Array) -> tuple[Indices, Indice
     up_command = np.maximum(up_command, touched + 1)
     # Presses may follow each other closely: none begins before the one before it has ended.
     down_command = np.searchsorted(times_s, times_s[touched] - TOUCH_DELAY_S)
-    return np.maximum(down_command, np.concatenate([[0], up_command[:-1]]) + 1), up_command
+    previous_end, _ = press_bounds(down_command, up_command, len(times_s))
+    return np.maximum(down_command, previous_end + 1), up_command
 
 
 def first_readings(readings: Array, times_s: Array, down_command: Indices, up_command: Indices) -> Indices:
@@ -149,7 +150,7 @@ def align_to_detected(
         return down_command, up_command
     nearest = _nearest(presses.touched, down_command)
     touched, released = presses.touched[nearest], presses.released[nearest]
-    next_down = np.append(down_command[1:], len(readings))
+    _, next_down = press_bounds(down_command, up_command, len(readings))
     is_same = (touched >= down_command - MAX_LEAD) & (touched < up_command)
     is_same &= (released >= up_command - MAX_LEAD) & (released < next_down)
     return np.where(is_same, downs[nearest], down_command), np.where(is_same, ups[nearest], up_command)

@@ -19,7 +19,7 @@ from padforge.design import Contact, Morphology, Twin
 from padforge.design.contact import contact_press
 from padforge.design.settings import PadSettings
 from padforge.design.twin import PARTS, TwinChannel, TwinPart
-from padforge.sense.arrays import MAX_FIBRES, MIN_SCALE_V, Array
+from padforge.sense.arrays import MAX_FIBRES, MIN_SCALE_V, Array, press_bounds
 from padforge.sense.recording.press_plan import (
     PositionTest,
     PressPlan,
@@ -263,7 +263,8 @@ def measure_rig_settings(recording: Recording) -> dict[str, float]:
     if len(down_command) < MIN_PRESSES or not valid.any():
         return {}
     readings, rested = recording.readings[:, valid], ceil(REST_S * rate_hz)
-    first = np.maximum(down_command - rested, np.append(0, up_command[:-1]))
+    previous_end, _ = press_bounds(down_command, up_command, len(readings))
+    first = np.maximum(down_command - rested, previous_end)
     rests = zip(first, np.maximum(down_command, first + 1), strict=True)
     baseline = np.array([readings[start:end].mean(axis=0) for start, end in rests])
     decay_s, drift_v = _fit_variogram(baseline, float(np.median(np.diff(recording.times_s[down_command]))))

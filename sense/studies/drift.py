@@ -23,7 +23,7 @@ from padforge.design.morphology import Morphology
 from padforge.design.published.networks import fit_batch, training_presses
 from padforge.design.published.objective import idle_share
 from padforge.design.settings import PUBLISHED_CONTACT, between_fibres
-from padforge.sense.arrays import Array, Indices
+from padforge.sense.arrays import Array, Indices, press_bounds
 from padforge.sense.localizer.calibration import split_presses
 from padforge.sense.localizer.evaluation import ACTIVE, distances
 from padforge.sense.localizer.evaluation import idle_share as recorded_idle_share
@@ -116,7 +116,7 @@ def level_indices(readings: int, down_command: Indices, up_command: Indices) -> 
     They are SETTLED readings from a command of the probe or, if the cycle is too short, the nearest ones that belong
     neither to another phase nor to another press.
     """
-    previous, following = np.append(0, up_command[:-1]), np.append(down_command[1:], readings)
+    previous, following = press_bounds(down_command, up_command, readings)
     before = np.maximum(down_command - SETTLED, previous)
     pressed = np.minimum(down_command + SETTLED, up_command - 1)
     return np.column_stack([before, pressed, np.minimum(up_command + SETTLED, following - 1)])

@@ -12,8 +12,9 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from padforge.common import files, plotting
+from padforge.common import files
 from padforge.common.command_line import text_table
+from padforge.common.page import cell_text
 from padforge.common.parallel import State, one_thread, run_tasks
 from padforge.common.plotting import FAINT, INK, save_figure, style_axes
 from padforge.common.progress import OnProgress, ignore_progress
@@ -135,11 +136,7 @@ def study_lines(document: Mapping[str, Any]) -> list[str]:
 
 def _table_cells(rows: Sequence[Mapping[str, Any]]) -> list[list[str]]:
     """Format rows as text, the first one their keys."""
-
-    def cell(value: object) -> str:
-        return "-" if value is None else f"{value:.4g}" if isinstance(value, float) else str(value)
-
-    return [list(rows[0]), *(list(map(cell, row.values())) for row in rows)]
+    return [list(rows[0]), *(list(map(cell_text, row.values())) for row in rows)]
 
 
 def _markdown(document: Mapping[str, Any], figure: str) -> str:
@@ -275,8 +272,13 @@ def label_axes(axes: Any, title: str = "", grid: Literal["", "x", "y"] = "", **l
 
 
 def draw_confusions(axes: Any, counts: Sequence[Sequence[int]], title: str, xlabel: str, ylabel: str) -> None:
-    """Draw a confusion matrix with a title, predicted classes by column."""
-    plotting.draw_confusions(axes, counts)
+    """Draw a confusion matrix, true classes by row and predicted ones by column, in per cent of each row."""
+    percent = 100 * np.array(counts) / np.maximum(np.sum(counts, axis=1, keepdims=True), 1)
+    axes.imshow(percent, cmap="Blues", vmin=0, vmax=100)
+    for (i, j), value in np.ndenumerate(percent):
+        axes.text(j, i, f"{value:.0f}", ha="center", va="center", color="white" if value > 60 else INK, fontsize=9)
+    axes.tick_params(length=0, labelcolor=INK)
+    axes.spines[:].set_visible(False)
     axes.set_title(title, loc="left", color=INK, fontsize=10)
     axes.set_xlabel(xlabel, color=INK)
     axes.set_ylabel(ylabel, color=INK)

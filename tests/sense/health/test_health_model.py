@@ -47,7 +47,7 @@ def test_load_refuses_changed_documents_and_torn_files(model: HealthModel, tmp_p
     whole = {name: (tmp_path / name).read_bytes() for name in HEALTH_FILES}
     document = json.loads(whole[DOCUMENT])
     for change, message in (
-        ({"false_alarm_rate": 0.0}, "false_alarm_rate: got 0.0"),
+        ({"false_alarm_rate": 0.0}, "false_alarm_rate is 0.0"),
         ({"weights_sha256": "0" * 64}, "not the weights"),
     ):
         (tmp_path / DOCUMENT).write_text(json.dumps(document | change))

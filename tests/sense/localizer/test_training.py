@@ -1,5 +1,7 @@
 """Networks and their training: NumPy agrees with torch, masks are bounded, positions are augmented."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -9,7 +11,7 @@ from hypothesis import strategies as st
 from padforge.benchmarks import harness
 from padforge.benchmarks import localizer as bench
 from padforge.common.progress import ignore_progress
-from padforge.sense.localizer import network, torch_network, training
+from padforge.sense.localizer import network, training
 from padforge.sense.localizer.features import N_FEATURES
 from padforge.sense.localizer.moments import N_PRESS_WINDOWS, N_TIMED, PHASES, RESIDUAL_PHASE
 from padforge.sense.localizer.press_sampler import PressSampler, sample_fibre_dropout
@@ -31,7 +33,7 @@ def test_forward_agrees_with_torch(seed: int, layers: int, n_timed: int) -> None
     features = torch.randn(7, 3, 5, generator=generator)
     fibre_mask = torch.rand(7, 3, generator=generator) < 0.6
     seen = torch.rand(7, n_timed, generator=generator) < 0.6
-    x = torch_network.network_inputs(features, fibre_mask, seen)
+    x = network.network_inputs(features, fibre_mask, seen, torch)
     expected = ensemble(x[None]).detach().numpy()
     weights = EnsembleMlp.join(parameters(ensemble))
     inputs = network.network_inputs(features.numpy(), fibre_mask.numpy(), seen.numpy())
@@ -167,7 +169,8 @@ def test_inputs_are_scaled_down_in_training_alone() -> None:
     table = np.zeros((3, 3, 4, N_FEATURES), np.float32)
     common = 5 * rng.standard_normal((200, 1, 1)) + 0.1 * rng.standard_normal((200, 4, N_FEATURES))
     presses = training_presses(common, np.ones((200, 4), bool), rng.uniform(-1, 1, (200, 2)), N_TIMED)
-    trained = training.Training(presses, table, Options(hidden=8, layers=1), 0, PHASES[N_TIMED]["released"])
+    task = training.TrainingTask("released", PHASES[N_TIMED]["released"], Options(hidden=8, layers=1), 1)
+    trained = training.Training(presses, table, task, 0)
     x = torch.from_numpy(np.concatenate([trained.sample_batch()[0] for _ in range(20)], axis=1))
     scaled = trained.scale_down(x)
     squares = torch.linalg.eigvalsh(scaled[0].T @ scaled[0] / x.shape[1])
@@ -179,8 +182,7 @@ def test_inputs_are_scaled_down_in_training_alone() -> None:
     expected = trained.network(scaled).detach().numpy()
     np.testing.assert_allclose(network.forward(trained.weights(weights), x[0].numpy()), expected, atol=1e-4)
     # A training from these weights starts with a network that answers alike.
-    phase, start = PHASES[N_TIMED]["released"], trained.weights(weights)
-    further = training.Training(presses, table, Options(), 1, phase, start=start)
+    further = training.Training(presses, table, replace(task, start=trained.weights(weights)), 1)
     answers = further.network(further.scale_down(x)).detach().numpy()
     np.testing.assert_allclose(answers, expected, atol=1e-3)
 
@@ -193,8 +195,8 @@ def test_retrain_follows_another_response_from_where_networks_are(monkeypatch: p
     inputs = interpolate_grid(table, positions)
     presses = training_presses(inputs, np.ones((60, 3), bool), positions, N_TIMED)
     options = Options(hidden=16, layers=1, members=2)
-    phase = PHASES[N_TIMED]["released"]
-    members = [training.Training(presses, table, options, seed, phase) for seed in (0, 1)]
+    task = training.TrainingTask("released", PHASES[N_TIMED]["released"], options, 1)
+    members = [training.Training(presses, table, task, seed) for seed in (0, 1)]
     old = network.stack_members([each.weights(parameters(each.network)) for each in members])
     assert len(network.unstack_members(old)) == 2
     for name, part in network.stack_members(network.unstack_members(old)).items():
