@@ -17,11 +17,13 @@ import numpy as np
 
 from padforge.common.validation import InputError
 from padforge.sense.arrays import Array, Indices, Mask
-from padforge.sense.formats.annotations import ModelAnnotations
 from padforge.sense.recording.recording import Recording
 
 if TYPE_CHECKING:
     from rosbags.typesys.store import Typestore
+
+    from padforge.sense.health.fault_detector import FibreFault
+    from padforge.sense.localizer.model import Localization
 
 Stamped = tuple[int, memoryview]
 """Stamp of a message, ns, and the message as CDR."""
@@ -158,15 +160,18 @@ def to_topics(recording: Recording, epoch_s: float) -> dict[str, TopicSeries]:
     return {topic: series for topic, series in topics.items() if len(series.stamps)}
 
 
-def touches(recording: Recording, annotations: ModelAnnotations, epoch_s: float) -> TopicSeries:
+def touches(recording: Recording, localization: "Localization", epoch_s: float) -> TopicSeries:
     """Return TOUCHES: the predicted positions, at the end of each press."""
     covariances = np.zeros((len(recording.up_command), 36))
-    covariances[:, [0, 7]] = (annotations.std_mm / 1000) ** 2
-    depth_variances = (annotations.depths_r90_mm / 1000 / Z90) ** 2
-    covariances[:, DEPTH_VARIANCE] = np.where(np.isnan(annotations.depths_mm), UNKNOWN_VARIANCE, depth_variances)
-    z = depths_to_z(annotations.depths_mm, recording.mirrored)
+    covariances[:, [0, 7]] = (localization.std_mm / 1000) ** 2
+    covariances[:, DEPTH_VARIANCE] = UNKNOWN_VARIANCE
+    z = np.zeros(len(covariances))
+    if depth := localization.measures.get("depth_mm"):
+        variances = (depth.r90 / 1000 / Z90) ** 2
+        covariances[:, DEPTH_VARIANCE] = np.where(np.isnan(depth.values), UNKNOWN_VARIANCE, variances)
+        z = depths_to_z(depth.values, recording.mirrored)
     stamps = stamps_at(to_stamps(recording.times_s, epoch_s), recording.up_command)
-    return TopicSeries(stamps, np.column_stack([annotations.positions_mm / 1000, z, covariances]))
+    return TopicSeries(stamps, np.column_stack([localization.positions_mm / 1000, z, covariances]))
 
 
 def arm_poses(states: Array, epoch_s: float) -> TopicSeries:
@@ -277,17 +282,17 @@ def decode_recording(raw: RawMessages, readings: Array) -> tuple[Recording, floa
 
 
 def encode_health(
-    store: "Typestore", recording: Recording, annotations: ModelAnnotations, stamps: Indices
+    store: "Typestore", recording: Recording, faults: "Sequence[FibreFault]", dead: Sequence[int], stamps: Indices
 ) -> list[Stamped]:
     """Serialize HEALTH: the state of all fibres at the first reading, and whenever a fault was detected."""
-    faults: dict[int, tuple[str, str]] = dict.fromkeys(
-        annotations.dead, ("dead", "was dead in the recording that health was learnt from")
+    states: dict[int, tuple[str, str]] = dict.fromkeys(
+        dead, ("dead", "was dead in the recording that health was learnt from")
     )
-    messages = [_encode_states(store, recording.fibres, faults, int(stamps[0]))]
+    messages = [_encode_states(store, recording.fibres, states, int(stamps[0]))]
     ends = stamps_at(stamps, recording.up_command).tolist()
-    for fault in annotations.faults or ():
-        faults = faults | dict.fromkeys(fault.fibres, (fault.kind, fault.text))
-        messages.append(_encode_states(store, recording.fibres, faults, ends[min(fault.press, len(ends) - 1)]))
+    for fault in faults:
+        states = states | dict.fromkeys(fault.fibres, (fault.kind, fault.text))
+        messages.append(_encode_states(store, recording.fibres, states, ends[min(fault.press, len(ends) - 1)]))
     return messages
 
 

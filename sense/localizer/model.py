@@ -14,9 +14,8 @@ from numpy.typing import ArrayLike
 from pydantic import ConfigDict, Field, JsonValue, TypeAdapter, ValidationError
 
 from padforge.common.files import read_json, reraise_write_error, write_text
-from padforge.common.validation import InputError, check_type, short_repr
+from padforge.common.validation import InputError, check_type, join_names, short_repr
 from padforge.sense.arrays import MAX_RATE_HZ, MIN_RATE_HZ, Array, Floats, Indices, Mask
-from padforge.sense.formats.columns import join_names
 from padforge.sense.localizer.bayes import PREFIX as BAYES
 from padforge.sense.localizer.bayes import BayesianLocalizer
 from padforge.sense.localizer.features import FeatureSet, PressFeatures, compute_features
