@@ -1,6 +1,5 @@
 """The common style of figures, with a colour for each family of fibres, and functions to save them."""
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -60,18 +59,6 @@ def style_axes(axes: Any) -> None:
 
 def add_title(figure: "Figure", text: str) -> None:
     figure.suptitle(text, x=0.01, ha="left", color=INK, fontsize=11)
-
-
-def draw_confusions(axes: Any, counts: Sequence[Sequence[int]]) -> None:
-    """Draw a confusion matrix, true classes by row, in per cent of each row."""
-    import numpy as np
-
-    percent = 100 * np.array(counts) / np.maximum(np.sum(counts, axis=1, keepdims=True), 1)
-    axes.imshow(percent, cmap="Blues", vmin=0, vmax=100)
-    for (i, j), value in np.ndenumerate(percent):
-        axes.text(j, i, f"{value:.0f}", ha="center", va="center", color="white" if value > 60 else INK, fontsize=9)
-    axes.tick_params(length=0, labelcolor=INK)
-    axes.spines[:].set_visible(False)
 
 
 def add_caption(axes: Any, text: str) -> None:

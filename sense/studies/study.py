@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from padforge.common import files, plotting
+from padforge.common import files
 from padforge.common.command_line import text_table
 from padforge.common.parallel import State, one_thread, run_tasks
 from padforge.common.plotting import FAINT, INK, save_figure, style_axes
@@ -275,8 +275,13 @@ def label_axes(axes: Any, title: str = "", grid: Literal["", "x", "y"] = "", **l
 
 
 def draw_confusions(axes: Any, counts: Sequence[Sequence[int]], title: str, xlabel: str, ylabel: str) -> None:
-    """Draw a confusion matrix with a title, predicted classes by column."""
-    plotting.draw_confusions(axes, counts)
+    """Draw a confusion matrix, true classes by row and predicted ones by column, in per cent of each row."""
+    percent = 100 * np.array(counts) / np.maximum(np.sum(counts, axis=1, keepdims=True), 1)
+    axes.imshow(percent, cmap="Blues", vmin=0, vmax=100)
+    for (i, j), value in np.ndenumerate(percent):
+        axes.text(j, i, f"{value:.0f}", ha="center", va="center", color="white" if value > 60 else INK, fontsize=9)
+    axes.tick_params(length=0, labelcolor=INK)
+    axes.spines[:].set_visible(False)
     axes.set_title(title, loc="left", color=INK, fontsize=10)
     axes.set_xlabel(xlabel, color=INK)
     axes.set_ylabel(ylabel, color=INK)

@@ -29,6 +29,7 @@ from padforge.sense.studies.study import (
     StudyResult,
     Task,
     compute_states,
+    draw_confusions,
     fit_and_predict,
     load_pads,
     read_counts,
@@ -216,3 +217,10 @@ def test_read_counts_gives_whole_counts_up_to_full_scale_of_the_training() -> No
     np.testing.assert_array_equal(signed, [[-2048, -ADC_STEPS], [ADC_STEPS, 0]])
     noisy = read_counts(np.repeat([0.5, 1.0], [4000, 1])[:, None], 4001, 4.0, np.random.default_rng(0))
     assert noisy[:-1].std() == pytest.approx(4, rel=0.1)
+
+
+def test_confusions_are_in_per_cent_of_each_true_class() -> None:
+    axes = Figure().subplots()
+    draw_confusions(axes, [[3, 1], [8, 32]], "", "", "")
+    written = {text.get_position(): text.get_text() for text in axes.texts}  # column and row
+    assert written == {(0, 0): "75", (1, 0): "25", (0, 1): "20", (1, 1): "80"}
