@@ -93,7 +93,9 @@ class MessageBuilder:
 
 def _message(topic: str, time_s: float, values: Sequence[Any], pad: dict[str, Any]) -> Message:
     """Return a message whose stamp is a time by the clock of the readings."""
-    return Message(topic, ros.build_message(topic, int(ros.to_stamps(np.array(time_s), 0.0)), values), pad)
+    whole_s = math.floor(time_s)
+    stamp = whole_s * 10**9 + round((time_s - whole_s) * 1e9)
+    return Message(topic, ros.build_message(topic, stamp, values), pad)
 
 
 class JsonLines(ConnectionServer):
