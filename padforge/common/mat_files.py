@@ -36,15 +36,10 @@ class Hdf5Reader:
 
     def read_text(self, name: str) -> str | None:
         """Return a text attribute of the file; None if it is missing."""
-        import h5py
-
-        if name not in self._file.attrs:
-            return None
-        attribute = self._file.attrs.get_id(name)
-        if attribute.shape != () or h5py.check_string_dtype(attribute.dtype) is None:
+        value = self._file.attrs.get(name)
+        if not isinstance(value, str | bytes | None):
             raise InputError(f"attribute {name} is no text")
-        value = self._file.attrs[name]
-        return value.decode() if isinstance(value, bytes) else str(value)
+        return value.decode() if isinstance(value, bytes) else value
 
     def is_numeric(self, name: str) -> bool:
         return self._datasets[name].dtype.base.kind in "fiub"

@@ -28,6 +28,7 @@ from padforge.common.validation import InputError
 
 HOST = "127.0.0.1"  # the loopback interface; other addresses are served only with a token
 MIN_TOKEN = 16  # characters
+MAX_POST_BYTES = 4096  # size limit of a post
 POLL_S = 0.05  # interval at which a server checks whether to end
 MIN_INTERVAL_S = 0.04  # between two messages to a browser
 KEEP_ALIVE_S = 5.0  # time without a message after which an empty one is sent, to detect a closed browser
@@ -84,8 +85,7 @@ class ConnectionServer(socketserver.ThreadingTCPServer):
         self.server_close()
 
     def end(self, timeout_s: float) -> None:
-        """Stop sending, and wait until every client has the last message, for at most `timeout_s`."""
-        raise NotImplementedError
+        """Stop sending, and wait until every client has the last message, for at most `timeout_s`; if any is sent."""
 
     def verify_request(self, request: Any, client_address: Any) -> bool:
         with self._lock:
@@ -123,21 +123,14 @@ class LocalPage(ConnectionServer):
     """A page that is served in the `with` block, with its latest message for every browser."""
 
     def __init__(
-        self,
-        port: int,
-        page: str,
-        handlers: Mapping[str, Handler],
-        max_post_bytes: int = 4096,
-        *,
-        host: str = HOST,
-        token: str = "",
+        self, port: int, page: str, handlers: Mapping[str, Handler], *, host: str = HOST, token: str = ""
     ) -> None:
         """Bind the port, 0 for any free one.
 
         The page has one <script> and one <style>, see `page_text`. Handlers of posts, by address, are called from
         several threads.
         """
-        self.page, self.handlers, self.max_post_bytes = page.encode(), handlers, max_post_bytes
+        self.page, self.handlers = page.encode(), handlers
         self.policy = "default-src 'none'; connect-src 'self'; img-src data:; base-uri 'none'; form-action 'none'"
         for tag in ("script", "style"):  # only those of the page
             digest = hashlib.sha256(page.split(f"<{tag}>")[1].split(f"</{tag}>")[0].encode()).digest()
@@ -220,7 +213,7 @@ class _PageHandler(BaseHTTPRequestHandler):
             self.send_error(HTTPStatus.NOT_FOUND)
         elif not (length.isascii() and length.isdigit()):
             self.send_error(HTTPStatus.LENGTH_REQUIRED)
-        elif int(length) > self.server.max_post_bytes:
+        elif int(length) > MAX_POST_BYTES:
             self.send_error(HTTPStatus.REQUEST_ENTITY_TOO_LARGE)
         else:
             try:

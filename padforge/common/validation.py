@@ -3,7 +3,7 @@
 import math
 import re
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from numbers import Integral, Real
 from pathlib import Path
@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import ArrayLike, NDArray
 
+MAX_LISTED = 12  # names in a message
 MAX_VALUES = 2**28  # size limit of arrays that public functions accept or create: 2 GiB of float64
 
 Kind = TypeVar("Kind")
@@ -79,6 +80,12 @@ def missing_extra(error: ModuleNotFoundError, wanted: str = "") -> str | None:
 def short_repr(value: object) -> str:
     """Return the representation of a value of any type and size, shortened to one line."""
     return " ".join(shortened(value).split())
+
+
+def join_names(names: Sequence[str]) -> str:
+    """Join the first names by commas, for a message."""
+    more = f" and {len(names) - MAX_LISTED} more" if len(names) > MAX_LISTED else ""
+    return (", ".join(short_repr(name) for name in names[:MAX_LISTED]) or "nothing") + more
 
 
 def check_type(name: str, value: object, kind: type[Kind]) -> Kind:

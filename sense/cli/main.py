@@ -1,7 +1,6 @@
 """`padforge sense`: the group of its commands, and the commands `import` and `export`."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import click
 
@@ -17,11 +16,6 @@ from padforge.sense.cli.options import (
     recording_argument,
     recording_line,
 )
-
-if TYPE_CHECKING:
-    from padforge.sense.formats.annotations import ModelAnnotations
-    from padforge.sense.recording.recording import Recording
-
 
 _PATH = click.Path(path_type=Path)
 
@@ -90,7 +84,7 @@ def import_(
     A value holds until the next message.
     """
     from padforge.common.files import provenance
-    from padforge.sense.formats.columns import join_names
+    from padforge.common.validation import join_names
     from padforge.sense.formats.import_export import describe_file, find_reader, import_file
     from padforge.sense.recording.doubts import find_doubts
     from padforge.sense.recording.recording import PRESSES_DETECTED
@@ -146,30 +140,13 @@ def export(recording: Path, file: Path, kind: str | None, model: Path | None) ->
     from padforge.sense.formats.import_export import arm_states, export_file
 
     opened = read_recording(recording)
-    annotations = _annotate(model, opened) if model else None
-    export_file(opened, file, kind or "", annotations, arm_states(recording))
+    localization = faults = None
+    dead = ()
+    if model:
+        localization, faults, _, detector, _ = predict_despite_faults(model, opened)
+        faults, dead = (faults, detector.model_.dead) if detector else (None, ())
+    export_file(opened, file, kind or "", localization, faults, dead, arm_states(recording))
     echo(f"{recording} -> {file}")
-
-
-def _annotate(model: Path, recording: "Recording") -> "ModelAnnotations":
-    """Return the predicted positions and faults; a faulty fibre is masked from its first bad press on."""
-    import numpy as np
-
-    from padforge.sense.formats.annotations import FaultAnnotation, ModelAnnotations
-
-    prediction, findings, _, detector, _ = predict_despite_faults(model, recording)
-    faults = [FaultAnnotation(fault.press, fault.fibres, fault.kind, fault.text) for fault in findings]
-    depth = prediction.measures.get("depth_mm")
-    unknown = np.full(len(prediction.r90_mm), np.nan)
-    return ModelAnnotations(
-        positions_mm=prediction.positions_mm,
-        std_mm=prediction.std_mm,
-        r90_mm=prediction.r90_mm,
-        depths_mm=unknown if depth is None else depth.values,
-        depths_r90_mm=unknown if depth is None else depth.r90,
-        faults=faults if detector else None,
-        dead=detector.model_.dead if detector else (),
-    )
 
 
 @click.group(cls=SectionedGroup)

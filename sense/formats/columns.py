@@ -17,7 +17,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from padforge.common.validation import InputError, check_path, check_type, short_repr
+from padforge.common.validation import InputError, check_path, check_type, join_names, short_repr
+from padforge.sense.recording.recording import Recording
 
 _SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0, "d": 86400.0}
 MILLIMETRES = {"mm": 1.0, "um": 1e-3, "cm": 10.0, "m": 1000.0}
@@ -38,7 +39,6 @@ have a unit; `down`, `up` and `duration` are columns of a table of presses.
 """
 DATASETS = tuple(name for name in UNITS if name not in ("down", "up", "duration"))
 """Quantities that a dataset or a variable may hold."""
-_MAX_LISTED = 12  # names in a message
 _NUMBER = re.compile(r"\d{1,9}")
 _INDEX = re.compile(r"(.+?)(\[(?:: ?, ?)?\d*:?\d*\])")
 
@@ -69,6 +69,16 @@ class ColumnEntry(NamedTuple):
 def check_import(path: object, columns: object) -> tuple[Path, str]:
     """Check and return the arguments of an import, a path and the text of a mapping."""
     return check_path("path", path), check_type("columns", columns, str)
+
+
+def check_export(recording: object, path: object, localization: object = None) -> Path:
+    """Check the types of the arguments of an export, and return the path."""
+    check_type("recording", recording, Recording)
+    if localization is not None:
+        from padforge.sense.localizer.model import Localization
+
+        check_type("localization", localization, Localization)
+    return check_path("path", path)
 
 
 def parse_columns(text: str, quantities: Sequence[str] = DATASETS) -> list[ColumnEntry]:
@@ -202,9 +212,3 @@ def _by_number(columns: Sequence[int], names: Sequence[str]) -> list[int]:
         for text, group in alike.items()
     }
     return [next(ranked[_NUMBER.sub("#", names[column])]) for column in columns]
-
-
-def join_names(names: Sequence[str]) -> str:
-    """Join the first names by commas, for a message."""
-    more = f" and {len(names) - _MAX_LISTED} more" if len(names) > _MAX_LISTED else ""
-    return (", ".join(short_repr(name) for name in names[:_MAX_LISTED]) or "nothing") + more

@@ -14,15 +14,14 @@ from pathlib import Path
 import numpy as np
 
 from padforge.common.files import atomic_file, reraise_write_error
-from padforge.common.validation import InputError, naming_file, short_repr
+from padforge.common.validation import InputError, join_names, naming_file, short_repr
 from padforge.sense.arrays import MAX_FIBRES, Array
-from padforge.sense.formats.annotations import check_export
 from padforge.sense.formats.assembly import MEASURES, Arrays, ForeignArrays, assemble_recording
 from padforge.sense.formats.columns import (
     UNITS,
     ColumnEntry,
+    check_export,
     check_import,
-    join_names,
     match_columns,
     order_notes,
     parse_columns,

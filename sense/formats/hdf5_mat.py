@@ -15,13 +15,12 @@ import numpy as np
 
 from padforge.common.files import atomic_file, reraise_write_error
 from padforge.common.mat_files import flatten_variables, load_mat, open_hdf5
-from padforge.common.validation import InputError, naming_file
+from padforge.common.validation import InputError, join_names, naming_file
 from padforge.sense.arrays import Array
-from padforge.sense.formats.annotations import check_export
 from padforge.sense.formats.assembly import MEASURES, Arrays, ForeignArrays, assemble_recording
 from padforge.sense.formats.columns import (
+    check_export,
     check_import,
-    join_names,
     match_columns,
     order_notes,
     parse_columns,

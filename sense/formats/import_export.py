@@ -1,14 +1,14 @@
 """Import and export of recordings, by the extension of the file."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from padforge.common.mat_files import load_mat
 from padforge.common.validation import InputError, check_path
 from padforge.sense.arrays import Array
-from padforge.sense.formats.annotations import ModelAnnotations
 from padforge.sense.formats.csv_recording import describe_table, export_csv, import_csv, read_presses
 from padforge.sense.formats.hdf5_mat import describe_arrays, export_hdf5, import_hdf5, import_mat
 from padforge.sense.formats.lerobot import export_lerobot
@@ -16,6 +16,10 @@ from padforge.sense.formats.ros_recording import METADATA, SUFFIXES, describe_ba
 from padforge.sense.recording.block_file import read_blocks
 from padforge.sense.recording.recording import Recording
 from padforge.sense.recording.run_directory import START, STATE_COLUMNS, STATES
+
+if TYPE_CHECKING:
+    from padforge.sense.health.fault_detector import FibreFault
+    from padforge.sense.localizer.model import Localization
 
 _TABLES = (".csv", ".tsv", ".txt", ".log", ".dat")
 _ADVICE = dict.fromkeys((".xlsx", ".xls", ".ods"), "save the sheet as CSV UTF-8") | {
@@ -103,22 +107,25 @@ def export_file(
     recording: Recording,
     path: Path,
     kind: str = "",
-    annotations: ModelAnnotations | None = None,
+    localization: "Localization | None" = None,
+    faults: "Sequence[FibreFault] | None" = None,
+    dead: Sequence[int] = (),
     states: Array | None = None,
 ) -> None:
     """Write a recording as .csv, .h5 or .mcap, by the extension, or as a folder of a kind of `FORMATS`.
 
-    Annotations by a model are for .mcap and LeRobot, the states of `arm_states` for .mcap.
+    Predicted positions are for .mcap and LeRobot; faults and dead fibres, as `export_bag` has them, and the states of
+    `arm_states` for .mcap.
     """
     extension = path.suffix.lower()
     if kind == "lerobot":
-        export_lerobot(recording, path, annotations)
+        export_lerobot(recording, path, localization)
     elif extension == ".mcap":
-        export_bag(recording, path, annotations, states)
+        export_bag(recording, path, localization, faults, dead, states)
     elif extension not in _WRITERS:
         folders = ", ".join(f"--format {name}" for name in FORMATS)
         raise InputError(f"{path}: ends in {path.suffix!r}, allowed are {', '.join(_WRITERS)}, .mcap, or {folders}")
-    elif annotations is not None:
+    elif localization is not None:
         raise InputError(f"{path}: predictions of a model can be written as .mcap or lerobot only")
     else:
         _WRITERS[extension](recording, path)

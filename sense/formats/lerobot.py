@@ -15,12 +15,14 @@ from numpy.typing import NDArray
 from padforge.common.files import make_folder, reraise_write_error, sync, temporary_folder, write_json
 from padforge.common.validation import InputError
 from padforge.sense.arrays import Indices
-from padforge.sense.formats.annotations import ModelAnnotations, check_export
+from padforge.sense.formats.columns import check_export
 from padforge.sense.recording.recording import Recording
 from padforge.sense.recording.run_directory import check_new_folder
 
 if TYPE_CHECKING:
     import pyarrow as pa
+
+    from padforge.sense.localizer.model import Localization
 
 VERSION = "v3.0"
 TASK = "Press the pad."
@@ -31,7 +33,7 @@ _QUANTILES = (0.01, 0.1, 0.5, 0.9, 0.99)
 _Column = NDArray[Any]
 
 
-def export_lerobot(recording: Recording, path: Path, annotations: ModelAnnotations | None = None) -> None:
+def export_lerobot(recording: Recording, path: Path, localization: "Localization | None" = None) -> None:
     """Write a recording as a LeRobot dataset, a folder that appears complete or not at all.
 
     Features are `observation.state`, the readings in V, NaN where missing; `action`, the commanded position, with the
@@ -41,9 +43,9 @@ def export_lerobot(recording: Recording, path: Path, annotations: ModelAnnotatio
     Args:
         recording: recording to write.
         path: path of a folder that is new or empty.
-        annotations: predictions of a model.
+        localization: predicted positions.
     """
-    path = check_export(recording, path, annotations)
+    path = check_export(recording, path, localization)
     try:
         import pandas  # noqa: F401
         import pyarrow  # noqa: F401
@@ -55,7 +57,7 @@ def export_lerobot(recording: Recording, path: Path, annotations: ModelAnnotatio
     middle = (recording.up_command[:-1] + recording.down_command[1:]) // 2
     starts = np.append(0, middle)[recording.has_position]
     ends = np.append(middle, len(recording.readings))[recording.has_position]
-    columns, names = _build_columns(recording, starts, ends, annotations)
+    columns, names = _build_columns(recording, starts, ends, localization)
     path = path.resolve()
     with reraise_write_error(path):
         make_folder(path.parent)
@@ -76,7 +78,7 @@ def _frame_rate(recording: Recording) -> float:
 
 
 def _build_columns(
-    recording: Recording, starts: Indices, ends: Indices, annotations: ModelAnnotations | None
+    recording: Recording, starts: Indices, ends: Indices, localization: "Localization | None"
 ) -> tuple[dict[str, _Column], dict[str, list[str] | None]]:
     """Return the values of n frames, (n, k) or (n,), and the names of the k columns, by feature."""
     lengths = ends - starts
@@ -91,9 +93,9 @@ def _build_columns(
     }
     if not np.isnan(recording.forces_n[presses]).any():
         features["observation.force"] = {"force_n": np.where(down, recording.forces_n[presses], 0)}
-    if annotations is not None:
-        x, y = annotations.positions_mm[presses].T
-        touch = {"x_mm": x, "y_mm": y, "r90_mm": annotations.r90_mm[presses], "valid": np.ones(len(presses))}
+    if localization is not None:
+        x, y = localization.positions_mm[presses].T
+        touch = {"x_mm": x, "y_mm": y, "r90_mm": localization.r90_mm[presses], "valid": np.ones(len(presses))}
         is_over = frames >= recording.up_command[presses]
         features["observation.touch"] = {name: np.where(is_over, values, 0) for name, values in touch.items()}
     x, y = recording.presses_mm[presses].T

@@ -10,18 +10,19 @@ if the other messages still agree with them.
 
 import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from operator import attrgetter
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from padforge.common.validation import InputError
 from padforge.sense.arrays import Array, Indices, Mask
-from padforge.sense.formats.annotations import ModelAnnotations
 from padforge.sense.recording.recording import Recording
 
 if TYPE_CHECKING:
     from rosbags.typesys.store import Typestore
+
+    from padforge.sense.health.fault_detector import FibreFault
+    from padforge.sense.localizer.model import Localization
 
 Stamped = tuple[int, memoryview]
 """Stamp of a message, ns, and the message as CDR."""
@@ -136,14 +137,22 @@ def upward(mirrored: bool) -> float:
     return -1.0 if mirrored else 1.0
 
 
+def poses(
+    positions_mm: Array, depths_mm: Array, mirrored: bool, std_mm: Array | float = 0.0, r90_mm: Array | float = 0.0
+) -> Array:
+    """Return the numbers (Q, 39) of PLACE or TOUCHES; NaN is an unknown depth, `r90_mm` half its 90 % interval."""
+    covariances = np.zeros((len(positions_mm), 36))
+    covariances[:, [0, 7]] = (std_mm / 1000) ** 2
+    covariances[:, DEPTH_VARIANCE] = np.where(np.isnan(depths_mm), UNKNOWN_VARIANCE, (r90_mm / 1000 / Z90) ** 2)
+    return np.column_stack([positions_mm / 1000, depths_to_z(depths_mm, mirrored), covariances])
+
+
 def to_topics(recording: Recording, epoch_s: float) -> dict[str, TopicSeries]:
     """Return the topics of a recording that have messages, except RECORDING."""
     stamps, mirrored = to_stamps(recording.times_s, epoch_s), recording.mirrored
     depths_mm, reached_mm, forces_n = recording.depths_mm, recording.reached_mm, recording.forces_n
     down, up = (stamps_at(stamps, readings) for readings in (recording.down_command, recording.up_command))
     x_y = recording.presses_mm / 1000
-    covariances = np.zeros((len(down), 36))
-    covariances[np.isnan(depths_mm), DEPTH_VARIANCE] = UNKNOWN_VARIANCE
 
     def at_presses(valid: Mask, *columns: Array) -> TopicSeries:
         return TopicSeries(down[valid], np.column_stack(columns)[valid])
@@ -151,22 +160,19 @@ def to_topics(recording: Recording, epoch_s: float) -> dict[str, TopicSeries]:
     topics = {
         READINGS: TopicSeries(stamps, recording.readings),
         PRESSED: TopicSeries(np.column_stack([down, up]).ravel(), np.tile([[1.0], [0.0]], (len(down), 1))),
-        PLACE: at_presses(recording.has_position, x_y, depths_to_z(depths_mm, mirrored), covariances),
+        PLACE: at_presses(recording.has_position, poses(recording.presses_mm, depths_mm, mirrored)),
         REACHED: at_presses(~np.isnan(reached_mm), x_y, depths_to_z(reached_mm, mirrored)),
         FORCE: at_presses(~np.isnan(forces_n), upward(mirrored) * forces_n),
     }
     return {topic: series for topic, series in topics.items() if len(series.stamps)}
 
 
-def touches(recording: Recording, annotations: ModelAnnotations, epoch_s: float) -> TopicSeries:
+def touches(recording: Recording, localization: "Localization", epoch_s: float) -> TopicSeries:
     """Return TOUCHES: the predicted positions, at the end of each press."""
-    covariances = np.zeros((len(recording.up_command), 36))
-    covariances[:, [0, 7]] = (annotations.std_mm / 1000) ** 2
-    depth_variances = (annotations.depths_r90_mm / 1000 / Z90) ** 2
-    covariances[:, DEPTH_VARIANCE] = np.where(np.isnan(annotations.depths_mm), UNKNOWN_VARIANCE, depth_variances)
-    z = depths_to_z(annotations.depths_mm, recording.mirrored)
+    depth, positions_mm = localization.measures.get("depth_mm"), localization.positions_mm
+    depths_mm, r90_mm = (depth.values, depth.r90) if depth else (np.full(len(positions_mm), np.nan), 0.0)
     stamps = stamps_at(to_stamps(recording.times_s, epoch_s), recording.up_command)
-    return TopicSeries(stamps, np.column_stack([annotations.positions_mm / 1000, z, covariances]))
+    return TopicSeries(stamps, poses(positions_mm, depths_mm, recording.mirrored, localization.std_mm, r90_mm))
 
 
 def arm_poses(states: Array, epoch_s: float) -> TopicSeries:
@@ -179,31 +185,59 @@ def arm_poses(states: Array, epoch_s: float) -> TopicSeries:
     )
 
 
+def build_message(topic: str, stamp: int, values: Sequence[Any]) -> dict[str, Any]:
+    """Return a message as JSON has it; its values are numbers at the paths of the topic, or states of HEALTH."""
+    seconds, nanoseconds = divmod(stamp, 10**9)
+    frame = ARM_FRAME if topic == ARM else FRAME
+    header = {"header": {"stamp": {"sec": seconds, "nanosec": nanoseconds}, "frame_id": frame}}
+    if topic == READINGS:
+        dimension = {"label": "fibre", "size": len(values), "stride": len(values)}
+        return {"layout": {"dim": [dimension], "data_offset": 0}, "data": values}
+    if topic == PRESSED:
+        return {"data": bool(values[0])}
+    if topic == HEALTH:
+        return header | {"status": values}
+    if topic == REACHED:
+        return header | {"point": _x_y_z(values)}
+    if topic == FORCE:
+        return header | {"wrench": {"force": _x_y_z((0.0, 0.0, values[0])), "torque": _x_y_z((0.0, 0.0, 0.0))}}
+    x, y, z, w = values[3:] if topic == ARM else (0.0, 0.0, 0.0, 1.0)
+    pose = {"position": _x_y_z(values[:3]), "orientation": {"x": x, "y": y, "z": z, "w": w}}
+    return header | {"pose": pose if topic == ARM else {"pose": pose, "covariance": values[3:]}}
+
+
+def _x_y_z(values: Sequence[float]) -> dict[str, float]:
+    return dict(zip("xyz", values, strict=True))
+
+
+def build_state(name: str, text: str, is_fault: bool, kind: str = "") -> dict[str, Any]:
+    """Return a state of HEALTH, of a fibre or of the pad."""
+    values = [{"key": "fault", "value": kind}] if kind else []
+    return {"level": 2 if is_fault else 0, "name": name, "message": text, "hardware_id": "pad", "values": values}
+
+
+def serialize(store: "Typestore", topic: str, message: Mapping[str, Any]) -> memoryview:
+    """Serialize a message of a topic."""
+    from rosbags.interfaces import Nodetype
+
+    def build(node: Any, value: Any) -> Any:
+        kind, content = node
+        if kind == Nodetype.BASE:
+            return value
+        if kind == Nodetype.NAME:
+            fields = store.fielddefs[content][1]
+            return store.types[content](**{name: build(field, value[name]) for name, field in fields})
+        item, _ = content
+        return np.array(value) if item[0] == Nodetype.BASE else [build(item, each) for each in value]
+
+    msgtype = TOPICS[topic].msgtype
+    return store.serialize_cdr(build((Nodetype.NAME, msgtype), message), msgtype)
+
+
 def encode(store: "Typestore", topic: str, series: TopicSeries) -> list[Stamped]:
     """Serialize the messages of a topic."""
-    msgtype, _, paths = TOPICS[topic]
-    message = _empty(store, msgtype)
-    if topic == READINGS:
-        n = series.values.shape[1]
-        message.layout.dim = [_empty(store, "std_msgs/msg/MultiArrayDimension", label="fibre", size=n, stride=n)]
-        message.data = np.zeros(n)
-    if topic in (PLACE, TOUCHES):
-        message.pose.pose.orientation.w = 1.0
-    header = getattr(message, "header", None)
-    if header is not None:
-        header.frame_id = ARM_FRAME if topic == ARM else FRAME
-    parents = [attrgetter(path.rpartition(".")[0])(message) if "." in path else message for path in paths]
-    names = [path.rpartition(".")[2] for path in paths]
-    is_array = [isinstance(getattr(*target), np.ndarray) for target in zip(parents, names, strict=True)]
-    encoded = []
-    for stamp, row in zip(series.stamps.tolist(), np.ascontiguousarray(series.values), strict=True):
-        if header is not None:
-            header.stamp.sec, header.stamp.nanosec = divmod(stamp, 10**9)
-        for column, (parent, name, takes_array) in enumerate(zip(parents, names, is_array, strict=True)):
-            # An array is at the last path, and takes the rest of the row.
-            setattr(parent, name, row[column:] if takes_array else float(row[column]))
-        encoded.append((stamp, store.serialize_cdr(message, msgtype)))
-    return encoded
+    rows = zip(series.stamps.tolist(), series.values.tolist(), strict=True)
+    return [(stamp, serialize(store, topic, build_message(topic, stamp, row))) for stamp, row in rows]
 
 
 def decode(raw: RawMessages, paths: Sequence[str]) -> TopicSeries:
@@ -236,23 +270,6 @@ def get_field(message: Any, path: str) -> Any:
     return message
 
 
-def _empty(store: "Typestore", msgtype: str, **fields: Any) -> Any:
-    """Return a message of zeros and empty texts and arrays, except `fields`."""
-    from rosbags.interfaces import Nodetype
-
-    def zero(node: Any) -> Any:
-        kind, content = node
-        if kind == Nodetype.BASE:
-            return "" if content[0] == "string" else 0
-        if kind == Nodetype.NAME:
-            return _empty(store, content)
-        (item, size) = content
-        size = size if kind == Nodetype.ARRAY else 0
-        return np.zeros(size) if item[0] == Nodetype.BASE else [zero(item) for _ in range(size)]
-
-    return store.types[msgtype](**({name: zero(node) for name, node in store.fielddefs[msgtype][1]} | fields))
-
-
 def encode_recording(store: "Typestore", recording: Recording, epoch_s: float, topics: Iterable[str]) -> memoryview:
     """Serialize the message of RECORDING, with a description of each topic of the bag."""
     arrays = {name: getattr(recording, name) for name in (*_NUMBERS, *_INDICES)}
@@ -265,7 +282,7 @@ def encode_recording(store: "Typestore", recording: Recording, epoch_s: float, t
         **{name: np.where(np.isnan(values), np.array(None), values).tolist() for name, values in arrays.items()},
     }
     text = json.dumps(document, allow_nan=False)
-    return store.serialize_cdr(_empty(store, TOPICS[RECORDING].msgtype, data=text), TOPICS[RECORDING].msgtype)
+    return serialize(store, RECORDING, {"data": text})
 
 
 def decode_recording(raw: RawMessages, readings: Array) -> tuple[Recording, float, str]:
@@ -277,28 +294,20 @@ def decode_recording(raw: RawMessages, readings: Array) -> tuple[Recording, floa
 
 
 def encode_health(
-    store: "Typestore", recording: Recording, annotations: ModelAnnotations, stamps: Indices
+    store: "Typestore", recording: Recording, faults: "Sequence[FibreFault]", dead: Sequence[int], stamps: Indices
 ) -> list[Stamped]:
     """Serialize HEALTH: the state of all fibres at the first reading, and whenever a fault was detected."""
-    faults: dict[int, tuple[str, str]] = dict.fromkeys(
-        annotations.dead, ("dead", "was dead in the recording that health was learnt from")
+    states: dict[int, tuple[str, str]] = dict.fromkeys(
+        dead, ("dead", "was dead in the recording that health was learnt from")
     )
-    messages = [_encode_states(store, recording.fibres, faults, int(stamps[0]))]
+    detected = [(int(stamps[0]), states)]
     ends = stamps_at(stamps, recording.up_command).tolist()
-    for fault in annotations.faults or ():
-        faults = faults | dict.fromkeys(fault.fibres, (fault.kind, fault.text))
-        messages.append(_encode_states(store, recording.fibres, faults, ends[min(fault.press, len(ends) - 1)]))
-    return messages
-
-
-def _encode_states(store: "Typestore", fibres: int, faults: Mapping[int, tuple[str, str]], stamp: int) -> Stamped:
-    message = _empty(store, TOPICS[HEALTH].msgtype)
-    message.header.frame_id = FRAME
-    message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp, 10**9)
-    for fibre in range(fibres):
-        kind, text = faults.get(fibre, ("", "sound"))
-        values = [_empty(store, "diagnostic_msgs/msg/KeyValue", key="fault", value=kind)] if kind else []
-        level, name = (2 if kind else 0), f"pad: fibre {fibre + 1}"  # ERROR or OK
-        about = {"level": level, "name": name, "message": text, "hardware_id": "pad", "values": values}
-        message.status.append(_empty(store, "diagnostic_msgs/msg/DiagnosticStatus", **about))
-    return stamp, store.serialize_cdr(message, TOPICS[HEALTH].msgtype)
+    for fault in faults:
+        states = states | dict.fromkeys(fault.fibres, (fault.kind, fault.text))
+        detected.append((ends[min(fault.press, len(ends) - 1)], states))
+    encoded = []
+    for stamp, states in detected:
+        of_fibres = enumerate((states.get(fibre, ("", "sound")) for fibre in range(recording.fibres)), 1)
+        status = [build_state(f"pad: fibre {number}", text, bool(kind), kind) for number, (kind, text) in of_fibres]
+        encoded.append((stamp, serialize(store, HEALTH, build_message(HEALTH, stamp, status))))
+    return encoded

@@ -5,7 +5,7 @@ repairs it.
 """
 
 import re
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from functools import cache, partial
@@ -17,17 +17,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from padforge.common.files import UNFINISHED, atomic_files, check_file, reraise_write_error
-from padforge.common.validation import InputError, naming_file, short_repr
+from padforge.common.validation import InputError, join_names, naming_file, short_repr
 from padforge.sense.arrays import MAX_BYTES, Array, Indices
 from padforge.sense.formats import ros_messages as ros
-from padforge.sense.formats.annotations import ModelAnnotations, check_export
 from padforge.sense.formats.assembly import Arrays, ForeignArrays, assemble_recording
 from padforge.sense.formats.columns import (
     MILLIMETRES,
     UNITS,
     ColumnEntry,
+    check_export,
     check_import,
-    join_names,
     match_columns,
     matches,
     order_notes,
@@ -39,6 +38,9 @@ from padforge.sense.recording.recording import NOTE, Recording
 if TYPE_CHECKING:
     from rosbags.interfaces import Connection
     from rosbags.typesys.store import Typestore
+
+    from padforge.sense.health.fault_detector import FibreFault
+    from padforge.sense.localizer.model import Localization
 
 SUFFIXES = (".mcap", ".db3", ".bag")
 METADATA = "metadata.yaml"  # a folder with this file is a rosbag2 bag
@@ -292,27 +294,34 @@ def _hold(stamps: Indices, values: Array, clock: Indices) -> Array:
 
 
 def export_bag(
-    recording: Recording, path: Path, annotations: ModelAnnotations | None = None, states: Array | None = None
+    recording: Recording,
+    path: Path,
+    localization: "Localization | None" = None,
+    faults: "Sequence[FibreFault] | None" = None,
+    dead: Sequence[int] = (),
+    states: Array | None = None,
 ) -> None:
     """Write a recording as an MCAP file of ROS 2, atomically; importing it gives the same numbers.
 
     Args:
         recording: recording to write.
         path: path of the file.
-        annotations: predictions of a model, for the topics of touches and health.
+        localization: predicted positions, for the topic of touches.
+        faults: in the order of presses, for the topic of health; None if there is no health model.
+        dead: indices of fibres that never responded, for that topic.
         states: states of an arm, by `run_directory.STATE_COLUMNS`, whose poses become a topic; shape (n, 10).
     """
-    path = check_export(recording, path, annotations)
+    path = check_export(recording, path, localization)
     store = load_typestore(f"{path}: MCAP")
     epoch_s = ros.choose_epoch(recording.times_s)
     topics = ros.to_topics(recording, epoch_s)
-    if annotations is not None:
-        topics[ros.TOUCHES] = ros.touches(recording, annotations, epoch_s)
+    if localization is not None:
+        topics[ros.TOUCHES] = ros.touches(recording, localization, epoch_s)
     if states is not None:
         topics[ros.ARM] = ros.arm_poses(states, epoch_s)
     encoded = {topic: ros.encode(store, topic, series) for topic, series in topics.items() if len(series.stamps)}
-    if annotations is not None and annotations.faults is not None:
-        encoded[ros.HEALTH] = ros.encode_health(store, recording, annotations, topics[ros.READINGS].stamps)
+    if faults is not None:
+        encoded[ros.HEALTH] = ros.encode_health(store, recording, faults, dead, topics[ros.READINGS].stamps)
     start, document = encoded[ros.READINGS][0][0], ros.encode_recording(store, recording, epoch_s, encoded)
     encoded = {ros.RECORDING: [(start, document)], **encoded}
     messages = [(topic, *stamped) for topic in encoded for stamped in encoded[topic]]

@@ -29,9 +29,6 @@ class FoxgloveGate(ConnectionServer):
         self.target = target
         super().__init__((HOST, port), _GateHandler, "", "--foxglove")
 
-    def end(self, timeout_s: float) -> None:
-        """Do nothing, since the server closes its connections."""
-
 
 def hidden_host() -> str:
     """Return a random loopback address, which a page cannot guess; macOS has only one."""

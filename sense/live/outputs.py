@@ -15,17 +15,19 @@ from collections.abc import Collection, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
+import numpy as np
+
 from padforge.common.server import HOST, ConnectionServer, LocalPage, page_text
 from padforge.common.validation import InputError, short_repr
 from padforge.sense.arrays import Array
-from padforge.sense.formats.ros_messages import FRAME, HEALTH, PRESSED, READINGS, TOPICS, TOUCHES, UNKNOWN_VARIANCE, Z90
+from padforge.sense.formats import ros_messages as ros
+from padforge.sense.formats.ros_messages import HEALTH, PRESSED, READINGS, TOPICS, TOUCHES
 from padforge.sense.health.fault_detector import FibreFault
 from padforge.sense.live.pipeline import Estimate, Event, Live, OtherPad
 from padforge.sense.localizer.single_press import OTHER_PAD
 
 FORMAT = "padforge-live/1"
 MAX_QUEUED = 4096  # lines queued for a subscriber, which is disconnected if it falls further behind
-_OK, _ERROR = 0, 2  # levels of a `DiagnosticStatus`
 
 
 @dataclass(frozen=True)
@@ -48,7 +50,7 @@ class MessageBuilder:
 
     def __init__(self, pipeline: Live, mirrored: bool = False) -> None:
         self._pipeline, self._pressed, self._is_first = pipeline, False, True
-        self._z_sign = 1.0 if mirrored else -1.0
+        self._mirrored = mirrored
 
     def build(self, times_s: Array, readings: Array, events: Sequence[Event]) -> Iterator[Message]:
         """Yield the messages of a block of readings, times (n,), s, and voltages (n, C), and of its events."""
@@ -59,54 +61,41 @@ class MessageBuilder:
             self._is_first = False
             yield self._health(float(times_s[0]), None)
         for time_s, volts in zip(times_s.tolist(), readings.tolist(), strict=True):
-            yield _readings_message(time_s, volts)
+            data = [None if math.isnan(value) else value for value in volts]
+            yield _message(READINGS, time_s, data, {"event": "readings", "time_s": time_s, "volts": data})
         if self._pipeline.pressed != self._pressed:
             self._pressed = not self._pressed
             pad = {"event": "pressed", "time_s": now_s, "pressed": self._pressed}
-            yield Message(PRESSED, {"data": self._pressed}, pad)
+            yield _message(PRESSED, now_s, [self._pressed], pad)
         for event in events:
-            is_touch = isinstance(event, Estimate)
-            yield _touch_message(event, self._z_sign) if is_touch else self._health(now_s, event)
+            yield self._touch(event) if isinstance(event, Estimate) else self._health(now_s, event)
+
+    def _touch(self, estimate: Estimate) -> Message:
+        x_y_mm, std_mm = np.array([[estimate.x_mm, estimate.y_mm]]), np.array([[estimate.std_x_mm, estimate.std_y_mm]])
+        depths_mm, r90_mm = (np.array([mm], float) for mm in (estimate.depth_mm, estimate.depth_r90_mm))  # None is NaN
+        (values,) = ros.poses(x_y_mm, depths_mm, self._mirrored, std_mm, r90_mm).tolist()
+        return _message(TOUCHES, estimate.now_s, values, {"event": "touch", **estimate.to_dict()})
 
     def _health(self, time_s: float, event: FibreFault | OtherPad | None) -> Message:
         states = [fibre["state"] for fibre in self._pipeline.view()["fibres"]]
         status = [
-            {"level": _OK if state in ("sound", "unmonitored") else _ERROR, "name": f"pad: fibre {number}"}
-            | {"message": state, "hardware_id": "pad", "values": []}
+            ros.build_state(f"pad: fibre {number}", state, state not in ("sound", "unmonitored"))
             for number, state in enumerate(states, 1)
         ]
         pad: dict[str, Any] = {"event": "health", "time_s": time_s, "states": states}
         pad["other_pad"] = self._pipeline.is_other_pad
         if pad["other_pad"]:
-            status.append({"level": _ERROR, "name": "pad", "message": OTHER_PAD, "hardware_id": "pad", "values": []})
+            status.append(ros.build_state("pad", OTHER_PAD, True))
         if isinstance(event, FibreFault):
             pad["fault"] = {**asdict(event), "text": event.text}
-        return Message(HEALTH, {"header": _header(time_s), "status": status}, pad)
+        return _message(HEALTH, time_s, status, pad)
 
 
-def _readings_message(time_s: float, volts: list[float]) -> Message:
-    data = [None if math.isnan(value) else value for value in volts]
-    dimension = {"label": "fibre", "size": len(data), "stride": len(data)}
-    msg = {"layout": {"dim": [dimension], "data_offset": 0}, "data": data}
-    return Message(READINGS, msg, {"event": "readings", "time_s": time_s, "volts": data})
-
-
-def _touch_message(estimate: Estimate, z_sign: float) -> Message:
-    covariance = [0.0] * 36
-    covariance[0], covariance[7] = (estimate.std_x_mm / 1000) ** 2, (estimate.std_y_mm / 1000) ** 2  # mm to m
-    depth_mm, depth_r90_mm = estimate.depth_mm or 0.0, estimate.depth_r90_mm
-    covariance[14] = UNKNOWN_VARIANCE if depth_r90_mm is None else (depth_r90_mm / 1000 / Z90) ** 2
-    position = {"x": estimate.x_mm / 1000, "y": estimate.y_mm / 1000, "z": 0.0 + z_sign * depth_mm / 1000}
-    pose = {"position": position, "orientation": {"x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0}}
-    msg = {"header": _header(estimate.now_s), "pose": {"pose": pose, "covariance": covariance}}
-    return Message(TOUCHES, msg, {"event": "touch", **estimate.to_dict()})
-
-
-def _header(time_s: float) -> dict[str, Any]:
-    """Return the header of a time by the clock of the readings."""
+def _message(topic: str, time_s: float, values: Sequence[Any], pad: dict[str, Any]) -> Message:
+    """Return a message whose stamp is a time by the clock of the readings."""
     whole_s = math.floor(time_s)
-    seconds, nanoseconds = divmod(whole_s * 10**9 + round((time_s - whole_s) * 1e9), 10**9)
-    return {"stamp": {"sec": seconds, "nanosec": nanoseconds}, "frame_id": FRAME}
+    stamp = whole_s * 10**9 + round((time_s - whole_s) * 1e9)
+    return Message(topic, ros.build_message(topic, stamp, values), pad)
 
 
 class JsonLines(ConnectionServer):

@@ -13,9 +13,8 @@ from numpy.typing import ArrayLike
 from pydantic import ConfigDict, Field, JsonValue, TypeAdapter
 
 from padforge.common.files import reraise_write_error, write_text
-from padforge.common.validation import InputError, short_repr
+from padforge.common.validation import InputError, join_names, short_repr
 from padforge.sense.arrays import MAX_RATE_HZ, MIN_RATE_HZ, Array, Floats, Indices, Mask
-from padforge.sense.formats.columns import join_names
 from padforge.sense.localizer.bayes import BayesianLocalizer
 from padforge.sense.localizer.features import FeatureSet, PressFeatures, compute_features
 from padforge.sense.localizer.model_files import DOCUMENT_CONFIG, check_same_pad, files_of, select_arrays

@@ -88,11 +88,8 @@ def _order_in_rounds(positions_mm: Array) -> Array:
 
 def open_recorder_by_hand(config: RigConfig, board: Mapping[str, Any], resume: bool) -> tuple[Recorder, Array, Array]:
     """Return the recorder, new or resumed, the targets (Q, 2) of its plan, and the remaining targets (P, 2), mm."""
-    if resume:
-        targets_mm = np.array(read_source(config, config.rig, KIND)["plan"]["presses"], np.float64)
-    else:
-        targets_mm = plan_targets(config)
-    recorder = open_recorder(config, config.rig, targets_mm.tolist(), config.out, resume, {"board": board}, KIND)
+    targets_mm = np.array(read_source(config, KIND)["plan"]["presses"], np.float64) if resume else plan_targets(config)
+    recorder = open_recorder(config, targets_mm.tolist(), config.out, resume, {"board": board}, KIND)
     remaining = targets_mm.tolist()
     for press in read_journal(config.out / JOURNAL).values() if resume else ():
         if list(press[:2]) in remaining:
@@ -285,20 +282,20 @@ class PressSequence:
 class HandSession:
     """A session of recording by hand, of targets (Q, 2) in their order, after `n_done` presses of earlier sessions."""
 
-    def __init__(self, recorder: Recorder, n_fibres: int, targets_mm: Array, hold_s: float, n_done: int = 0) -> None:
-        self._recorder, self._n_fibres, self._n_done = recorder, n_fibres, n_done
+    def __init__(self, recorder: Recorder, targets_mm: Array, hold_s: float, n_done: int = 0) -> None:
+        self._recorder, self._n_done = recorder, n_done
         # Times begin at 0, or 1 s after the last reading of a resumed recording.
         self._start_s = max(recorder.last_s + 1, 0.0)
         self._zero_s: float | None = None
         self._first = recorder.n_readings  # index in the recording of the session's first reading, which has index 0
         self._number = max(recorder.done, default=-1) + 1
         self._sequence = PressSequence(targets_mm, hold_s, self._start_s)
-        self._ring, self._now_s = RingBuffer(1 + n_fibres), self._start_s
-        self._detector: PressDetector | None = PressDetector(n_fibres)  # None while the pad is touched undetected
+        self._ring, self._now_s = RingBuffer(1 + recorder.fibres), self._start_s
+        self._detector: PressDetector | None = PressDetector(recorder.fibres)  # None: the pad is touched undetected
         self._detector_start, self._validator = 0, PressValidator()
         self._touched = self._down_command = self._released = 0
         self._released_s = self._start_s
-        self._baseline = np.zeros(n_fibres)  # before the current press
+        self._baseline = np.zeros(recorder.fibres)  # before the current press
         self._accepted: list[tuple[int, int, int]] = []  # number, down and up command in the recording
         self._max_response_v = 1e-3
         self._message, self._rejected_mm = "", None
@@ -404,7 +401,7 @@ class HandSession:
             self._sequence.reject("nothing touches the pad")
             self._release(self._ring.end - 1)
         self._sequence.wait(self._now_s)
-        self._detector, self._detector_start = PressDetector(self._n_fibres), self._ring.end
+        self._detector, self._detector_start = PressDetector(self._recorder.fibres), self._ring.end
 
     def _time_s(self, reading: int) -> float:
         return float(self._ring.rows(reading, reading + 1)[0, 0])
@@ -468,7 +465,7 @@ def record_by_hand(
     with recorder:
         hold_s = config.rig.readings_per_press / 2 / stream.rate_hz
         n_done = len(targets_mm) - len(remaining_mm)
-        session = HandSession(recorder, stream.fibres, remaining_mm, hold_s, n_done)
+        session = HandSession(recorder, remaining_mm, hold_s, n_done)
         session.run(stream.blocks, on_view, poll_commands)
     return Recording.open(config.out)
 

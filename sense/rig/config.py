@@ -162,23 +162,23 @@ class RigConfig:
     folder: Path = Path()  # folder of the pad, with the files of `fabricate`
 
 
-def load_or_make_plan(config: RigConfig, rig: RigSettings, resume: bool) -> PressPlan:
-    """Return the stored plan of a resumed recording, otherwise a new one by `rig`."""
+def load_or_make_plan(config: RigConfig, resume: bool) -> PressPlan:
+    """Return the stored plan of a resumed recording, otherwise a new one by `[rig]`."""
     if resume:
-        plan = PressPlan.from_rows(read_source(config, rig, KIND)["plan"]["presses"])
+        plan = PressPlan.from_rows(read_source(config, KIND)["plan"]["presses"])
         free = pressable_test(config.pad, fit_pad_settings(config.pad, config.pad_settings))
         return check_pressable(plan, config.out, free)
-    return make_plan(config.pad, rig, np.random.default_rng(rig.seed), config.pad_settings)
+    return make_plan(config.pad, config.rig, np.random.default_rng(config.rig.seed), config.pad_settings)
 
 
-def read_source(config: RigConfig, rig: RigSettings, kind: str) -> dict[str, Any]:
+def read_source(config: RigConfig, kind: str) -> dict[str, Any]:
     """Return the source of the recording to resume; InputError if it has no plan, or its presses would differ."""
     source = read_json(config.out / START, FORMAT)["source"]
     if "plan" not in source:
         raise InputError(f"{config.out}: has no plan, so that it cannot be resumed")
     if source["kind"] != kind:
         raise InputError(f"{config.out}: holds a recording of kind {source['kind']!r}, not {kind!r}")
-    current = _settings_and_pad(config, rig)
+    current = _settings_and_pad(config)
     if source["morphology"] != current["morphology"]:
         raise InputError(f"{config.out}: was begun with another pad than the one given")
     for key in sorted(current["rig"].keys() - _CHANGEABLE):
@@ -196,7 +196,6 @@ def plan_notice(config: RigConfig) -> str:
 
 def open_recorder(
     config: RigConfig,
-    rig: RigSettings,
     presses: Sequence[Sequence[float]],
     folder: Path,
     resume: bool,
@@ -205,9 +204,8 @@ def open_recorder(
 ) -> Recorder:
     """Return the recorder of a new recording in `folder`, or of the one there if `resume`.
 
-    `rig` are the settings completed for the devices, `presses` x and y, or x, y and depth, of each press of the plan,
-    mm, and `identities` the results of `connect`, by "arm" and "board". Raises InputError for a recording that was
-    begun with another arm, tool or board.
+    `presses` are x and y, or x, y and depth, of each press of the plan, mm, and `identities` the results of `connect`,
+    by "arm" and "board". Raises InputError for a recording that was begun with another arm, tool or board.
     """
     devices = json.loads(json.dumps({name: dict(identity) for name, identity in identities.items()}))
     if resume:
@@ -218,12 +216,13 @@ def open_recorder(
                     raise InputError(f"{device}: {key} is {now}, the recording in {folder} was begun with {before}")
         return Recorder.resume(folder)
     plan = {"columns": list(COLUMNS[: len(presses[0])]), "presses": presses}
-    source = {"kind": kind, "devices": devices, **_settings_and_pad(config, rig), "plan": plan}
-    made_by = provenance(config.command, rig.seed, config.inputs)
+    source = {"kind": kind, "devices": devices, **_settings_and_pad(config), "plan": plan}
+    made_by = provenance(config.command, config.rig.seed, config.inputs)
     return Recorder(folder, len(config.pad.knots), source, made_by)
 
 
-def _settings_and_pad(config: RigConfig, rig: RigSettings) -> dict[str, Any]:
+def _settings_and_pad(config: RigConfig) -> dict[str, Any]:
     """Return `[rig]`, with the wired inputs and the pad's side filled in, and the pad, as JSON."""
+    rig = config.rig
     wired = rig.model_copy(update={"channels": rig.inputs(len(config.pad.knots)), "mirrored": bool(rig.mirrored)})
     return {"rig": wired.model_dump(mode="json"), "morphology": pad_source(config.pad)}

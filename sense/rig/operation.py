@@ -7,6 +7,7 @@ import logging
 import tempfile
 from collections.abc import Mapping, Sequence
 from contextlib import closing, nullcontext
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -161,16 +162,16 @@ def record(
     not safe.
     """
     inputs = config.rig.inputs(len(config.pad.knots))
-    rig = config.rig.model_copy(update={"channels": inputs})
     if kind == "printer":
-        _check_ports(rig)
-        rig = locate_on_bed(rig, config.folder)
+        _check_ports(config.rig)
+        config = replace(config, rig=locate_on_bed(config.rig, config.folder))
+    rig = config.rig
     arm = load_device("padforge.arms", kind)(rig)
     # Closing stops the arm, and comes before the board is closed.
     with closing(make_board(rig, inputs)) as board, closing(arm):
         with Interrupts() as interrupts:
-            plan = load_or_make_plan(config, rig, resume)
-            planner = _make_planner(config, rig, model)
+            plan = load_or_make_plan(config, resume)
+            planner = _make_planner(config, model)
             check_plan(plan, rig)
             if resume and (notice := plan_notice(config)):
                 _log.warning(notice)
@@ -185,19 +186,19 @@ def record(
             _log.warning('[rig] max_force_n is "unwatched": no force stops the arm')
         folder = temporary_folder(Path(tempfile.gettempdir()), "padforge-dry-") if dry else nullcontext(config.out)
         with folder as out:
-            with open_recorder(config, rig, plan.to_rows(), out, resume and not dry, identities) as recorder:
+            with open_recorder(config, plan.to_rows(), out, resume and not dry, identities) as recorder:
                 on_progress(len(recorder.done), len(plan), "")
                 PressLoop(arm, board, recorder, rig, dry=dry).run(plan, on_progress, planner)
             return None if dry else Recording.open(out)
 
 
-def _make_planner(config: RigConfig, rig: RigSettings, model: Path | None) -> AdaptivePlanner | None:
-    if rig.plan != "adaptive":
+def _make_planner(config: RigConfig, model: Path | None) -> AdaptivePlanner | None:
+    if config.rig.plan != "adaptive":
         return None
     if model is None:
         raise InputError("[rig] plan is adaptive, which needs --model, a folder that calibrate wrote")
     free = pressable_test(config.pad, fit_pad_settings(config.pad, config.pad_settings))
-    return AdaptivePlanner(LocalizerModel.load(model), config.out, np.random.default_rng(rig.seed), free)
+    return AdaptivePlanner(LocalizerModel.load(model), config.out, np.random.default_rng(config.rig.seed), free)
 
 
 def diagnose(kind: str, config: RigConfig, inputs: Sequence[int]) -> list[Diagnosis]:
@@ -215,7 +216,7 @@ def diagnose(kind: str, config: RigConfig, inputs: Sequence[int]) -> list[Diagno
         diagnoses += examine_board(make_board(config.rig, inputs))
     except RigFault as fault:
         diagnoses.append(Diagnosis("board", "fail", str(fault)))
-    rig, location = config.rig.model_copy(update={"channels": tuple(inputs)}), []
+    rig, location = config.rig, []
     try:
         if kind == "printer":
             _check_ports(rig)

@@ -276,7 +276,7 @@ class PressLoop:
         except Exception as error:
             stop_error = str(error)
         try:
-            retreat(self._arm, self._limits, self._rig.acceleration_mm_s2)
+            retreat(self._arm, self._limits)
         except Exception as error:
             return stop_error or str(error)
         return None

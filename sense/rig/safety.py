@@ -22,7 +22,7 @@ MAX_LEAN_DEG = 10.0  # between the expected tool axis and straight down, since d
 MAX_TILT_DEG = 2.0  # between the expected tool axis and a target's
 MAX_TURN_DEG = 45.0  # about that axis, between the first target and the tool before the first move
 TCP_TOLERANCE_MM = 0.1
-MAX_STATE_AGE_S = 0.5
+MAX_STATE_AGE_S = 0.5  # of the latest state; an older one is stale
 DEPTH_TOLERANCE_MM = 0.3  # excess of a moving tip over the maximum depth, by noise and overshoot
 POLL_S = 0.004  # between two states
 
@@ -210,7 +210,7 @@ def wait_until_still(arm: Arm, limits: Limits, on_wait: Callable[[], None] = lam
         raise
 
 
-def retreat(arm: Arm, limits: Limits, acceleration_mm_s2: float) -> None:
+def retreat(arm: Arm, limits: Limits) -> None:
     """Lift the tool straight up, unless it is above the pad already and the force is within its limit.
 
     The move is checked like any other, with three exceptions: the tool may start at the edge of the box or too deep,
@@ -236,8 +236,8 @@ def retreat(arm: Arm, limits: Limits, acceleration_mm_s2: float) -> None:
     if up[2] <= z:
         return
     speed_mm_s = min(RETREAT_MM_S, limits.max_speed_mm_s)
-    check_target(up, speed_mm_s, acceleration_mm_s2, relaxed)
-    arm.move(up, speed_mm_s, acceleration_mm_s2)
+    check_target(up, speed_mm_s, limits.max_acceleration_mm_s2, relaxed)
+    arm.move(up, speed_mm_s, limits.max_acceleration_mm_s2)
     on_wait = _falling_force_check(arm, force_n, max_n) if overloaded and max_n else lambda: None
     check_state(wait_until_still(arm, relaxed, on_wait), limits, clock.now())
 

@@ -36,7 +36,7 @@ class SimulatedBoard:
         if rig.plan_file is None:
             make_plan(pad, rig, rng, size)  # `simulate`, too, draws the plan before the pad
         self._model = LivePad(pad, contact, rig, rig.rate_hz, rng)
-        self._pad, self._contact, self._rig = pad, contact, rig
+        self._pad, self._rig = pad, rig
         self._depths_mm = rig.press_depths_mm
         self._size = size
         self._position_rng = rng.spawn(1)[0]

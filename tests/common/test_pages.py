@@ -28,7 +28,7 @@ def doubled(body: bytes) -> Mapping[str, Any] | None:
 
 @pytest.fixture
 def page() -> Iterator[LocalPage]:
-    with LocalPage(0, PAGE, {"/double": doubled}, 100) as page:
+    with LocalPage(0, PAGE, {"/double": doubled}) as page:
         yield page
 
 
@@ -71,8 +71,8 @@ ELSEWHERE = "http://elsewhere.example"
         (b"4", "/double", {"Origin": ELSEWHERE, "Host": "elsewhere.example"}, 403),
         (b"4", "/", {}, 404),
         (None, "/double", {}, 411),
-        (b"1" * 101, "/double", {}, 413),
-        (b"1" * 100, "/double", {}, 200),
+        (b"1" * 4097, "/double", {}, 413),
+        (b"1" * 4096, "/double", {}, 200),
     ],
 )
 def test_posts_of_other_origins_and_malformed_posts_are_refused(
@@ -83,7 +83,7 @@ def test_posts_of_other_origins_and_malformed_posts_are_refused(
 
 def test_token_is_required_under_any_host_name() -> None:
     token = "known to few & all"
-    with LocalPage(0, PAGE, {"/double": doubled}, 100, host="0.0.0.0", token=token) as page:
+    with LocalPage(0, PAGE, {"/double": doubled}, host="0.0.0.0", token=token) as page:
         assert page.url.endswith("/?token=known+to+few+%26+all")
 
         def asked(path: str, **headers: str) -> int:

@@ -10,7 +10,7 @@ import numpy as np
 
 from padforge.sense.arrays import Array, Indices
 from padforge.sense.rig import clock
-from padforge.sense.rig.devices import RigFault, SerialStream
+from padforge.sense.rig.devices import BoardSamples, RigFault, SerialStream
 
 POLL_S = 0.1  # longest wait for bytes
 SETTLE_S = 0.5  # time of blocks before the first samples are returned, so that times depend on several arrivals
@@ -105,6 +105,8 @@ class SerialBoard(ABC):
     `rate_hz` is the number of samples a second, `inputs` the input of each fibre, from 0; () for all inputs in order.
     """
 
+    _assembler: "SampleAssembler"
+
     def __init__(self, port: str, baud: int, rate_hz: float, inputs: Sequence[int] = ()) -> None:
         self._port, self._baud, self._rate_hz, self._inputs = port, baud, rate_hz, inputs
         self._stream: SerialStream | None = None
@@ -128,15 +130,15 @@ class SerialBoard(ABC):
             self._stream.close()
         self._stream = self._reader = None
 
-    @abstractmethod
-    def _start(self, stream: SerialStream) -> dict[str, Any]:
-        """Start `_reader` on the open port, and return the board's identity."""
-
-    def _drain(self) -> Arrivals:
-        """Return the received blocks; RigFault("refused") before `connect`."""
+    def read(self) -> BoardSamples:
+        """Return all samples since the last call, volts; RigFault("refused") before `connect`. See `Board`."""
         if self._reader is None:
             raise RigFault("refused", f"{self._port}: not connected")
-        return self._reader.drain()
+        return self._assembler.assemble(self._reader.drain())
+
+    @abstractmethod
+    def _start(self, stream: SerialStream) -> dict[str, Any]:
+        """Set `_assembler`, start `_reader` on the open port, and return the board's identity."""
 
 
 def select_inputs(inputs: Sequence[int], n_inputs: int) -> tuple[int, ...]:
@@ -225,3 +227,35 @@ def _fit_lower_line(points: list[Point], max_slope: float) -> tuple[float, float
 
 def _slope(a: Point, b: Point) -> float:
     return (b[1] - a[1]) / (b[0] - a[0])
+
+
+class SampleAssembler(ABC):
+    """Converts samples to `BoardSamples`: host times by a clock, voltages of the fibres, numbers of lost samples.
+
+    `columns` are those of the fibres in a sample's values, in units of `volts`.
+    """
+
+    def __init__(self, clock: SampleClock, columns: Sequence[int], volts: float) -> None:
+        self._clock, self._columns, self._volts = clock, columns, volts
+
+    def assemble(self, arrivals: Arrivals) -> BoardSamples:
+        """Return the samples of blocks with their arrival times; RigFault("data") for repeated impossible ones."""
+        indices, rows, gaps = [], [], []
+        for arrival_s, block in arrivals:
+            for sample in block:
+                if (placed := self._place(sample)) is not None:
+                    index, values, missing = placed
+                    indices.append(index)
+                    rows.append([values[column] for column in self._columns])
+                    gaps.append(missing)
+            if indices:
+                self._clock.observe(indices[-1], arrival_s)
+        return BoardSamples(
+            self._clock.times(np.array(indices)) if indices else np.empty(0),
+            np.array(rows, np.float64).reshape(-1, len(self._columns)) * self._volts,
+            np.array(gaps, np.int64),
+        )
+
+    @abstractmethod
+    def _place(self, sample: Any) -> tuple[int, Sequence[float], int] | None:
+        """Return a sample's index by the clock, its values, and the number lost before it; None if it is dropped."""

@@ -13,9 +13,9 @@ import numpy as np
 
 from padforge.sense.arrays import MAX_FIBRES, Array
 from padforge.sense.rig import clock
-from padforge.sense.rig.boards.board_reader import BlockReader, SampleClock, SerialBoard, select_inputs
+from padforge.sense.rig.boards.board_reader import BlockReader, SampleAssembler, SampleClock, SerialBoard, select_inputs
 from padforge.sense.rig.boards.line_board import describe_lines, find_line_port
-from padforge.sense.rig.devices import BoardSamples, RigFault, SerialStream
+from padforge.sense.rig.devices import RigFault, SerialStream
 from padforge.sense.settings import RigSettings
 
 LISTEN_S = 2.0  # time in which columns and rate are measured
@@ -54,25 +54,6 @@ class CsvBoard(SerialBoard):
         """Return the board that `[rig]` names."""
         return cls(find_line_port(rig), rig.baud, rig.board_rate_hz, inputs, rig.count_v)
 
-    def read(self) -> BoardSamples:
-        """Return all samples since the last call, volts; see `Board`."""
-        indices, rows = [], []
-        for arrival_s, block in self._drain():
-            for numbers in block:
-                self._n_lines += 1
-                if len(numbers) == self._width:
-                    indices.append(self._n_lines)
-                    rows.append([numbers[column] for column in self._columns])
-            if indices:
-                self._clock.observe(indices[-1], arrival_s)
-        missing = np.diff(np.array([self._last, *indices])) - 1 if indices else np.empty(0, np.int64)
-        self._last = indices[-1] if indices else self._last
-        return BoardSamples(
-            self._clock.times(np.array(indices)) if indices else np.empty(0),
-            np.array(rows, np.float64).reshape(-1, len(self._columns)) * self._count_v,
-            missing,
-        )
-
     def _start(self, stream: SerialStream) -> dict[str, Any]:
         # 1. Listen, and ignore the greeting of a board that the opening of its port has reset.
         self._tail = b""
@@ -96,18 +77,17 @@ class CsvBoard(SerialBoard):
         if not 1 <= n_inputs <= MAX_FIBRES:
             raise RigFault("refused", f"{self._port}: a line has {n_inputs} numbers, allowed is 1 to {MAX_FIBRES}")
         inputs = select_inputs(self._inputs, n_inputs)
-        self._columns = [column + has_time for column in inputs]
+        columns = [column + has_time for column in inputs]
         # 3. Measure the rate, and start to read.
         rate_hz = _measure_rate(np.array([arrival_s for arrival_s, _ in lines]))
         if abs(rate_hz / self._rate_hz - 1) > _RATE_TOLERANCE:
             message = f"{self._port}: {rate_hz:.4g} lines come a second, [rig] says {self._rate_hz:g}"
             raise RigFault("refused", message, f"set board_rate_hz = {rate_hz:.3g}")
-        self._clock = SampleClock(1 / rate_hz, _RATE_TOLERANCE)
-        self._n_lines = self._last = 0
+        self._assembler = CsvAssembler(SampleClock(1 / rate_hz, _RATE_TOLERANCE), columns, self._count_v, self._width)
         self._lines: list[list[float]] = []  # received since the last line of samples
         self._reader = BlockReader(self._port, lambda: self._receive_blocks(stream), rate_hz)
         self._reader.start_settled()
-        level_v = float(np.median(np.abs(table[:, self._columns]))) * self._count_v
+        level_v = float(np.median(np.abs(table[:, columns]))) * self._count_v
         warning = "its lines have no header and no check: what is damaged or lost is not seen"
         if level_v > 50.0:  # probably counts of a converter
             warning += f"; they rest at {level_v:.4g}: if that are counts, [rig] count_v is the volts of one"
@@ -132,6 +112,23 @@ class CsvBoard(SerialBoard):
             return now_s, []
         block, self._lines = self._lines, []
         return now_s, [block]
+
+
+class CsvAssembler(SampleAssembler):
+    """Assembles lines of `width` numbers by their order; others are lost samples."""
+
+    def __init__(self, clock: SampleClock, columns: Sequence[int], volts: float, width: int) -> None:
+        super().__init__(clock, columns, volts)
+        self._width = width
+        self._n_lines = self._n_lost = 0  # in all, and since the last sample
+
+    def _place(self, sample: Sequence[float]) -> tuple[int, Sequence[float], int] | None:
+        self._n_lines += 1
+        if len(sample) != self._width:
+            self._n_lost += 1
+            return None
+        missing, self._n_lost = self._n_lost, 0
+        return self._n_lines, sample, missing
 
 
 def _measure_rate(arrivals_s: Array) -> float:

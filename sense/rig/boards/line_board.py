@@ -2,16 +2,14 @@
 
 from binascii import crc32
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-
 from padforge.sense.arrays import MAX_FIBRES
 from padforge.sense.rig import clock
-from padforge.sense.rig.boards.board_reader import BlockReader, SampleClock, SerialBoard, select_inputs
-from padforge.sense.rig.devices import BoardSamples, RigFault, SerialStream, host_ports
+from padforge.sense.rig.boards.board_reader import BlockReader, SampleAssembler, SampleClock, SerialBoard, select_inputs
+from padforge.sense.rig.devices import RigFault, SerialStream, host_ports
 from padforge.sense.settings import RigSettings
 
 HEADER_REQUEST = b"?"
@@ -171,17 +169,10 @@ class LineBoard(SerialBoard):
     minimum delay of the port.
     """
 
-    _assembler: "LineAssembler"  # set by `connect`
-
     @classmethod
     def from_settings(cls, rig: RigSettings, inputs: Sequence[int]) -> "LineBoard":
         """Return the board that `[rig]` names; see `find_line_port`."""
         return cls(find_line_port(rig), rig.baud, rig.board_rate_hz, inputs)
-
-    def read(self) -> BoardSamples:
-        """Return all samples since the last call, volts; RigFault("data") for a reset or impossible times."""
-        blocks = self._drain()  # raises if the board is not connected
-        return self._assembler.assemble(blocks)
 
     def _start(self, stream: SerialStream) -> dict[str, Any]:
         self._decoder, self._settled = LineDecoder(), False
@@ -239,45 +230,25 @@ class LineBoard(SerialBoard):
         return now_s, [samples]
 
 
-class LineAssembler:
-    """Converts lines to `BoardSamples`: host times by a `SampleClock`, voltages of the fibres, numbers of lost samples.
+class LineAssembler(SampleAssembler):
+    """Assembles the samples of lines by the board's clock.
 
     Every sample has a time slot, one period after the previous one; empty slots are lost samples. The slots track the
     board's actual rate, which may differ slightly from its header's. A line that fits no slot is dropped.
     """
 
     def __init__(self, header: LineHeader, inputs: Sequence[int]) -> None:
-        self._clock = SampleClock(1e-6, RESONATOR_SKEW)
-        self._columns = list(inputs)
-        self._volts = header.reference_v / header.full_scale
+        super().__init__(SampleClock(1e-6, RESONATOR_SKEW), inputs, header.reference_v / header.full_scale)
         self._period_us = 1e6 / header.rate_hz
         self._last_us: int | None = None
         self._slot_us = 0.0
         self._n_misplaced = 0.0
 
-    def assemble(self, arrivals: Iterable[tuple[float, list[LineSample]]]) -> BoardSamples:
-        """Return the samples of lines with their arrival times; RigFault("data") for repeated impossible times."""
-        times_us, rows, gaps = [], [], []
-        for arrival_s, block in arrivals:
-            for sample in block:
-                if (missing := self._place(sample.time_us)) is not None:
-                    times_us.append(self._last_us)
-                    rows.append([sample.counts[column] for column in self._columns])
-                    gaps.append(missing)
-            if times_us:
-                self._clock.observe(times_us[-1], arrival_s)
-        return BoardSamples(
-            self._clock.times(np.array(times_us)) if times_us else np.empty(0),
-            np.array(rows, np.float64).reshape(-1, len(self._columns)) * self._volts,
-            np.array(gaps, np.int64),
-        )
-
-    def _place(self, time_us: int) -> int | None:
-        """Return the number of samples lost before one of this time; None if the time is impossible."""
+    def _place(self, sample: LineSample) -> tuple[int, Sequence[float], int] | None:
         if self._last_us is None:
-            self._last_us, self._slot_us = time_us, float(time_us)
-            return 0
-        elapsed_us = (time_us - self._last_us + 2**31) % 2**32 - 2**31  # the board's time wraps at 32 bits
+            self._last_us, self._slot_us = sample.time_us, float(sample.time_us)
+            return sample.time_us, sample.counts, 0
+        elapsed_us = (sample.time_us - self._last_us + 2**31) % 2**32 - 2**31  # the board's time wraps at 32 bits
         now_us = self._last_us + elapsed_us
         steps = round((now_us - self._slot_us) / self._period_us)
         if not 0 < elapsed_us <= _MAX_GAP_US or steps < 1:
@@ -292,4 +263,4 @@ class LineAssembler:
         self._slot_us += steps * self._period_us
         self._slot_us += 0.1 * (now_us - self._slot_us)  # low-pass: the slots follow the board slowly
         self._last_us = now_us
-        return steps - 1
+        return now_us, sample.counts, steps - 1

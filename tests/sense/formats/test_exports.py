@@ -12,9 +12,9 @@ import pytest
 import scipy.io
 from rosbags.rosbag2 import Reader
 
-from padforge.sense import Recording, export_bag, export_csv, export_hdf5, export_lerobot
-from padforge.sense.formats.annotations import FaultAnnotation, ModelAnnotations
+from padforge.sense import FibreFault, Localization, Recording, export_bag, export_csv, export_hdf5, export_lerobot
 from padforge.sense.formats.import_export import describe_file, import_file
+from padforge.sense.localizer.model import MeasureEstimate
 from tests.helpers.golden import Golden, json_text
 
 from .foreign import STORE, array, as_json, make, pose, write_bag
@@ -41,12 +41,11 @@ def three() -> Recording:
 
 
 @pytest.fixture
-def annotations() -> ModelAnnotations:
-    """A model that predicts depth for two of the presses, and has named a fibre at the second."""
+def localization() -> Localization:
+    """A model that predicts depth for two of the presses."""
     positions = np.array([[1.5, -2.5], [3.0, 4.5], [0.0, 1.0]]), np.array([[0.5, 0.25], [1.0, 2.0], [3.0, 4.0]])
-    depths = np.array([4.0, 2.0, NAN]), np.array([0.5, 0.25, NAN])
-    fault = FaultAnnotation(1, (1,), "stuck", "fibre 2 reads one value since press 1")
-    return ModelAnnotations(*positions, np.array([1.25, 2.25, 9.0]), *depths, [fault], (0,))
+    depth = MeasureEstimate(np.array([4.0, 2.0, NAN]), np.array([0.5, 0.25, NAN]))
+    return Localization(*positions, np.ones(3), np.array([1.25, 2.25, 9.0]), {"depth_mm": depth})
 
 
 def test_csv(three: Recording, golden: Golden, tmp_path: Path) -> None:
@@ -64,11 +63,12 @@ def test_hdf5(three: Recording, golden: Golden, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("mirrored", [False, True])
-def test_bag(three: Recording, annotations: ModelAnnotations, golden: Golden, tmp_path: Path, mirrored: bool) -> None:
+def test_bag(three: Recording, localization: Localization, golden: Golden, tmp_path: Path, mirrored: bool) -> None:
     """All messages, but for readings beyond the first two; of a mirrored pad those with a z."""
     states = np.array([[100.0, 100, 200, 300, 0, 0, np.pi / 2, 1, 0, 0], [101.0, 400, 500, 600, 0, 0, 0, 0, 0, 0]])
     recording = replace(three, source={"kind": "test", "rig": {"mirrored": mirrored}})
-    export_bag(recording, tmp_path / "three.mcap", annotations, states)
+    faults = [FibreFault(1, 1, (1,), "stuck", 99)]
+    export_bag(recording, tmp_path / "three.mcap", localization, faults, (0,), states)
     left_out = ("/pad/recording", "/pad/readings", "/pad/health", "/pad/pressed", "/arm/pose") if mirrored else ()
     lines = []
     with Reader(tmp_path / "three.mcap") as reader:
@@ -97,10 +97,10 @@ def compact(value: Any) -> str:
     return f"{value:.9g}" if isinstance(value, float) else repr(value)
 
 
-def test_lerobot(three: Recording, annotations: ModelAnnotations, golden: Golden, tmp_path: Path) -> None:
+def test_lerobot(three: Recording, localization: Localization, golden: Golden, tmp_path: Path) -> None:
     """All files, with the statistics of one feature."""
     known = replace(three, forces_n=np.array([1.5, 2.0, 0.75]))
-    export_lerobot(known, tmp_path / "set", annotations)
+    export_lerobot(known, tmp_path / "set", localization)
     tables = {path: pq.read_table(path) for path in sorted((tmp_path / "set").rglob("*.parquet"))}
     for path, table in tables.items():
         names = [name for name in table.column_names if not name.startswith("stats/") or "/observation.force" in name]

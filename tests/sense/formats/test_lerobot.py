@@ -10,9 +10,8 @@ import pyarrow.parquet as pq
 import pytest
 
 from padforge.common.validation import InputError
-from padforge.sense import Recording
+from padforge.sense import Localization, Recording
 from padforge.sense.formats import lerobot
-from padforge.sense.formats.annotations import ModelAnnotations
 from padforge.sense.formats.import_export import export_file
 from padforge.sense.formats.lerobot import export_lerobot
 from tests.helpers.power_cut import ON_LINUX, Disk
@@ -55,8 +54,8 @@ def test_export_lerobot_outlasts_a_power_cut(eight: Recording, tmp_path: Path, m
 
 def test_export_lerobot_puts_every_frame_in_an_episode(eight: Recording, tmp_path: Path) -> None:
     """With what a model predicts only once a press is over."""
-    positioned, nan = replace(eight, presses_mm=np.nan_to_num(eight.presses_mm)), np.full(8, np.nan)
-    touches = ModelAnnotations(np.full((8, 2), 3.0), np.ones((8, 2)), np.full(8, 2.5), nan, nan)
+    positioned = replace(eight, presses_mm=np.nan_to_num(eight.presses_mm))
+    touches = Localization(np.full((8, 2), 3.0), np.ones((8, 2)), np.ones(8), np.full(8, 2.5))
     export_lerobot(positioned, tmp_path / "set", touches)
     info, columns, _ = read_dataset(tmp_path / "set")
     assert info["total_frames"] == len(positioned.readings)

@@ -14,8 +14,7 @@ import filelock
 import numpy as np
 import pytest
 
-from padforge.sense import Recording
-from padforge.sense.formats.annotations import ModelAnnotations
+from padforge.sense import Localization, Recording
 from padforge.sense.formats.lerobot import export_lerobot
 
 HERE = Path(__file__).parent
@@ -77,18 +76,17 @@ def test_lerobot_records_a_pad_beside_an_arm_and_opens_exported_datasets(
     check_recorded(recorded)
 
 
-def annotated(brief: Recording) -> tuple[Recording, ModelAnnotations]:
+def annotated(brief: Recording) -> tuple[Recording, Localization]:
     """A recording with readings that are missing, and touches mirrored about the middle."""
     readings = brief.readings.copy()
     readings[50:60, 1] = np.nan
     presses = len(brief.presses_mm)
     forces, r90 = np.linspace(1, 5, presses), np.linspace(0.5, 2, presses)
-    nan = np.full(presses, np.nan)
-    touches = ModelAnnotations(-brief.presses_mm, np.ones((presses, 2)), r90, nan, nan)
+    touches = Localization(-brief.presses_mm, np.ones((presses, 2)), r90, r90)
     return replace(brief, readings=readings, forces_n=forces), touches
 
 
-def check_exported(read: dict[str, Any], recording: Recording, touches: ModelAnnotations) -> None:
+def check_exported(read: dict[str, Any], recording: Recording, touches: Localization) -> None:
     frames, state, presses = read["frames"], recording.readings.astype(np.float32), len(recording.presses_mm)
     ends = np.append((recording.up_command[:-1] + recording.down_command[1:]) // 2, len(state))
     assert read["episodes"] == np.column_stack([np.append(0, ends[:-1]), ends]).tolist()

@@ -362,4 +362,4 @@ def test_presses_are_held_for_half_a_cycle_at_the_rate_of_the_board(monkeypatch:
     config = replace(config_of(presses=3, rate_hz=400.0, readings_per_press=40), out=tmp_path / "out")
     with pytest.raises(EOFError):
         record_by_hand(config, board, lambda view: None, list)
-    assert session.call_args.args[3] == 20 / 500
+    assert session.call_args.args[2] == 20 / 500

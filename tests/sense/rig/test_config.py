@@ -127,19 +127,19 @@ BOARD = {"name": "padforge-due", "serial": "ab12", "firmware": "1.0.0", "port": 
 IDENTITIES: dict[str, dict[str, Any]] = {"arm": ARM, "board": BOARD}
 
 
-def config_of(out: Path, pad: Morphology = PAD) -> RigConfig:
-    return RigConfig(pad, PUBLISHED_CONTACT, RIG, out, "test")
+def config_of(out: Path, pad: Morphology = PAD, rig: RigSettings = RIG) -> RigConfig:
+    return RigConfig(pad, PUBLISHED_CONTACT, rig, out, "test")
 
 
 def resumed_plan(out: Path, pad: Morphology = PAD, **settings: Any) -> list:
-    return load_or_make_plan(config_of(out, pad), RIG.model_copy(update=settings), resume=True).to_rows()
+    return load_or_make_plan(config_of(out, pad, RIG.model_copy(update=settings)), resume=True).to_rows()
 
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory) -> Path:
     """A recording of no press so far, which nobody may change."""
     out, plan = tmp_path_factory.mktemp("run"), make_plan(PAD, RIG, np.random.default_rng(0))
-    with open_recorder(config_of(out), RIG, plan.to_rows(), out, False, IDENTITIES):
+    with open_recorder(config_of(out), plan.to_rows(), out, False, IDENTITIES):
         pass
     return out
 
@@ -151,14 +151,14 @@ def test_make_plan_keeps_the_plan_of_a_resumed_recording(run):
 def test_make_plan_refuses_to_resume_into_a_new_keep_out(tmp_path):
     pad = Morphology.random((1, 3), 2, 0, (8.0, 15.0))
     plan = make_plan(pad, RIG, np.random.default_rng(0))
-    with open_recorder(config_of(tmp_path, pad), RIG, plan.to_rows(), tmp_path, False, IDENTITIES):
+    with open_recorder(config_of(tmp_path, pad), plan.to_rows(), tmp_path, False, IDENTITIES):
         pass
     assert resumed_plan(tmp_path, pad) == plan.to_rows()
     x, y = plan.positions_mm[1].tolist()
     hole = ((x - 1, y - 1), (x + 1, y - 1), (x, y + 1))
     config = replace(config_of(tmp_path, pad), pad_settings=PadSettings(keep_out_mm=(hole,)))
     with pytest.raises(InputError, match=r"press 1, at .* lies in a keep-out"):
-        load_or_make_plan(config, RIG, resume=True)
+        load_or_make_plan(config, resume=True)
 
 
 CHANGES: dict[str, Any] = {
@@ -173,7 +173,7 @@ CHANGES: dict[str, Any] = {
 def test_resume_refuses_settings_that_change_a_press(run):
     for key, value in CHANGES.items():
         with pytest.raises(InputError, match=re.escape(f"[rig] {key}: got {value}, the recording")):
-            load_or_make_plan(config_of(run), RigSettings(**RIG.model_dump() | {key: value}), resume=True)
+            load_or_make_plan(config_of(run, rig=RigSettings(**RIG.model_dump() | {key: value})), resume=True)
 
 
 def test_resume_accepts_other_limits_and_addresses_but_no_other_pad(run):
@@ -190,5 +190,5 @@ def test_resume_accepts_another_controller_of_the_same_arm(run, tmp_path):
     assert json.loads((run / START).read_text())["source"]["devices"] == IDENTITIES
     out = Path(shutil.copytree(run, tmp_path / "run"))
     plan = resumed_plan(out)
-    with open_recorder(config_of(out), RIG, plan, out, True, IDENTITIES | {"arm": ARM | {"controller": "5.13.0"}}):
+    with open_recorder(config_of(out), plan, out, True, IDENTITIES | {"arm": ARM | {"controller": "5.13.0"}}):
         pass

@@ -224,7 +224,7 @@ def test_recordings_are_not_resumed_in_these_words(golden, tmp_path: Path) -> No
     options = RIG.model_copy(update={"channels": (0, 1, 2, 3)})
     identities = {"arm": {"model": "UR5", "serial": "2018", "tcp": [0.0] * 6}, "board": {"name": "due", "serial": "7"}}
     config = RigConfig(PAD, PUBLISHED_CONTACT, options, run, "test")
-    with open_recorder(config, options, [[0.0, 0.0, 4.0]], run, False, identities):
+    with open_recorder(config, [[0.0, 0.0, 4.0]], run, False, identities):
         pass
     recorder, _, _ = open_recorder_by_hand(replace(config, out=hand), {"name": "due"}, resume=False)
     with recorder:
@@ -233,12 +233,12 @@ def test_recordings_are_not_resumed_in_these_words(golden, tmp_path: Path) -> No
     (broken / START).write_text(json.dumps({"format": FORMAT, "fibres": 4, "source": {"kind": "arrays"}}))
 
     def resumed(out: Path = run, pad: Morphology = PAD, **settings: Any) -> Callable[[], object]:
-        other = replace(config, out=out, pad=pad)
-        return lambda: load_or_make_plan(other, options.model_copy(update=settings), resume=True)
+        other = replace(config, out=out, pad=pad, rig=options.model_copy(update=settings))
+        return lambda: load_or_make_plan(other, resume=True)
 
     def opened(device: str, **changed: Any) -> Callable[[], object]:
         other = identities | {device: identities[device] | changed}
-        return lambda: open_recorder(config, options, [[0.0, 0.0, 4.0]], run, True, other)
+        return lambda: open_recorder(config, [[0.0, 0.0, 4.0]], run, True, other)
 
     folder = tmp_path / "pad"
     folder.mkdir()

@@ -189,7 +189,7 @@ def arm_at(height_mm: float, force: Callable[[FakeArm], float]) -> FakeArm:
 
 def retreated(arm: FakeArm) -> FakeArm:
     with arm.time.of_all():
-        retreat(arm, RETREAT_LIMITS, 500)
+        retreat(arm, RETREAT_LIMITS)
     return arm
 
 
