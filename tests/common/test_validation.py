@@ -1,4 +1,4 @@
-"""Checks of arguments: bounds are inclusive, and errors are one line; cells of a confusion matrix."""
+"""Checks of arguments: bounds are inclusive, and errors are one line."""
 
 import math
 from pathlib import Path
@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from padforge.common import validation as errors
-from padforge.common.plotting import draw_confusions, new_figure
 from padforge.common.validation import InputError, missing_extra
 
 
@@ -54,10 +53,3 @@ def test_checks_refuse_values_beyond_their_bounds_and_of_other_types(check, valu
 )
 def test_missing_extra_names_the_extra(module, wanted, said):
     assert missing_extra(ModuleNotFoundError(name=module), wanted) == (said and f"this needs {said}")
-
-
-def test_confusions_are_in_per_cent_of_each_true_class():
-    _, axes = new_figure(3, 3)
-    draw_confusions(axes, [[3, 1], [8, 32]])
-    written = {text.get_position(): text.get_text() for text in axes.texts}  # column and row
-    assert written == {(0, 0): "75", (1, 0): "25", (0, 1): "20", (1, 1): "80"}

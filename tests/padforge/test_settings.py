@@ -11,7 +11,6 @@ from padforge.fabricate import FabricationSettings
 from padforge.run import Run, check_run
 from padforge.settings import check_settings
 from tests.helpers.door import called, refused
-from tests.helpers.less import blank_pictures, compare_little
 
 THIN = '[contact]\nthickness_mm = 4\ndepth_mm = 2.5\ntool = "ball"\n[mould]\nsilicone_mm = 4\n'
 CONTRADICTIONS = {
@@ -57,10 +56,8 @@ def test_thin_pad_is_pressed_as_deep_as_it_is_designed_for(tmp_path: Path, caplo
     ],
 )
 def test_commands_say_once_that_a_layer_is_strained_too_much(
-    tmp_path: Path, command: tuple[str, ...], monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, command: tuple[str, ...], brief: None
 ) -> None:
-    compare_little(monkeypatch)
-    blank_pictures(monkeypatch)
     for name in ("morphology", "other"):
         Morphology.straight(1).save(tmp_path / f"{name}.json")
     (tmp_path / "pad.toml").write_text('[pad]\ngrid = 1\n[contact]\nbase = "bonded"\n')
