@@ -12,7 +12,6 @@ import pytest
 from padforge import InputError, Spec
 from padforge.common.server import page_text as served_page
 from padforge.design import Contact, Morphology, PadSettings, RulesSettings, SearchOptions, search
-from padforge.design import cli as commands
 from padforge.design import compare as comparison
 from padforge.design.contact_comparison import compare_contacts
 from padforge.design.design_run import load_result, summary_lines
@@ -149,13 +148,16 @@ def test_import(run, golden: Golden) -> None:
 
 
 def test_edit(run, golden: Golden, monkeypatch: pytest.MonkeyPatch) -> None:
-    """As a command that is interrupted at once, and as the view of a page after some edits."""
+    """As a command that is interrupted after an edit, and as the view of a page after some."""
 
-    def interrupt(seconds: float) -> None:
+    def interrupt(editor: EditSession) -> None:
+        editor.edit(b'{"do": "add", "fibre": 1}')
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(commands.time, "sleep", interrupt)
-    golden("design/edit.txt", run("edit", "pad.json", "--port", "0"), forget=[PORT])
+    with monkeypatch.context() as patch:
+        patch.setattr(EditSession, "begin", interrupt)
+        golden("design/edit.txt", run("edit", "pad.json", "--port", "0"), forget=[PORT])
+    assert not Path("pad-edited.json").exists()
 
     views: list[dict[str, Any]] = []
     spec = Spec.load(Path("pad.toml"))

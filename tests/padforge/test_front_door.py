@@ -26,7 +26,7 @@ def loaded_by(*codes: str) -> list[set[str]]:
 def test_package_help_and_stages_import_only_what_they_need(tmp_path: Path) -> None:
     """What one may load, none before it has loaded."""
     pad, build = "p = design.Morphology.straight(1)", f"build(p, {str(tmp_path)!r}, ['stl', 'svg'])"
-    compare = "from padforge.design.contact_comparison import errors_by_contact"
+    compare = "from padforge.design import contact_comparison, editor"
     settings = "design.PadSettings(grid=1), design.SearchSettings(max_failures=0)"
     (tmp_path / "pad.toml").write_text(SMALLEST)
     package, helped, stage, designed, built, compared = loaded_by(
@@ -35,7 +35,7 @@ def test_package_help_and_stages_import_only_what_they_need(tmp_path: Path) -> N
         "import padforge.fabricate.cli",
         f"import os; os.chdir({str(tmp_path)!r}); sys.argv = ['padforge', 'design', '--json']; main()",
         f"from padforge import build, design; {pad}; design.signals(p, [[1, 1]]); {build}",
-        f"{compare}; errors_by_contact({{'': p}}, {{'': design.Contact()}}, {settings})",
+        f"{compare}; contact_comparison.errors_by_contact({{'': p}}, {{'': design.Contact()}}, {settings})",
     )
     assert not {name for name in package if name.startswith("padforge.")}
     assert not package & {"numpy", "click", "pydantic"}
@@ -48,7 +48,7 @@ def test_package_help_and_stages_import_only_what_they_need(tmp_path: Path) -> N
     assert not designed & {"build123d", "manifold3d", "pymoo", "h5py", "torch", "trimesh"}
     assert built >= {"numba", "manifold3d"}
     assert not built & (cad - {"matplotlib"} | {"ezdxf"})
-    assert "padforge.design.objectives.bayes_error" in compared
+    assert compared >= {"padforge.design.objectives.bayes_error", "padforge.design.editor"}
     assert "torch" not in compared
 
 
