@@ -121,9 +121,9 @@ def test_search_broken_off_anywhere_resumes_as_if_unbroken(method, tmp_path, mon
 
     Also if the state of the first start is lost, which then comes to its end after the others.
     """
-    monkeypatch.setattr(stopping, "SLICE_S", -1.0)  # a state is kept after every step
     settings = SMALL.model_copy(update={"method": method, "steps": 10})
     unbroken, kills, resumed = search(PAD, None, settings, FREE), 0, None
+    monkeypatch.setattr(stopping, "SLICE_S", -1.0)  # a state is kept after every step
 
     def report(*progress):
         reported.append(progress)
