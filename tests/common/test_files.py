@@ -134,25 +134,14 @@ def test_atomic_files_moves_and_removes_all_or_none(tmp_path):
 
 
 @ON_LINUX
-def test_atomic_file_outlasts_a_power_cut(tmp_path, monkeypatch):
-    disk, path = Disk(monkeypatch), tmp_path / "a" / "b" / "file.txt"
+def test_what_is_written_outlasts_a_power_cut(tmp_path, monkeypatch):
+    disk, folder = Disk(monkeypatch), tmp_path / "a" / "b"
     for text in ("old", "new"):
-        files.write_text(path, text)
-        assert disk.read(path) == text.encode()
-    assert disk.has_name(tmp_path / "a")
-    assert disk.has_name(tmp_path / "a" / "b")
-    assert disk.torn == []
-
-
-@ON_LINUX
-def test_atomic_files_outlast_a_power_cut(tmp_path, monkeypatch):
-    disk, folder = Disk(monkeypatch), tmp_path / "pad"
-    for text in (b"old", b"new"):
-        with files.atomic_files(folder) as stage:
-            for name in ("a.json", "b.csv"):
-                (stage / name).write_bytes(text)
-        assert [disk.read(folder / name) for name in ("a.json", "b.csv")] == [text, text]
-    assert disk.has_name(folder)
+        files.write_text(folder / "file.txt", text)
+        replaced(folder / "set", "a.json", "b.csv", text=text)
+        for name in ("file.txt", "set/a.json", "set/b.csv"):
+            assert disk.read(folder / name) == text.encode()
+    assert all(disk.has_name(path) for path in (folder.parent, folder, folder / "set"))
     assert disk.torn == []
 
 

@@ -1,4 +1,4 @@
-"""Checks of arguments: bounds are inclusive, and errors are one line; cells of a confusion matrix."""
+"""Checks of arguments: bounds are inclusive, and errors are one line."""
 
 import math
 from pathlib import Path

@@ -5,10 +5,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import shapely
 
 from padforge.benchmarks import harness
 from padforge.common.progress import ignore_progress
-from padforge.design import Morphology, Twin
+from padforge.design import Morphology, Twin, flatten
 from padforge.design.morphology import assemble_knots
 from padforge.design.published.objective import information
 from padforge.design.settings import Layout
@@ -21,6 +22,12 @@ KNOTS_MM = (
     *([(-8, -9), (6, -2)], [(-8, 8), (6, -4)]),  # the second falls below the first
     *([(-19, -6), (-7, 6)], [(0, -5), (1, 7)], [(12, -4), (8, 8)]),  # the first comes near the border
 )
+
+
+def max_distance_mm(one: Morphology, other: Morphology) -> float:
+    """Greatest distance of fibres of two pads, mm."""
+    lines = ([shapely.LineString(pad.to_mm(line)) for line in flatten(pad, 1e-5)] for pad in (one, other))
+    return max(a.hausdorff_distance(b) for a, b in zip(*lines, strict=True))
 
 
 @pytest.fixture

@@ -8,20 +8,18 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import shapely
 
 from padforge import InputError, Spec
 from padforge.common.server import page_text as served_page
-from padforge.design import Contact, Morphology, PadSettings, RulesSettings, SearchOptions, flatten, search
-from padforge.design import cli as commands
+from padforge.design import Contact, Morphology, PadSettings, RulesSettings, SearchOptions, search
 from padforge.design import compare as comparison
-from padforge.design.cli import design
 from padforge.design.contact_comparison import compare_contacts
 from padforge.design.design_run import load_result, summary_lines
 from padforge.design.editor import EditSession
 from padforge.design.objectives.rules import Violation
 from padforge.design.optimize.search import SearchResult
 from padforge.design.settings import SearchSettings
+from tests.design.conftest import max_distance_mm
 from tests.helpers.door import call
 from tests.helpers.golden import Golden, page_text
 from tests.helpers.json_text import json_text
@@ -44,7 +42,6 @@ horizontals = 1
 verticals = 2
 pitch_mm = [10, 12]
 [search]
-knots = 2
 starts = 2
 steps = 20
 max_failures = 1
@@ -78,20 +75,11 @@ def document_of(path: str) -> Any:
     return json.loads(Path(path).read_text())
 
 
-def lines_mm(pad: Morphology) -> list[shapely.LineString]:
-    return [shapely.LineString(pad.to_mm(line)) for line in flatten(pad, 1e-5)]
-
-
-def test_help(run, golden: Golden, monkeypatch: pytest.MonkeyPatch) -> None:
-    names = ("", "show", "check", "score", "edit", "import")
-    for command in (design, *(design.commands[name] for name in names[1:])):
-        monkeypatch.setattr(command, "_help_option", None)  # which another test may have asked for by other names
-    golden("design/help.txt", "\n".join(run(*filter(None, (name, "--help"))) for name in names))
-
-
 def test_design(run, golden: Golden) -> None:
+    """From a pad, which has as many knots as are searched for."""
     Path("pad.toml").write_text(SEARCH)
-    printed = run("--seed", "3")
+    Morphology.random((1, 2), 2, 1, (10.0, 12.0)).save("first.json")
+    printed = run("--seed", "3", "--start-from", "first.json")
     golden("design/design.txt", printed, forget=SECONDS, rtol=1e-3)
     document = document_of("out/pad/design.json")
     golden("design/design.json", json_text(document), forget=[VERSIONS, *SECONDS], rtol=1e-3)
@@ -143,9 +131,7 @@ def test_show_draws_what_import_reads(run, golden: Golden, figures: list[Any], b
     printed = run("show", "pad.json") + run("show", "pad.json", "--out", "plan.png")
     golden("design/show_plan.txt", figures[0], forget=[ROUNDING])
     golden("design/show.txt", printed + run("import", "plan.svg", "--tolerance-mm", "0.5"), rtol=1e-3)
-    drawn = Morphology.load("out/plan/morphology.json")
-    distances_mm = [a.hausdorff_distance(b) for a, b in zip(lines_mm(drawn), lines_mm(bent_pad), strict=True)]
-    assert max(distances_mm) < 0.6
+    assert max_distance_mm(Morphology.load("out/plan/morphology.json"), bent_pad) < 0.6
 
 
 def test_import(run, golden: Golden) -> None:
@@ -162,13 +148,16 @@ def test_import(run, golden: Golden) -> None:
 
 
 def test_edit(run, golden: Golden, monkeypatch: pytest.MonkeyPatch) -> None:
-    """As a command that is interrupted at once, and as the view of a page after some edits."""
+    """As a command that is interrupted after an edit, and as the view of a page after some."""
 
-    def interrupt(seconds: float) -> None:
+    def interrupt(editor: EditSession) -> None:
+        editor.edit(b'{"do": "add", "fibre": 1}')
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(commands.time, "sleep", interrupt)
-    golden("design/edit.txt", run("edit", "pad.json", "--port", "0"), forget=[PORT])
+    with monkeypatch.context() as patch:
+        patch.setattr(EditSession, "begin", interrupt)
+        golden("design/edit.txt", run("edit", "pad.json", "--port", "0"), forget=[PORT])
+    assert not Path("pad-edited.json").exists()
 
     views: list[dict[str, Any]] = []
     spec = Spec.load(Path("pad.toml"))
@@ -189,19 +178,6 @@ def test_edit(run, golden: Golden, monkeypatch: pytest.MonkeyPatch) -> None:
     words = page_text(served_page("padforge.design.editor", "editor.html", "editor.css", "drawing.js", "editor.js"))
     golden("design/edit_page.txt", words)
     golden("design/edit_messages.json", json_text([{name: view[name] for name in names} for view in views[1:]]))
-
-
-def test_compare(run, golden: Golden, figures: list[Any], bent_pad: Morphology) -> None:
-    """Costs come from who makes the pad."""
-    Morphology.straight((2, 3), (10.0, 12.0)).save("straight.json")
-    variants = comparison.read_variants([Path("pad.json"), Path("straight.json")], [], lambda path: Spec({}))
-    costs = {"force_n": 1.234, "strain_percent": 45.6, "mould_ml": 12.34, "silicone_ml": 7.89, "failed": 2}
-    made = lambda pad, spec, folder: costs if pad == bent_pad else {}  # noqa: E731
-    comparison.compare(variants, Path("out"), SearchOptions(), 3, made)
-    document = document_of("out/comparison.json")
-    golden("design/comparison.json", json_text(document), forget=[VERSIONS], rtol=1e-3)
-    golden("design/comparison.txt", "\n".join(comparison.comparison_lines(document)))
-    golden("design/comparison_figure.txt", figures[-1], rtol=1e-3)
 
 
 def test_names_of_variants(golden: Golden) -> None:

@@ -16,6 +16,7 @@ from padforge.design.objectives.ambiguity import free_presses
 from padforge.design.paths.import_plan import import_plan
 from padforge.design.paths.keep_outs import check_fibre_ends
 from padforge.design.settings import Layout
+from tests.design.objectives.pads import square
 from tests.helpers.golden import Golden
 from tests.helpers.refusals import refusal_table
 
@@ -42,11 +43,6 @@ def keep_out(*polygon: Any) -> Callable[[], None]:
         check_fibre_ends(size, design.RulesSettings())
 
     return use
-
-
-def square(x: float, y: float) -> tuple[tuple[float, float], ...]:
-    """The corners of one of 4 mm."""
-    return (x - 2, y - 2), (x + 2, y - 2), (x + 2, y + 2), (x - 2, y + 2)
 
 
 def depths(depths_mm: object) -> Callable[[], object]:
@@ -78,9 +74,9 @@ VALUES: dict[str, Callable[[], object]] = {
     "a tool too wide for the layer": lambda: solve_press("flat", 1000.0, 0.05, 0.1),
     "a keep-out that crosses itself": keep_out((0, 0), (4, 4), (4, 0), (0, 4)),
     "a keep-out of two corners": keep_out((0, 0), (4, 4)),
-    "a keep-out beside the pad": keep_out(*square(100, 0)),
+    "a keep-out beside the pad": keep_out(*square(100, 0, 4)),
     "a screw by an end": keep_out(-25.0, -15.0, 4.0),
-    "a keep-out by an end": keep_out(*square(-25.0, -15.0)),
+    "a keep-out by an end": keep_out(*square(-25.0, -15.0, 4)),
     "a keep-out of all": keep_out((-28, -30), (28, -30), (28, 30), (-28, 30)),
     "a sensed area": lambda: design.score(Morphology.straight(3), size=PadSettings(sensed_mm=(46, 20))),
     "too many fibres to compare": lambda: design.score(Morphology.random(16, 3000, seed=0), max_failures=0),
@@ -96,7 +92,7 @@ VALUES: dict[str, Callable[[], object]] = {
 
 def test_refusals_of_values(golden: Golden) -> None:
     golden("design/refusals.txt", refusal_table(VALUES))
-    keep_out(*square(-24.0, -15.0))()  # just far enough from the end
+    keep_out(*square(-24.0, -15.0, 4))()  # just far enough from the end
 
 
 def test_refusals_of_twins(golden: Golden, twin: Path, tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ import pytest
 from padforge.common.page import page
 from padforge.design.contact import FIBRE_BLUR_MM, contact_press
 from padforge.design.objectives.score import describe_terms
-from padforge.design.report import contact_lines, contact_sections, design_sections, draw_press, press_sections
+from padforge.design.report import contact_lines, contact_sections, design_sections, press_sections
 from padforge.design.settings import Contact, PadSettings, RulesSettings, SearchSettings
 from tests.helpers.golden import Golden, page_text
 from tests.helpers.less import blank_pictures
@@ -80,12 +80,15 @@ def test_contact_section_and_lines(golden: Golden) -> None:
 
 
 @pytest.mark.parametrize("tool", ["dome", "flat"])
-def test_press_is_drawn_to_scale(golden: Golden, tool: str) -> None:
-    contact = PRESS.model_copy(update={"tool": tool})
-    figure = draw_press(contact, 11.25)
-    golden(f"design/press_{tool}.txt", figure, forget=[r"-?\d\.\d+e-1\d"], rtol=1e-3)
-    section = figure.axes[0]
+def test_press_is_drawn_to_scale(golden: Golden, figures: list[Any], monkeypatch, tool: str) -> None:
+    blank_pictures(monkeypatch)
+    document, contact = design_document(), PRESS.model_copy(update={"tool": tool})
+    document["provenance"]["settings"]["contact"] = contact.model_dump(mode="json")
+    press_sections(document, None)
+    golden(f"design/press_{tool}.txt", figures[0], forget=[r"-?\d\.\d+e-1\d"], rtol=1e-3)
+    section = figures[0].axes[0]
     x_mm, height_mm = np.asarray(section.lines[-1].get_xydata(), float).T  # of the vertical fibres
     heights_mm, press = np.linspace(0, 7.5, 30), contact_press(contact)
     strains = [press.strains(np.abs(x_mm), z, FIBRE_BLUR_MM).compressive for z in heights_mm]
+    assert np.diff(x_mm) == pytest.approx(8.25)
     assert height_mm == pytest.approx(7.5 - np.trapezoid(strains, heights_mm, axis=0), abs=0.03)

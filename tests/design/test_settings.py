@@ -7,35 +7,12 @@ import numpy as np
 import pytest
 
 from padforge import InputError, Spec, design
-from padforge.common.settings import commented_toml, settings_schema
+from padforge.common.settings import commented_toml
 from padforge.design import Contact, Morphology, PadSettings, RulesSettings, SearchSettings, signals
-from padforge.design.settings import (
-    BUILT,
-    PUBLISHED,
-    PUBLISHED_CONTACT,
-    Layout,
-    Scatter,
-    read_contact,
-    sensed_rectangle,
-)
+from padforge.design.settings import PUBLISHED_CONTACT, Layout, Scatter, read_contact, sensed_rectangle
 from tests.helpers.golden import Golden
-from tests.helpers.json_text import json_text
 
 MODELS = {model.section(): model for model in (PadSettings, Contact, SearchSettings, RulesSettings)}
-
-
-@pytest.mark.parametrize("stated", [{}, PUBLISHED, BUILT], ids=["toml", "published", "built"])
-def test_commented_toml_round_trip(stated, request, golden: Golden) -> None:
-    text = commented_toml(MODELS, stated or None)
-    spec = Spec(tomllib.loads(text))
-    for name, model in MODELS.items():
-        assert spec.section(model) == stated.get(name, model())
-    differing = [line for line in text.splitlines() if line not in commented_toml(MODELS).splitlines()]
-    golden(f"design/pad_{request.node.callspec.id}.txt", "\n".join(differing) if stated else text)
-
-
-def test_schema_states_defaults_and_limits(golden: Golden) -> None:
-    golden("design/schema.json", json_text(settings_schema(MODELS)))
 
 
 REFUSED = {

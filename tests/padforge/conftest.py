@@ -68,8 +68,13 @@ def finished(once: Once) -> tuple[Path, str]:
 
 
 @pytest.fixture
-def folder(finished: tuple[Path, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A copy of it, to go on in; what is done again compares contacts as little, and its pictures are blank."""
+def brief(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Pads are compared by few presses, and pictures are blank."""
     compare_little(monkeypatch)
     blank_pictures(monkeypatch)
+
+
+@pytest.fixture
+def folder(finished: tuple[Path, str], tmp_path: Path, brief: None) -> Path:
+    """A copy of it, to go on in."""
     return shutil.copytree(finished[0], tmp_path / "run")

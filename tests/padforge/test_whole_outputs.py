@@ -13,7 +13,6 @@ from padforge.design import Contact, Morphology
 from padforge.design.contact import contact_press, fibre_strains, half_width_mm
 from tests.helpers.door import called
 from tests.helpers.golden import json_text
-from tests.helpers.less import blank_pictures, compare_little
 
 
 def command_names(command: click.Command) -> Iterator[tuple[str, ...]]:
@@ -38,9 +37,7 @@ def test_help_of_padforge_itself(tmp_path: Path, golden) -> None:
     assert (ended.code, ended.out, ended.err) == (2, "", called("-h", cwd=tmp_path).out)
 
 
-def test_comparison_of_two_pads(tmp_path: Path, golden, figures, monkeypatch: pytest.MonkeyPatch) -> None:
-    compare_little(monkeypatch)
-    blank_pictures(monkeypatch)
+def test_comparison_of_two_pads(tmp_path: Path, golden, figures, brief: None) -> None:
     Morphology.straight((2, 3), (8.0, 15.0)).save(tmp_path / "plain.json")
     Morphology.random(2, 3, seed=1).save(tmp_path / "bent.json")
     words = ("design", "compare", "plain.json", "bent.json", "--out", "both")

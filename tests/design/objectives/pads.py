@@ -20,6 +20,12 @@ def only(**limits):
     return NONE.model_copy(update=limits)
 
 
+def square(x, y, side):
+    """The corners of a keep-out, mm."""
+    half = side / 2
+    return ((x - half, y - half), (x + half, y - half), (x + half, y + half), (x - half, y + half))
+
+
 def bent(across, along=2.5, fibre=0):
     """A 4 x 4 grid with one knot of one fibre moved."""
     knots = Morphology.straight(4).knots

@@ -15,12 +15,9 @@ from padforge.design.objectives.bayes_error import (
 )
 from padforge.design.objectives.criterion import evaluation_windows, straight_full_scale
 from padforge.design.settings import PUBLISHED_CONTACT, Scatter
+from tests.design.objectives.pads import square
 
 PLACES = np.stack(np.meshgrid(*[np.linspace(0, 4, 41)] * 2), axis=-1).reshape(-1, 2)
-
-
-def positions(responses: np.ndarray, blur: float = 0.0) -> Positions:
-    return Positions(PLACES, np.zeros(len(PLACES)), responses, np.full(responses.shape, blur))
 
 
 def test_posteriors_match_explicit_covariances(monkeypatch):
@@ -28,19 +25,20 @@ def test_posteriors_match_explicit_covariances(monkeypatch):
     rng, scatter, working = np.random.default_rng(1), Scatter(0.1, 0.3, 0.4), np.array([True, False, True])
     responses = np.sin(PLACES @ rng.standard_normal((2, 3)))
     readings = scatter.sample(responses[rng.integers(len(PLACES), size=6)], rng)
-    found = bayes_positions(readings, positions(responses, 0.01), scatter, working)
+    log_areas = rng.standard_normal(len(PLACES))
+    positions = Positions(PLACES, log_areas, responses, np.full(responses.shape, 0.01))
+    found = bayes_positions(readings, positions, scatter, working)
     x = responses[:, working]
     own = np.array([np.diag(0.1**2 + 0.3**2 * 0.6 * row**2 + 0.01) for row in x])
     covariances = own + 0.3**2 * 0.4 * x[:, :, None] * x[:, None]
     densities = [multivariate_normal(*each) for each in zip(x, covariances, strict=True)]
-    likelihoods = np.array([density.pdf(readings[:, working]) for density in densities]).T
+    likelihoods = np.array([density.pdf(readings[:, working]) for density in densities]).T * np.exp(log_areas)
     expected = likelihoods @ PLACES / likelihoods.sum(axis=1)[:, None]
     assert found == pytest.approx(expected, abs=1e-3)
 
 
 def test_positions_cover_the_pressed_area_once_and_no_keep_out():
-    corner = ((-40.0, -40.0), (-40.0, 0.0), (0.0, 0.0), (0.0, -40.0))
-    size = PadSettings(grid=9, keep_out_mm=(corner,))
+    size = PadSettings(grid=9, keep_out_mm=(square(-20.0, -20.0, 40.0),))
     pad, window = Morphology.straight(size.layout), evaluation_windows(size.sensed)[-1]
     possible = possible_positions(pad, PUBLISHED_CONTACT, size, window, 1.0)
     area = np.ptp(np.array(size.sensed), axis=0).prod() - 40**2 / pad.unit_mm**2

@@ -21,6 +21,7 @@ from padforge.design.objectives.criterion import (
     window_presses,
 )
 from padforge.design.settings import Contact, PadSettings, Scatter
+from tests.design.objectives.pads import square
 
 SIDE, SIZE = 14, np.array([4.0, 4.0])
 PAD = PadSettings(grid=4, sensed_mm=(45.0, 45.0))
@@ -72,8 +73,7 @@ def test_evaluation_windows_tile_the_pressed_area(size):
 
 
 def test_expected_error_ignores_presses_in_keep_outs():
-    corner = ((-30.0, -30.0), (-30.0, 0.0), (0.0, 0.0), (0.0, -30.0))
-    size = PadSettings(grid=4, keep_out_mm=(corner,))
+    size = PadSettings(grid=4, keep_out_mm=(square(-15.0, -15.0, 30.0),))
     presses = window_presses(size, size.sensed, SIDE, np.random.default_rng(0))
     assert presses.free.mean() == pytest.approx(0.75, abs=0.05)
     answers, kept = random_responses(), [[1.0] * 3]
@@ -155,8 +155,8 @@ def test_window_presses_sample_the_remaining_pad_coarsely():
     assert ((presses.far < low - module.WINDOW_MARGIN) | (presses.far > high + module.WINDOW_MARGIN)).any(axis=1).all()
     rest = np.prod(np.diff(np.array(size.sensed), axis=0)) - np.prod(high - low)
     assert 0.5 * rest < len(presses.far) * module.COARSE_STEP**2 < rest
-    corner = ((-40.0, -40.0), (-40.0, 0.0), (0.0, 0.0), (0.0, -40.0))
-    far = window_presses(PadSettings(grid=9, keep_out_mm=(corner,)), window, SIDE, np.random.default_rng(2)).far
+    size = PadSettings(grid=9, keep_out_mm=(square(-20.0, -20.0, 40.0),))
+    far = window_presses(size, window, SIDE, np.random.default_rng(2)).far
     assert 0 < len(far) < len(presses.far)
     assert not (abs(Morphology.straight(9).to_mm(far) + 20) < 20).all(axis=1).any()
 

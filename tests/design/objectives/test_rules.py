@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from scipy.interpolate import PchipInterpolator
 
 from padforge.design import Morphology, crossings
 from padforge.design.contact import fibre_axes
@@ -38,16 +37,6 @@ def test_min_mean_bend_radius_passes_kinks_up_to_half_a_radian(rise, breaks):
     assert (turn > 0.5) == breaks
     assert [v.measured for v in found] == ([pytest.approx(1.5 / turn, rel=1e-3)] if breaks else [])
     assert all(v.place_mm == pytest.approx((0, rise * 11.25), abs=1.6) for v in found)
-
-
-def test_max_length_matches_scipy_curve():
-    pad = bent(3.0, fibre=5)
-    (found,) = check_rules(pad, only(max_length_mm=5 * 11.25 + 0.1))
-    at = np.linspace(0, 5, 200_001)
-    curve = PchipInterpolator(pad.knots[5, :, 1], pad.knots[5, :, 0])(at)
-    assert (found.rule, found.fibres, found.place_mm) == ("max_length_mm", (6,), None)
-    assert found.measured == pytest.approx(11.25 * np.hypot(np.diff(at), np.diff(curve)).sum(), rel=1e-5)
-    assert found.limit == 5 * 11.25 + 0.1
 
 
 def slanting(rise=0.12):

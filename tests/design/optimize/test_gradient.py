@@ -19,7 +19,6 @@ from padforge.design.optimize.gradient import (
     GradientSearch,
     Parametrization,
     border_width,
-    initial_paths,
 )
 from padforge.design.optimize.problem import SearchProblem
 from padforge.design.paths.curves import refine
@@ -35,10 +34,9 @@ PAD, FREE = PadSettings(grid=2, sensed_mm="fibres"), RulesSettings(enforce=False
 BRIEF = PUBLISHED_SEARCH.model_copy(update={"starts": 1, "steps": 20, "max_failures": 1, "knots": 6})
 
 
-def begun(search, rules, start=0, state=None, pad=PAD, contact=PUBLISHED_CONTACT):
-    return GradientSearch(
-        SearchProblem(pad, tuple(served_contacts(contact, search).values()), search, rules), start, state
-    )
+def begun(search, rules):
+    contacts = tuple(served_contacts(PUBLISHED_CONTACT, search).values())
+    return GradientSearch(SearchProblem(PAD, contacts, search, rules), 0)
 
 
 def advance(run, steps):
@@ -47,9 +45,9 @@ def advance(run, steps):
             run.advance()
 
 
-def finished(search, rules, start=0):
+def finished(search, rules):
     """Fibres after all steps and repair."""
-    run = begun(search, rules, start)
+    run = begun(search, rules)
     while not run.done:
         run.advance()
     return run.morphology()
@@ -75,26 +73,6 @@ def test_steps_of_adam_ignore_what_is_no_number():
     variable = np.array([0.3, -1.0, 2.0])
     Adam([variable]).step((np.array([np.nan, np.inf, -np.inf]),), 0.1)
     assert variable.tolist() == [0.3, -1.0, 2.0]
-
-
-def test_initial_paths_from_an_origin_are_it_and_near_it():
-    def begin(origin, start):
-        return initial_paths(PadSettings(), RulesSettings(), 5, origin, start, np.random.default_rng(start))
-
-    origin = Morphology.random(4, 5, seed=3)
-    assert np.array_equal(begin(origin, 0), origin.knots)
-    assert 0 < np.abs(begin(origin, 1) - origin.knots).max() < 1
-    straight = begin(Morphology.straight(4), 0)
-    assert 0 < np.abs(straight[:4, :, 1] - np.arange(1, 5)[:, None]).max() < 1
-
-
-def test_every_second_start_is_nearly_straight_the_others_zigzags():
-    """The former within a tenth of a grid unit or so, and clear of the slopes without a gradient of straight ones."""
-    size, rng = PadSettings(), np.random.default_rng(0)
-    paths = [initial_paths(size, RulesSettings(), 21, None, start, rng) for start in range(4)]
-    offsets = [np.abs(each[:4, :, 1] - np.arange(1, 5)[:, None]) for each in paths]
-    assert [each.max() < 0.5 for each in offsets] == 2 * [False, True]
-    assert all((each[:, 1:-1] > 0).all() for each in offsets if each.max() < 0.5)
 
 
 def test_gradient_search_for_several_contacts_serves_each():
@@ -138,23 +116,6 @@ def test_refine_keeps_knots_and_curve(more, seed):
         assert np.isin(old[:, axis], new[:, axis]).all()
         curve = PchipInterpolator(old[:, axis], old[:, 1 - axis])
         assert new[:, 1 - axis] == pytest.approx(curve(new[:, axis]), abs=1e-12)
-
-
-def test_gradient_search_resumes_bit_for_bit():
-    """Before the first step, amid the steps, before the repair and in it."""
-    asked = SearchSettings(knots=3, steps=10, max_failures=0, contacts="assumed"), RulesSettings(max_length_mm=34)
-    unbroken = begun(*asked)
-    advance(unbroken, 20)
-    assert unbroken.step == 20
-    for broken_at in (0, 7, 10, 15):
-        broken = begun(*asked)
-        advance(broken, broken_at)
-        resumed = begun(*asked, state={name: array.copy() for name, array in broken.state().items()})
-        advance(resumed, 20 - broken_at)
-        first, second = unbroken.state(), resumed.state()
-        assert first.keys() == second.keys()
-        for name in first:
-            np.testing.assert_array_equal(first[name], second[name], strict=True)
 
 
 @pytest.mark.parametrize(

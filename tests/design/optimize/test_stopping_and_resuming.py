@@ -116,10 +116,14 @@ def test_executor_that_hangs_is_left_at_the_end_of_the_budget_or_on_a_second_ctr
 
 
 @pytest.mark.parametrize("method", ["descent", "genetic"])
-def test_search_broken_off_anywhere_resumes_as_if_unbroken(method, tmp_path):
-    """The report raises, as a kill would end it, again and again; every attempt goes on from the last state."""
+def test_search_broken_off_anywhere_resumes_as_if_unbroken(method, tmp_path, monkeypatch):
+    """The report raises, as a kill would end it, again and again; every attempt goes on from the last state.
+
+    Also if the state of the first start is lost, which then comes to its end after the others.
+    """
     settings = SMALL.model_copy(update={"method": method, "steps": 10})
     unbroken, kills, resumed = search(PAD, None, settings, FREE), 0, None
+    monkeypatch.setattr(stopping, "SLICE_S", -1.0)  # a state is kept after every step
 
     def report(*progress):
         reported.append(progress)
@@ -134,7 +138,10 @@ def test_search_broken_off_anywhere_resumes_as_if_unbroken(method, tmp_path):
             kills += 1
             assert kills < 30, "it does not get on"
     assert kills > 0
-    assert (resumed.morphology, resumed.history) == (unbroken.morphology, unbroken.history)
+    (tmp_path / "search" / "start_0000.npz").unlink()
+    again = search(PAD, None, settings, FREE, run=SearchOptions(keep_in=tmp_path / "search", resume=True))
+    for result in (resumed, again):
+        assert (result.morphology, result.history) == (unbroken.morphology, unbroken.history)
 
 
 def test_checkpoints_remove_no_files_of_others(tmp_path):

@@ -6,13 +6,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-import shapely
 from ezdxf import new, units  # pyright: ignore[reportPrivateImportUsage]
 
 from padforge import InputError
 from padforge.design import Morphology, flatten
 from padforge.design.paths.import_plan import import_plan
-from tests.design.conftest import LAYOUT
+from tests.design.conftest import LAYOUT, max_distance_mm
 from tests.helpers.golden import Golden
 
 STRAIGHT = "M -20 6 L 20 6", *(f"M {x} -18 L {x} 18" for x in (0, 10))
@@ -41,12 +40,6 @@ PATHS = paths(*WAYS)
 def plain(tmp_path_factory) -> Morphology:
     """What the paths are."""
     return import_plan(svg(tmp_path_factory.mktemp("plain"), PATHS), LAYOUT, 0.4).pad
-
-
-def max_distance_mm(one: Morphology, other: Morphology) -> float:
-    """Greatest distance of fibres, mm."""
-    lines = ([shapely.LineString(pad.to_mm(line)) for line in flatten(pad, 1e-5)] for pad in (one, other))
-    return max(a.hausdorff_distance(b) for a, b in zip(*lines, strict=True))
 
 
 DRAWN = [

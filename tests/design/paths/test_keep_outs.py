@@ -12,12 +12,7 @@ from padforge.design.objectives.rules import check_rules
 from padforge.design.paths.curves import bend_radius, rolled_turns
 from padforge.design.paths.keep_outs import is_outside, keep_outs, pass_keep_outs, straight_paths
 from padforge.design.settings import Layout, PadSettings, RulesSettings
-from tests.design.objectives.pads import only
-
-
-def square(x, y, side):
-    half = side / 2
-    return ((x - half, y - half), (x + half, y - half), (x + half, y + half), (x - half, y + half))
+from tests.design.objectives.pads import only, square
 
 
 def kept_off(*polygons, counts=(3, 6), pitch_mm=(8.0, 15.0)):
