@@ -33,11 +33,10 @@ from padforge.sense.rig.arms.printer_link import (
     parse_position,
 )
 from padforge.sense.rig.devices import ArmState, Array, RigFault
-from padforge.sense.rig.safety import check_finite_move, check_probe
+from padforge.sense.rig.safety import MAX_STATE_AGE_S, check_finite_move, check_probe
 from padforge.sense.settings import RigSettings
 
 CONNECT_S = 3.0  # longest wait for a printer that restarts as its port is opened
-STALE_S = 0.5  # maximum age of a state
 SETTINGS = ("G21", "G90", "M220 S100", "M211 S1", "M84 S0")
 """Millimetres, absolute positions, speeds at 100 %, software endstops on, motors always energized."""
 
@@ -281,8 +280,8 @@ class Printer:
     def state(self) -> ArmState:
         """Return the latest state; see `Arm.state`."""
         state = self._connected().latest
-        if (age_s := clock.now() - state.time_s) > STALE_S:
-            message = f"the printer's last answer is {age_s:.2f} s old; allowed {STALE_S} s"
+        if (age_s := clock.now() - state.time_s) > MAX_STATE_AGE_S:
+            message = f"the printer's last answer is {age_s:.2f} s old; allowed {MAX_STATE_AGE_S} s"
             raise RigFault("stale", message, "it may be busy: look at its display")
         return state
 

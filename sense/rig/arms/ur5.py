@@ -19,13 +19,12 @@ from padforge.sense.recording.run_directory import STATE_COLUMNS
 from padforge.sense.rig import clock
 from padforge.sense.rig.arms.rtde import stop_program
 from padforge.sense.rig.devices import ArmState, Array, Cause, Pose, RigFault
-from padforge.sense.rig.safety import check_finite_move
+from padforge.sense.rig.safety import MAX_STATE_AGE_S, check_finite_move
 from padforge.sense.settings import RigSettings
 
 SUPERVISION_S = 2.0  # heartbeats end this long after the program last asked for a state
 CONNECT_S = 4.5  # longest wait for the link
 MOVE_S = 1.0  # longest wait for the arm to accept a move
-STALE_S = 0.5  # maximum age of a state
 
 
 class RtdeWorker:
@@ -177,8 +176,8 @@ class UR5:
         worker.renew_watch()
         state = worker.latest
         age_s = np.inf if state is None else clock.now() - state.time_s
-        if state is None or age_s > STALE_S:
-            raise RigFault("stale", f"the last state of the arm is {age_s:.2f} s old; allowed {STALE_S} s")
+        if state is None or age_s > MAX_STATE_AGE_S:
+            raise RigFault("stale", f"the last state of the arm is {age_s:.2f} s old; allowed {MAX_STATE_AGE_S} s")
         return replace(state, moving=state.moving or state.time_s < self._move_s)
 
     def drain(self) -> Array:

@@ -21,8 +21,7 @@ from rosbags.rosbag2 import Reader
 from padforge.common.validation import InputError
 from padforge.sense import Recording
 from padforge.sense.formats import ros_recording
-from padforge.sense.formats.annotations import FaultAnnotation, ModelAnnotations
-from padforge.sense.formats.import_export import export_file, import_file
+from padforge.sense.formats.import_export import import_file
 from padforge.sense.formats.ros_messages import choose_epoch, to_stamps
 from padforge.sense.formats.ros_recording import export_bag, import_bag
 
@@ -69,21 +68,6 @@ def test_export_bag_round_trip_is_reproducible(eight: Recording, bag: Path, tmp_
     with Reader(bag) as reader:  # rosbag2 tells whoever comes later what is in the recording
         durability = {each.topic: each.ext.offered_qos_profiles[0].durability for each in reader.connections}  # pyright: ignore
     assert {topic for topic, how in durability.items() if how == QosDurability.TRANSIENT_LOCAL} == {"/pad/recording"}
-
-
-def test_bag_with_annotations_and_poses_of_an_arm_is_imported_without_them(eight: Recording, tmp_path: Path) -> None:
-    positions = np.full((8, 2), 3.0), np.full((8, 2), [0.5, 0.25])
-    faults = [FaultAnnotation(5, (1,), "open", "fibre 2 is open")]
-    annotations = ModelAnnotations(*positions, np.ones(8), np.full(8, np.nan), np.full(8, np.nan), faults, (3,))
-    states = np.zeros((4, 10))
-    states[:, 0] = [-5, 1, 2, np.nan]  # stamps cannot hold the first and the last
-    export_bag(eight, tmp_path / "r.mcap", annotations, states)
-    topics, _ = read_by_mcap(tmp_path / "r.mcap")
-    assert [stamp for stamp, _ in topics["/arm/pose"]] == [10**9, 2 * 10**9]
-    assert len(topics["/pad/touches"]) == 8
-    assert import_bag(tmp_path / "r.mcap") == eight
-    with pytest.raises(InputError, match=r"predictions of a model can be written as \.mcap"):
-        export_file(eight, tmp_path / "r.csv", annotations=annotations)
 
 
 @given(st.floats(-1e6, 2e9) | st.builds(operator.sub, st.integers(-(10**6), 10**6), st.floats(0, 1e-9)))
