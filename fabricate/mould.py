@@ -145,13 +145,13 @@ def conductive_plan(plan: Plan) -> Plan:
     return replace(plan, settings=replace(plan.settings, mould=mould))
 
 
-def well_outlines(plan: Plan, sides: int = 64) -> list[BaseGeometry]:
+def well_outlines(plan: Plan) -> list[BaseGeometry]:
     """Return the outlines of the wells at the ends of the ridges of every layer, as regular polygons, mm."""
-    wells = [fibre_wells(plan, fibre, sides) for fibre in range(plan.pad.layout.fibres)]
+    wells = [fibre_wells(plan, fibre) for fibre in range(plan.pad.layout.fibres)]
     return [shapely.union_all([wells[fibre] for fibre in fibres]) for fibres in plan.layers]
 
 
-def fibre_wells(plan: Plan, fibre: int, sides: int) -> BaseGeometry:
+def fibre_wells(plan: Plan, fibre: int, sides: int = 64) -> BaseGeometry:
     """Return the outlines of the two wells of a fibre, as regular polygons, mm."""
     discs = []
     for lead in plan.leads.pairs[fibre]:

@@ -128,7 +128,8 @@ def locate_on_bed(rig: RigSettings, folder: Path) -> RigSettings:
     x, y = rig.pad_mm or frame.centre_mm
     contact = frame.surface_mm if rig.contact_mm is None else rig.contact_mm
     half_x, half_y = (side / 2 for side in np.broadcast_to(frame.pad_mm, 2).tolist())
-    if round(frame.angle_deg / 90) % 2:  # quarter turn of the pad on the bed
+    angle_deg = rig.pad_angle_deg + frame.angle_deg
+    if round(angle_deg / 90) % 2:  # quarter turn of the pad on the bed
         half_x, half_y = half_y, half_x
     width, depth, height = frame.bed_mm
     dx, dy, dz = rig.tcp_mm or (0.0, 0.0, 0.0)
@@ -143,7 +144,7 @@ def locate_on_bed(rig: RigSettings, folder: Path) -> RigSettings:
             "mirrored": frame.mirrored if rig.mirrored is None else rig.mirrored,
             "contact_mm": contact,
             "box_mm": rig.box_mm or box,
-            "pad_angle_deg": rig.pad_angle_deg + frame.angle_deg,
+            "pad_angle_deg": angle_deg,
         }
     )
 

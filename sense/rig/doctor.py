@@ -39,7 +39,7 @@ def examine_board(board: Board) -> list[Diagnosis]:
     finally:
         board.close()
     rate_hz = (len(times_s) - 1) / (times_s[-1] - times_s[0]) if len(times_s) > 1 else 0.0
-    nominal_hz = float(identity.get("rate_hz", rate_hz))
+    nominal_hz = float(identity["rate_hz"])
     is_on_rate = abs(rate_hz / nominal_hz - 1) < 0.01
     inputs, supply_v = identity["inputs"], identity.get("supply_v", np.inf)
     return [

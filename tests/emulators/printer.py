@@ -66,14 +66,13 @@ class Firmware:
         self._max_mm_s, self._max_mm_s2, self._bed_mm = max_mm_s, max_mm_s2, bed_mm
         self._emergency_parser, self._realtime = emergency_parser, realtime
         self.moves: list[ExecutedMove] = [ExecutedMove(-math.inf, StraightMove(position, position, 1.0, 1.0), 0.0)]
-        self._origin: Position = (0.0, 0.0, 0.0)
         self._acceleration, self._feed = 500.0, 25.0
         self._text, self._lines = bytearray(), deque[bytes]()
         self._last_number = 0
         self._out = bytearray()
         self._waiting = False
         self._last_busy_s = self._busy_until_s = -math.inf
-        self.halted, self.homed = False, True
+        self.halted = False
 
     def position(self, time_s: float) -> Position:
         """Return the true position of the nozzle at a time, mm."""
@@ -92,17 +91,13 @@ class Firmware:
         self._lines.clear()
 
     def restart(self, now_s: float) -> None:
-        """Restart, as after a reset: wherever the nozzle is, the firmware takes it for 0, 0, 0."""
+        """Restart, as after a reset."""
         self._cut(now_s)
-        self._origin, self.homed, self.halted, self._last_number = self.position(now_s), False, False, 0
+        self.halted, self._last_number = False, 0
         self._text.clear()
         self._lines.clear()
         self._busy_until_s = -math.inf
         self._say("start", "Marlin 2.1.2", "echo: Last Updated: 2023-07-16 | Author: (none, default config)")
-
-    def home(self, now_s: float) -> None:
-        """Learn the true position, as after a person has homed it."""
-        self._origin, self.homed = (0.0, 0.0, 0.0), True
 
     def receive(self, data: bytes, now_s: float) -> None:
         """Take bytes from the host."""
@@ -172,10 +167,8 @@ class Firmware:
 
     def _do_g1(self, words: dict[str, str], now_s: float) -> None:
         start = self._planned_position()
-        reported = (float(words.get(axis, value)) for axis, value in zip("XYZ", self._to_reported(start), strict=True))
-        x, y, z = (value + origin for value, origin in zip(reported, self._origin, strict=True))
-        if self.homed:  # software endstops clip axes that were homed
-            x, y, z = (min(max(value, 0.0), limit) for value, limit in zip((x, y, z), self._bed_mm, strict=True))
+        end = (float(words.get(axis, value)) for axis, value in zip("XYZ", start, strict=True))
+        x, y, z = (min(max(value, 0.0), limit) for value, limit in zip(end, self._bed_mm, strict=True))  # endstops
         self._feed = float(words["F"]) / 60 if "F" in words else self._feed
         move = StraightMove(start, (x, y, z), self._feed, self._acceleration).limit_axes(
             self._max_mm_s, self._max_mm_s2
@@ -184,11 +177,8 @@ class Firmware:
             start_s = max(now_s + START_S, self.moves[-1].end_s)
             self.moves.append(ExecutedMove(start_s, move, move.duration_s))
 
-    _do_g0 = _do_g1
-
     def _do_m114(self, words: dict[str, str], now_s: float) -> None:
-        position = self.position(now_s) if self._realtime and "R" in words else self._planned_position()
-        x, y, z = self._to_reported(position)
+        x, y, z = self.position(now_s) if self._realtime and "R" in words else self._planned_position()
         counts = [round(value * steps) for value, steps in zip((x, y, z), STEPS_PER_MM, strict=True)]
         self._say(f"X:{x:.2f} Y:{y:.2f} Z:{z:.2f} E:0.00 Count X:{counts[0]} Y:{counts[1]} Z:{counts[2]}")
 
@@ -223,10 +213,6 @@ class Firmware:
         *moves, last = [move for move in self.moves if move.start_s < now_s]
         self.moves = [*moves, replace(last, duration_s=min(last.duration_s, now_s - last.start_s))]
 
-    def _to_reported(self, position: Position) -> Position:
-        x, y, z = (value - origin for value, origin in zip(position, self._origin, strict=True))
-        return x, y, z
-
     def _say(self, *lines: str) -> None:
         self._out += "".join(f"{line}\n" for line in lines).encode("ascii", "replace")
 
@@ -246,7 +232,6 @@ class EmulatedPrinter(SerialDevice):
 
     halt = partialmethod(_change, "kill")  # the firmware finds a fault and stops for good
     restart = partialmethod(_change, "restart")  # it no longer knows where it is
-    home = partialmethod(_change, "home")  # as a person does at the display
     busy = partialmethod(_change, "busy")  # take no command for some seconds: a person is at the display
 
     def true_positions(self, times_s: ArrayLike) -> Array:

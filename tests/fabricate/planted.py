@@ -9,21 +9,21 @@ from padforge.design.morphology import Morphology, assemble_knots
 from padforge.fabricate.settings import DEFAULTS, FabricationSettings
 
 
-def level_pad(first: float, second: float, pitch_mm: float = 10.0) -> Morphology:
+def level_pad(first: float, second: float) -> Morphology:
     """A pad of 2 x 2 whose horizontals run level at y = `first` and `second` (grid units) from x = 1 to 2."""
     inner = np.empty((4, 2, 2))
     inner[:2, :, 0] = (1, 2)
     inner[:2, :, 1] = [[first], [second]]
     inner[2:, :, 0] = [[1], [2]]
     inner[2:, :, 1] = (1, 2)
-    return Morphology(assemble_knots(inner), pitch_mm)
+    return Morphology(assemble_knots(inner), 10.0)
 
 
-def winding_pad(*places: tuple[float, float], pitch_mm: float = 10.0) -> Morphology:
+def winding_pad(*places: tuple[float, float]) -> Morphology:
     """A pad of 1 x 1 whose horizontal fibre runs through places (grid units, 0..2); its vertical one is straight."""
     along = 2 * np.arange(1, len(places) + 1) / (len(places) + 1)
     vertical = np.stack([np.ones(len(places)), along], axis=1)
-    return Morphology(assemble_knots(np.stack([np.array(places, dtype=float), vertical])), pitch_mm)
+    return Morphology(assemble_knots(np.stack([np.array(places, dtype=float), vertical])), 10.0)
 
 
 def with_settings(

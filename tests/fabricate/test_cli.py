@@ -2,7 +2,6 @@
 
 import io
 import json
-from pathlib import Path
 from typing import Any, cast
 
 import ezdxf
@@ -11,7 +10,7 @@ from click.testing import CliRunner
 
 from padforge.design.morphology import Morphology
 from padforge.fabricate import export
-from padforge.fabricate.cli import fabricate, mould_lines
+from padforge.fabricate.cli import fabricate
 from padforge.fabricate.outputs.pictures import draw_crossing, draw_orientation
 from tests.fabricate.planted import level_pad
 from tests.helpers.golden import json_text
@@ -118,9 +117,9 @@ def test_files_and_lines_of_a_mould(name, tmp_path, golden, figures, monkeypatch
 def test_lines_and_documents_of_checks(tmp_path, golden, figures):
     level_pad(1.8, 1.2).save(tmp_path / "crossed.json")
     (tmp_path / "two.toml").write_text('[mould]\nlevels = "two"\n[printer]\nnozzle_mm = 0.6\n')
-    (tmp_path / "small.toml").write_text("[printer]\nbed_mm = [30, 30, 100]\n")
+    (tmp_path / "small.toml").write_text("[printer]\nbed_mm = [30, 30, 100]\n[mould]\nmin_silicone_mm = 3.0\n")
+    lines = [invoke(tmp_path / "crossed.json", "--formats", "", "--out", tmp_path).output]
     invoke(tmp_path / "crossed.json", "--formats", "stl", "--out", tmp_path)
-    lines = []
     (tmp_path / "plain.toml").write_text("")
     checks = (("mould.stl", "plain"), ("crossed.json", "two"), ("crossed.json", "small"), ("mould.stl", "small"))
     words: list[Any] = []
@@ -130,31 +129,12 @@ def test_lines_and_documents_of_checks(tmp_path, golden, figures):
         result = invoke(*words, "--picture", tmp_path / "findings.png")
         lines += [f"{file} {spec}: exit code {result.exit_code}", result.output]
     golden("fabricate/checked.txt", "\n".join(lines))
-    assert lines[0] == "mould.stl plain.toml: exit code 0"  # warnings alone
-    assert "warn" in lines[1]
+    assert lines[1] == "mould.stl plain.toml: exit code 0"  # warnings alone
+    assert "warn" in lines[2]
     document = json.loads(invoke(*words, "--json").output)
     golden("fabricate/checked.json", json_text(document))
     for number, figure in enumerate(figures[-3:], 1):
         golden(f"fabricate/checked_{number}.txt", figure)
-
-
-def test_lines_of_a_mould_name_three_places_and_count_the_others():
-    places = [(1.04, -2.06), (3.0, 4.0), (5.0, 6.0), (7.0, 8.0), (9.0, 0.0)]
-    findings = [
-        {"name": name, "status": status, "message": f"is {status}", "positions_mm": positions}
-        for name, status, positions in (("bed", "pass", []), ("thin", "warn", places), ("wall", "fail", []))
-    ]
-    document = {"size_mm": [60.123, 50.5, 8.0], "silicone_volume_ml": 20.06, "files": ["mould.3mf", "tracks.svg"]}
-    assert mould_lines(document | {"findings": findings}, Path("out")) == [
-        f"mould: 60.12 x 50.5 x 8 mm, 20.1 ml of silicone -> {Path('out/mould.3mf')}",
-        "  1 checks passed",
-        "  warn thin: is warn at (1.0, -2.1) (3.0, 4.0) (5.0, 6.0) and 2 more places",
-        "  FAIL wall: is fail",
-    ]
-    assert mould_lines(document | {"findings": [], "files": []}, Path("out")) == [
-        f"mould: 60.12 x 50.5 x 8 mm -> {Path('out/fabrication.json')}",
-        "  0 checks passed, no warnings",
-    ]
 
 
 def test_json_of_a_build_is_its_document(tmp_path):

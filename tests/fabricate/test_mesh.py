@@ -20,11 +20,11 @@ VERTICES, TRIANGLES = np.asarray(BOX.vertices), np.asarray(BOX.faces)
 CORE = "http://schemas.microsoft.com/3dmanufacturing/core/2015/02"
 
 
-def written(path: Path, vertices: np.ndarray = VERTICES, triangles: np.ndarray = TRIANGLES, title: str = "box") -> Path:
+def written(path: Path, vertices: np.ndarray = VERTICES, title: str = "box") -> Path:
     if path.suffix == ".stl":
-        write_stl(path, vertices, triangles)
+        write_stl(path, vertices, TRIANGLES)
     else:
-        write_3mf(path, vertices, triangles, name="mould", title=title, material=title)
+        write_3mf(path, vertices, TRIANGLES, name="mould", title=title, material=title)
     return path
 
 

@@ -17,7 +17,7 @@ from padforge.design.morphology import Morphology
 from padforge.design.paths.curves import Crossing
 from padforge.design.settings import FIBRE_MM, read_contact
 from padforge.fabricate.mould import mould_body
-from padforge.fabricate.plan import COVER_MM, INTO_WALL_MM, Plan, assign_layers, draw_number
+from padforge.fabricate.plan import COVER_MM, Plan, assign_layers, draw_number
 from padforge.sense.rig.config import RobotFrame
 from padforge.sense.settings import RigSettings
 from tests.fabricate.planted import exact_fibre, level_pad, with_settings
@@ -37,22 +37,13 @@ def test_ridges_follow_the_curves_within_the_tolerance(tolerance_mm):
         assert curves.buffer(0.2 - tolerance_mm, quad_segs=16).intersection(inside).within(ridge)
 
 
-def test_ridges_run_into_the_walls_at_both_ends():
-    border_mm = 3.0
-    plan = Plan(Morphology.random(3, 4, seed=2), with_settings({"border_mm": border_mm}))
-    side = plan.pad.layout.size_mm[0] / 2 + border_mm
-    assert plan.cavity.bounds == pytest.approx((-side, -side, side, side))
-    ends = np.array([line.coords[0] for line in plan.lines[:3]])
-    assert ends[:, 0] == pytest.approx(-side - plan.settings.mould.exit_mm - INTO_WALL_MM)
-    assert ends[:, 1] == pytest.approx(plan.pad.to_mm([[0, 1], [0, 2], [0, 3]])[:, 1])
-    for line in plan.lines:
-        assert shapely.within(line, plan.tray)
-
-
-def test_shrinkage_compensated_plan_shrinks_to_the_pad():
-    plan = Plan(Morphology.random(3, 4, seed=2), with_settings({"border_mm": 1.0}, silicone={"shrinkage": 0.03}))
+@pytest.mark.parametrize("leads", ["edges", "one side"])
+def test_shrinkage_compensated_plan_shrinks_to_the_pad(leads):
+    settings = with_settings({"border_mm": 1.0}, pad={"leads": leads}, silicone={"shrinkage": 0.03})
+    plan = Plan(Morphology.random(3, 4, seed=2), settings)
     mould = plan.shrinkage_compensated
-    assert mould.cavity.bounds[2] * 0.97 == pytest.approx(plan.cavity.bounds[2], rel=1e-12)
+    assert np.array(mould.cavity.bounds) * 0.97 == pytest.approx(plan.cavity.bounds, rel=1e-12)
+    assert mould.lengths_mm * 0.97 == pytest.approx(plan.lengths_mm)
     for larger, slot in zip(mould.exits, plan.exits, strict=True):
         assert np.array(larger.bounds) * 0.97 == pytest.approx(slot.bounds, rel=1e-12)
     for fibre, larger in enumerate(mould.lines):

@@ -94,15 +94,6 @@ def test_one_side_leads_keep_their_spacing(fibres, pitches, border):
     assert np.diff(exits).min() > apart - 1e-6
 
 
-def test_leads_are_compensated_for_shrinkage():
-    plan = Plan(
-        PAD, replace(settings(PAD, leads="one side"), silicone=DEFAULTS.silicone.model_copy(update={"shrinkage": 0.01}))
-    )
-    large = plan.shrinkage_compensated
-    assert np.array(large.cavity.bounds) * 0.99 == pytest.approx(plan.cavity.bounds)
-    assert large.lengths_mm * 0.99 == pytest.approx(plan.lengths_mm)
-
-
 def test_holder_slots_are_at_the_mirrored_leads():
     pad = Morphology.straight((1, 3), (9.0, 12.0))
     plan = Plan(pad, settings(pad, {"holder": True}, leads="one side"))

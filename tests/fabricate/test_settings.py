@@ -95,15 +95,6 @@ def test_shrinkage_compensated_scales_lengths_of_the_pad():
     assert asked.shrinkage_compensated().shrinkage_factor == 1
 
 
-@pytest.mark.parametrize(("layer_mm", "shrinkage"), [(0.1, 1e-3), (0.2, 0.13)])
-def test_shrinkage_compensated_keeps_whole_layers(layer_mm, shrinkage):
-    asked = with_settings(printer={"layer_mm": layer_mm}, silicone={"shrinkage": shrinkage})
-    for key in ("silicone_mm", "deep_ridge_height_mm", "shallow_ridge_height_mm"):
-        height = getattr(asked.shrinkage_compensated().mould, key)
-        assert height / layer_mm == pytest.approx(round(height / layer_mm))
-        assert height * (1 - shrinkage) == pytest.approx(getattr(asked.mould, key), abs=layer_mm / 2)
-
-
 @pytest.mark.parametrize(("written", "preset"), [("ecoflex 0030", "Ecoflex 00-30"), ("Published", "published")])
 def test_preset_names_ignore_case_spaces_and_hyphens(written, preset):
     settings = SiliconeSettings(name=written)

@@ -87,7 +87,11 @@ def test_ridge_walls_are_as_long_as_exact_offsets():
 
 @pytest.mark.parametrize(
     ("pad", "mould"),
-    [(SOFT, {}), pytest.param(Morphology.random(1, 6, seed=3), {"ridge_width_mm": 0.8}, marks=pytest.mark.slow)],
+    [
+        (SOFT, {}),
+        (Morphology.random(2, 3, seed=3), {"ridge_width_mm": 1.5}),
+        pytest.param(Morphology.random(1, 6, seed=3), {"ridge_width_mm": 0.8}, marks=pytest.mark.slow),
+    ],
 )
 def test_ridge_edges_are_half_a_width_from_exact_fibres(pad, mould):
     """Thousands of places on the kernel's own curves, against scipy's own PCHIP."""
@@ -189,7 +193,7 @@ def test_assemble_places_bodies_side_by_side():
     settings = with_settings({"lid": True, "pins": True, "spout": True, "holder": True, "conductive": True})
     plan = Plan(SOFT, settings)
     wells = conductive_plan(plan)
-    second = mould_body(wells, well_outlines(wells, sides=512))
+    second = mould_body(wells, well_outlines(wells))
     bodies = {"mould": mould_body(plan), "lid": lid_body(plan), "conductive": second, "holder": holder_body(wells)}
     built = build_parts(plan, bodies)
     assert max(part.deviation for parts in built.values() for part in parts) < 5e-4  # meshes have polygons for circles

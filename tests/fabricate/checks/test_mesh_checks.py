@@ -5,13 +5,11 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-import pytest
 import shapely
 import trimesh
 from manifold3d import CrossSection, Manifold
 
 from padforge.design.morphology import Morphology
-from padforge.fabricate.checks.mesh_checks import SOLID_CHECKS, check_triangles
 from padforge.fabricate.mesh import mesh_arrays, mould_mesh
 from padforge.fabricate.plan import Plan
 from padforge.fabricate.settings import PrinterSettings
@@ -255,10 +253,3 @@ def test_findings_of_meshes(golden):
         findings = check_body(make(), **options | {"printer": printer})
         lines += [title, *finding_lines(findings.values(), passed=title in WITH_PASSED)]
     golden("fabricate/findings_of_meshes.txt", "\n".join(lines))
-
-
-@pytest.mark.parametrize("dtype", [np.float32, np.float64])
-def test_mesh_of_nothing_has_no_body(dtype):
-    findings = check_triangles(np.empty((0, 3), dtype), np.empty((0, 3), dtype=int), genus=0)
-    assert {f.name for f in findings if f.status == "fail"} >= {"bodies", "volume"}
-    assert [f.name for f in findings][:5] == list(SOLID_CHECKS)

@@ -9,7 +9,6 @@ from scipy.interpolate import PchipInterpolator
 
 from padforge.design.morphology import Morphology
 from padforge.fabricate.fibre_placement import Stroke, plan_toolpath
-from padforge.fabricate.outputs.laying_page import laying_document
 from padforge.fabricate.plan import Plan
 from tests.fabricate.planted import with_settings
 
@@ -70,10 +69,3 @@ def test_feed_in_a_bend_follows_from_its_radius(radius_mm, acceleration, stretch
     slow_mm = horizontal.steps_mm[horizontal.feeds_mm_s == feed].sum()
     ends_mm = 4 * 2 * 0.3  # of both quarters: beside them the needle has half a diameter to get slower in
     assert slow_mm == pytest.approx(math.pi * radius_mm if feed < 10 else horizontal.steps_mm.sum(), abs=ends_mm)
-
-
-def test_strokes_have_the_cut_length_of_the_laying_page():
-    plan = Plan(Morphology.random(2, 5, seed=3))
-    cut = [fibre["cut_mm"] for fibre in laying_document(plan, 1.0)["fibres"]]
-    for stroke in strokes(plan):
-        assert stroke.steps_mm.sum() == pytest.approx(cut[stroke.fibre], abs=0.02)

@@ -18,7 +18,6 @@ from tests.fabricate.planted import with_settings
 
 PAD = Morphology.random(3, 3, seed=7)
 SVG = "{http://www.w3.org/2000/svg}"
-INKSCAPE = "{http://www.inkscape.org/namespaces/inkscape}"
 TONGUES = [{"exit_mm": 0.0}, {"border_mm": 2.0}]
 
 

@@ -9,36 +9,17 @@ import shapely
 from scipy.integrate import quad
 
 from padforge.design.morphology import Morphology
+from padforge.fabricate.export import build
 from padforge.fabricate.mesh import mould_mesh
-from padforge.fabricate.mould import sizes
 from padforge.fabricate.outputs.laying_page import (
     PRINT_SETTINGS_HEAD,
     laying_document,
     laying_page,
-    pad_document,
     print_settings_rows,
 )
 from padforge.fabricate.plan import Plan
 from padforge.fabricate.settings import MouldSettings, PrinterSettings
 from tests.fabricate.planted import exact_fibre, with_settings
-
-
-def fabrication_document(plan: Plan, findings: tuple[dict, ...] = ()) -> dict:
-    """Return the parts of a fabrication document that the page reads."""
-    volume = mould_mesh(plan.shrinkage_compensated).volume()
-    return {
-        "files": ["mould.stl"],
-        "size_mm": [64.669, 64.669, 8.0],
-        "sizes": sizes(plan),
-        "mould_volume_ml": volume / 1000,
-        "findings": list(findings),
-        "settings": {
-            "mould": plan.settings.mould.model_dump(),
-            "printer": plan.settings.printer.model_dump(),
-            "pad": pad_document(plan),
-        },
-        **laying_document(plan, volume),
-    }
 
 
 def straight_volume_mm3(draft_deg: float) -> float:
@@ -79,15 +60,16 @@ def test_lengths_match_curves(mould):
         assert entry["cut_mm"] == pytest.approx(entry["in_pad_mm"] + 2 * plan.settings.mould.lead_mm, abs=0.011)
 
 
-def test_common_tracks_are_listed_from_twice_a_right_angled_crossing_on():
+def test_common_tracks_are_listed_from_twice_a_right_angled_crossing_on(tmp_path):
     """Straight ones have 0.8 mm in common; a vertical that crosses at 25 degrees 1.9 mm, at 35 degrees 1.4 mm."""
-    assert laying_document(Plan(Morphology.straight(4)), 1.0)["common_tracks"] == []
-    assert "over a deeper one" not in laying_page(fabrication_document(Plan(Morphology.straight(4))))
+    document = build(Morphology.straight(4), tmp_path, []).to_dict()
+    assert document["common_tracks"] == []
+    assert "over a deeper one" not in laying_page(document)
     for angle_deg, listed in ((25, True), (35, False)):
         shift = 0.2 / 3 / math.tan(math.radians(angle_deg))
         vertical = [[1, 0], [1 - shift, 0.9], [1 + shift, 1.1], [1, 2]]
         pad = Morphology(np.array([[[0, 1], [0.5, 1], [1.5, 1], [2, 1]], vertical]), 20.0)
-        document = fabrication_document(Plan(pad))
+        document = build(pad, tmp_path, []).to_dict()
         assert bool(document["common_tracks"]) == listed
         if listed:
             (track,) = document["common_tracks"]

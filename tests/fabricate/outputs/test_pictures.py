@@ -5,19 +5,22 @@ from matplotlib.figure import Figure
 
 from padforge.common.plotting import FAINT, HORIZONTAL, PAPER, VERTICAL
 from padforge.design.morphology import Morphology
-from padforge.fabricate.checks import Finding
 from padforge.fabricate.mesh import mould_mesh
-from padforge.fabricate.outputs.pictures import TURN_DEG, draw_findings, draw_mould, draw_orientation, draw_tracks
+from padforge.fabricate.outputs.laying_page import laying_document
+from padforge.fabricate.outputs.pictures import (
+    TURN_DEG,
+    draw_crossing,
+    draw_findings,
+    draw_mould,
+    draw_orientation,
+    draw_tracks,
+)
 from padforge.fabricate.plan import Plan, fibre_layers
 from padforge.sense.rig.config import RobotFrame
 from padforge.sense.settings import RigSettings
 from tests.fabricate.planted import level_pad, with_settings
 
 PLAN = Plan(level_pad(1.8, 1.2))
-
-
-def make_finding(status, *positions: tuple[float, float], name: str = "wall") -> Finding:
-    return Finding(name, status, 0.0, 1.0, "planted", positions)
 
 
 def mesh_of(plan: Plan) -> tuple[np.ndarray, np.ndarray]:
@@ -113,6 +116,16 @@ def test_panels_match_frame_of_rig(tmp_path, figures):
                 assert texts[axis] / np.hypot(*texts[axis]) == pytest.approx(
                     np.array(frame.pose(unit, 0.0)[:2]), abs=0.01
                 )
+
+
+def test_section_is_of_the_narrowest_crossing(tmp_path, figures):
+    """Of a pad of three depths whose first crossing is a wide one."""
+    plan = Plan(Morphology.random((1, 2), 2, seed=1))
+    crossings = laying_document(plan, 1.0)["crossings"]
+    draw_crossing(plan, tmp_path / "crossing.svg")
+    assert crossings["table"][0][-1] > crossings["gap_mm"]
+    [*_, gap] = [text.get_text() for text in figures[0].axes[0].texts]
+    assert gap == f"{crossings['gap_mm']:.2g} mm"
 
 
 def test_fibres_are_drawn_as_wide_as_they_are(tmp_path, figures):

@@ -64,8 +64,9 @@ def test_hdf5(three: Recording, golden: Golden, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("mirrored", [False, True])
 def test_bag(three: Recording, localization: Localization, golden: Golden, tmp_path: Path, mirrored: bool) -> None:
-    """All messages, but for readings beyond the first two; of a mirrored pad those with a z."""
+    """All messages, but for readings beyond the first two; of a mirrored pad those with a z; and they are read back."""
     states = np.array([[100.0, 100, 200, 300, 0, 0, np.pi / 2, 1, 0, 0], [101.0, 400, 500, 600, 0, 0, 0, 0, 0, 0]])
+    states = np.vstack([np.full((1, 10), -5.0), states, np.full((1, 10), NAN)])  # times that no stamp can hold
     recording = replace(three, source={"kind": "test", "rig": {"mirrored": mirrored}})
     faults = [FibreFault(1, 1, (1,), "stuck", 99)]
     export_bag(recording, tmp_path / "three.mcap", localization, faults, (0,), states)
@@ -79,6 +80,7 @@ def test_bag(three: Recording, localization: Localization, golden: Golden, tmp_p
             if connection.topic not in left_out and (connection.topic != "/pad/readings" or stamp < 100.2e9):
                 lines.append(f"{stamp / 1e9:.3f} {connection.topic} {connection.msgtype} {compact(message)}")
     golden(f"formats/bag{'_mirrored' * mirrored}.txt", "\n".join(lines))
+    assert import_file(tmp_path / "three.mcap") == recording
 
 
 def compact(value: Any) -> str:

@@ -152,9 +152,9 @@ def positioned(scale: float = 1.0, jitter: float = 0.0, late: int = 0, held: boo
     return table(f"t{time},c0,c1,c2,c3,px,py", lines)
 
 
-def measured(volts: str = "mV", other: str = "mV") -> str:
+def measured(other: str = "mV") -> str:
     """A table whose times and volts have their units behind them."""
-    units = (volts, other)
+    units = ("mV", other)
     lines = [
         ",".join([f"{1000 * TIMES[i]:.1f} ms", *(f"{1000 * volt:.1f}{units[i % 2]}" for volt in VOLTS[i])])
         for i in range(N)
@@ -224,6 +224,7 @@ REMARKABLE: dict[str, tuple[str, str]] = {
     "force": (with_force(lambda _: 2.5), WITH_FORCE),
     "force a little below 0": (with_force(lambda i: -0.02 if 78 < i < 98 else 2.5), WITH_FORCE),
     "force that points the other way": (TURNED, WITH_FORCE),
+    "force in mN that points the other way": (TURNED, f"{WITH_FORCE}:mN"),
     "force that is turned": (TURNED, f"{WITH_FORCE}:-1"),
     "own, positions unknown and readings missing": (own(*PARTLY), ""),
     "own, a word in a column": (own(*OWN, *["6,1,two,,"] * 4), ""),
@@ -283,13 +284,13 @@ def test_import_csv_reads_the_line_that_follows_a_torn_one_in_the_same_line(
 
 def test_presses_of_a_table_of_their_own(tmp_path: Path) -> None:
     begin = np.flatnonzero(np.diff(PRESSED, prepend=0) == 1)
-    lines = [f"{TIMES[i]:.3f},{SPOTS[i, 0]},{SPOTS[i, 1]},0.6,2.5" for i in begin]
+    lines = [f"{TIMES[i]:.3f},{SPOTS[i, 0]},{SPOTS[i, 1]}" for i in begin]
     (tmp_path / "lab.csv").write_text(table())
-    for names, mapping in (
-        ("down_s,x_mm,y_mm,duration_s,force_n", ""),
-        ("at,px,py,for,f", "down=at,duration=for,x=px,y=py,force=f"),
+    for names, mapping, more in (
+        ("down_s,x_mm,y_mm,duration_s,force_n", "", "0.6,2.5"),
+        ("at,px,py,for,f", "down=at,duration=for:ms,x=px,y=py,force=f:mN", "600,2500"),
     ):
-        (tmp_path / "presses.csv").write_text(table(names, [*lines, "99,0,0,0.6,2.5"]))
+        (tmp_path / "presses.csv").write_text(table(names, [f"{line},{more}" for line in (*lines, "99,0,0")]))
         recording = import_file(tmp_path / "lab.csv", MAPPING, presses=tmp_path / "presses.csv", press_columns=mapping)
         check(recording)
         assert recording.down_command.tolist() == begin.tolist()

@@ -19,9 +19,9 @@ from rosbags.interfaces import QosDurability
 from rosbags.rosbag2 import Reader
 
 from padforge.common.validation import InputError
-from padforge.sense import FibreFault, Localization, Recording
+from padforge.sense import Recording
 from padforge.sense.formats import ros_recording
-from padforge.sense.formats.import_export import export_file, import_file
+from padforge.sense.formats.import_export import import_file
 from padforge.sense.formats.ros_messages import choose_epoch, to_stamps
 from padforge.sense.formats.ros_recording import export_bag, import_bag
 
@@ -68,20 +68,6 @@ def test_export_bag_round_trip_is_reproducible(eight: Recording, bag: Path, tmp_
     with Reader(bag) as reader:  # rosbag2 tells whoever comes later what is in the recording
         durability = {each.topic: each.ext.offered_qos_profiles[0].durability for each in reader.connections}  # pyright: ignore
     assert {topic for topic, how in durability.items() if how == QosDurability.TRANSIENT_LOCAL} == {"/pad/recording"}
-
-
-def test_bag_with_predictions_and_poses_of_an_arm_is_imported_without_them(eight: Recording, tmp_path: Path) -> None:
-    localization = Localization(np.full((8, 2), 3.0), np.full((8, 2), [0.5, 0.25]), np.ones(8), np.ones(8))
-    faults = [FibreFault(5, 5, (1,), "open", 99)]
-    states = np.zeros((4, 10))
-    states[:, 0] = [-5, 1, 2, np.nan]  # stamps cannot hold the first and the last
-    export_bag(eight, tmp_path / "r.mcap", localization, faults, (3,), states)
-    topics, _ = read_by_mcap(tmp_path / "r.mcap")
-    assert [stamp for stamp, _ in topics["/arm/pose"]] == [10**9, 2 * 10**9]
-    assert len(topics["/pad/touches"]) == 8
-    assert import_bag(tmp_path / "r.mcap") == eight
-    with pytest.raises(InputError, match=r"predictions of a model can be written as \.mcap"):
-        export_file(eight, tmp_path / "r.csv", localization=localization)
 
 
 @given(st.floats(-1e6, 2e9) | st.builds(operator.sub, st.integers(-(10**6), 10**6), st.floats(0, 1e-9)))

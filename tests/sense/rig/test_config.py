@@ -92,9 +92,14 @@ def test_locate_on_bed_reads_the_holder(folder, with_frame):
     check_plan(make_plan(PAD, rig, np.random.default_rng(0)), rig)
     assert box_of(folder, tcp_mm=(95.0, -90.0, -20.0))[0:4:3] == [95, 90]  # it ends where the nozzle does
     assert box_of(folder, tcp_mm=(-95.0, 95.0, -20.0))[1:3] == [105, 95]
-    for angle_deg, (x, y) in ((0.0, (30.0, 10.0)), (90.0, (10.0, 30.0)), (180.0, (30.0, 10.0))):
+    for angle_deg, more_deg, (x, y) in (
+        (0.0, 0.0, (30.0, 10.0)),
+        (90.0, 0.0, (10.0, 30.0)),
+        (0.0, -90.0, (10.0, 30.0)),  # turned on the bed by hand
+        (90.0, 90.0, (30.0, 10.0)),
+    ):
         elsewhere = with_frame(pad_mm=[60.0, 20.0], angle_deg=angle_deg)
-        assert box_of(elsewhere)[:4] == [100 - x, 100 + x, 90 - y, 90 + y]
+        assert box_of(elsewhere, pad_angle_deg=more_deg)[:4] == [100 - x, 100 + x, 90 - y, 90 + y]
 
 
 def test_locate_on_bed_prefers_what_rig_sets(folder, with_frame):
@@ -144,10 +149,6 @@ def run(tmp_path_factory) -> Path:
     return out
 
 
-def test_make_plan_keeps_the_plan_of_a_resumed_recording(run):
-    assert resumed_plan(run, seed=9, presses=3) == resumed_plan(run)
-
-
 def test_make_plan_refuses_to_resume_into_a_new_keep_out(tmp_path):
     pad = Morphology.random((1, 3), 2, 0, (8.0, 15.0))
     plan = make_plan(pad, RIG, np.random.default_rng(0))
@@ -176,19 +177,13 @@ def test_resume_refuses_settings_that_change_a_press(run):
             load_or_make_plan(config_of(run, rig=RigSettings(**RIG.model_dump() | {key: value})), resume=True)
 
 
-def test_resume_accepts_other_limits_and_addresses_but_no_other_pad(run):
+def test_resume_keeps_the_plan_and_accepts_other_limits_addresses_and_controllers(run, tmp_path):
+    """Another arm, tool, board or pad is in the table of refusals."""
+    plan, out = resumed_plan(run), Path(shutil.copytree(run, tmp_path / "run"))
     limits = {"max_force_n": 30.0, "max_depth_mm": 5.5, "box_mm": (0, 1, 0, 1, 0, 1)}
-    resumed_plan(run, **limits, host="arm", port="COM3", mirrored=False)
-    with pytest.raises(InputError, match="another pad"):
-        resumed_plan(run, Morphology.random(2, 3, 1))
-    with pytest.raises(InputError, match="another pad"):  # rather than that its fibres are on other inputs
-        resumed_plan(run, Morphology.straight(3), channels=())
-
-
-def test_resume_accepts_another_controller_of_the_same_arm(run, tmp_path):
-    """Another arm, tool or board is in the table of refusals."""
+    assert resumed_plan(run, **limits, host="arm", port="COM3", mirrored=False, seed=9, presses=3) == plan
     assert json.loads((run / START).read_text())["source"]["devices"] == IDENTITIES
-    out = Path(shutil.copytree(run, tmp_path / "run"))
-    plan = resumed_plan(out)
     with open_recorder(config_of(out), plan, out, True, IDENTITIES | {"arm": ARM | {"controller": "5.13.0"}}):
         pass
+    with pytest.raises(InputError, match="another pad"):  # rather than that its fibres are on other inputs
+        resumed_plan(run, Morphology.straight(3), channels=())

@@ -1,15 +1,18 @@
-"""Adaptive plans press where a localizer errs, beside the same by hand."""
+"""Adaptive plans press where a localizer errs, beside the same by hand; a simulated recording names its files."""
 
+import json
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 
+from padforge.common.files import sha256
+from padforge.common.settings import Spec
 from padforge.sense.recording.press_plan import PressPlan
 from padforge.sense.recording.recording import Recording
 from padforge.sense.recording.run_directory import Recorder
-from padforge.sense.rig.operation import ADAPT_EVERY, AdaptivePlanner, acquisition
-from tests.sense.rig.fakes import FIBRES
+from padforge.sense.rig.operation import ADAPT_EVERY, AdaptivePlanner, acquisition, record_simulated
+from tests.sense.rig.fakes import FIBRES, PAD
 
 
 def test_acquisition_is_mean_error_of_five_times_distance():
@@ -53,3 +56,14 @@ def test_adaptive_planner_presses_where_the_localizer_is_poor(tmp_path):
     assert (np.abs(chosen_mm) <= np.abs(plan.positions_mm).max(axis=0)).all()
     apart_mm = np.linalg.norm(chosen_mm[:, None] - moved.positions_mm[None, : 2 * ADAPT_EVERY], axis=2)
     assert np.sort(apart_mm, axis=1)[:, 1].min() > 1.0  # from any other press
+
+
+def test_simulated_recording_names_its_plan_among_its_inputs(tmp_path):
+    (tmp_path / "pad.toml").write_text("")
+    (tmp_path / "places.csv").write_text("x_mm,y_mm\n3,-1\n0,2\n")
+    spec = Spec({"rig": {"plan": str(tmp_path / "places.csv")}})
+    recording = record_simulated(spec, PAD, tmp_path / "run", {"seed": 4}, [tmp_path / "pad.toml"])
+    assert recording.presses_mm.tolist() == [[3, -1], [0, 2]]
+    made_by = json.loads((tmp_path / "run" / "start.json").read_text())["provenance"]
+    assert made_by["inputs"] == {name: sha256(tmp_path / name) for name in ("pad.toml", "places.csv")}
+    assert made_by["seed"] == 4

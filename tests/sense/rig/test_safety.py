@@ -127,10 +127,9 @@ def test_check_state_accepts_the_limits_and_no_nan(change: dict[str, object], ca
 
 
 def test_checks_of_an_unwatched_force() -> None:
-    check_state(replace(STILL, force_n=1e6), replace(LIMITS, max_force_n=None), 10.0)
-    sensorless = replace(STILL, force_n=None)
-    check_state(sensorless, replace(LIMITS, max_force_n=None), 10.0)
-    check_start_state(sensorless, replace(LIMITS, max_force_n=None))
+    for force_n in (1e6, None):
+        check_state(replace(STILL, force_n=force_n), replace(LIMITS, max_force_n=None), 10.0)
+        check_start_state(replace(STILL, force_n=force_n), replace(LIMITS, max_force_n=None))
 
 
 def scripted_arm(*script: ArmState | BaseException) -> tuple[mock.Mock, Time]:

@@ -1,18 +1,14 @@
 """A simulated board is of the pad of a simulated recording, and is found by the model that was trained on that."""
 
-import json
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from padforge.design import Morphology
-from padforge.design.settings import PUBLISHED_CONTACT, Contact
-from padforge.sense import Recording
-from padforge.sense.recording.run_directory import FORMAT, START
+from padforge.design.settings import PUBLISHED_CONTACT, Contact, PadSettings
 from padforge.sense.rig.simulated_board import SimulatedBoard, simulated_board_of
 from padforge.sense.rig.streams import RECORDED
-from padforge.sense.settings import RigSettings
 from padforge.sense.simulation.simulated_recording import simulate
 from tests.helpers.rigs import quiet_rig
 from tests.sense.rig.fakes import Time
@@ -53,8 +49,17 @@ def test_simulated_board_is_pressed_to_its_depths_in_turn() -> None:
     assert max(swings[0::2]) < 0.5 * min(swings[1::2])
 
 
-def test_simulated_board_of_a_model_is_of_its_simulated_recording(brief: Recording, tmp_path: Path) -> None:
-    brief.save(tmp_path / RECORDED, {})
-    source = simulate(Morphology.straight(2), RigSettings(presses=1)).source
-    (tmp_path / RECORDED / START).write_text(json.dumps({"format": FORMAT, "source": source}))
-    assert simulated_board_of(tmp_path).connect()["channels"] == 4
+def test_simulated_board_of_a_model_is_that_of_its_simulated_recording(tmp_path: Path) -> None:
+    """Pressed where that was: within what is sensed, and beside the keep-outs."""
+    hole = ((2.0, -6.0), (9.0, -6.0), (9.0, 6.0), (2.0, 6.0))
+    size = PadSettings(horizontals=3, verticals=2, pitch_mm=(8.0, 15.0), keep_out_mm=(hole,), sensed_mm=(10.0, 12.0))
+    pad, rig, time = Morphology.straight(size.layout), quiet_rig(presses=4, readings_per_press=10), Time(least_s=0)
+    simulate(pad, rig, size=size).save(tmp_path / RECORDED, {})
+    boards = simulated_board_of(tmp_path), *(SimulatedBoard(pad, rig, Contact(), each) for each in (size, None))
+    with time.of_all():
+        for board in boards:
+            board.connect()
+        time.sleep(10.0)
+        same, told, elsewhere = (board.read().volts for board in boards)
+    np.testing.assert_array_equal(same, told)
+    assert not np.array_equal(same, elsewhere)

@@ -30,20 +30,16 @@ PAD = Morphology.straight(4)
 CYCLE = Cycle(40, 13.3)
 
 
-def one_press(after: float = 0.0, creep: float = 0.0, onset: float = 1.0, presses: int = 10) -> Strain:
-    """Strain of a press of a fibre whose held response is 1, and of none in the cycles that follow."""
-    parts = np.zeros((4, presses, 1))
-    parts[:, 0, 0] = 1.0, onset, creep, after
-    motion = followed_by_rest(probe_motion(CYCLE, np.full((1, 2), 0.1)), presses - 1)
-    return superpose_strain(PressParts(*parts), np.zeros((presses, 1)), motion)
-
-
 def followed_by_rest(motion: Motion, cycles: int) -> Motion:
     return Motion(*(np.pad(values, ((0, cycles), (0, 0))) for values in motion))
 
 
 def test_what_remains_is_of_opposite_sign_and_decays() -> None:
-    visible = Viscoelasticity(13.3, RigSettings(hysteresis_s=2.5))(one_press(after=0.25))[:, 0]
+    parts = np.zeros((4, 10, 1))
+    parts[:, 0, 0] = 1.0, 1.0, 0.0, 0.25  # one press, and none in the cycles that follow
+    motion = followed_by_rest(probe_motion(CYCLE, np.full((1, 2), 0.1)), 9)
+    strain = superpose_strain(PressParts(*parts), np.zeros((10, 1)), motion)
+    visible = Viscoelasticity(13.3, RigSettings(hysteresis_s=2.5))(strain)[:, 0]
     assert visible[:40].min() == 0
     assert visible[35:40] == pytest.approx(1, abs=0.01)
     assert -0.25 < visible[40:].min() < -0.22

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from padforge.design import Contact, Morphology
-from padforge.sense import RigSettings
+from padforge.sense import RigSettings, simulate
 from padforge.sense.settings import IDEAL_RIG
 from padforge.sense.simulation.strokes import simulate_strokes
 
@@ -17,8 +17,10 @@ def pad() -> Morphology:
 
 
 def test_a_stroke_reads_as_a_press_where_the_finger_is(pad: Morphology) -> None:
+    """On the pad of a simulated recording, whose fibres rest alike."""
     strokes = simulate_strokes(pad, QUIET, Contact(), 20.0, 3, np.random.default_rng(0))
     recording = strokes.recording
+    np.testing.assert_array_equal(recording.readings[:19], simulate(pad, QUIET).readings[:19])
     held = recording.up_command[0] - recording.down_command[0]
     for stroke in range(3):
         for reading in (held // 2, held - 1):

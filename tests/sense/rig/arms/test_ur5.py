@@ -272,6 +272,30 @@ def test_arm_rests_after_fault_during_move(robot: EmulatedUR5, arm: UR5, name: s
     go(arm, (x, y, z + 1, *HOME[3:]))
 
 
+def test_arm_rests_after_a_move_that_was_not_confirmed(
+    robot: EmulatedUR5, arm: UR5, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    go(arm, HOME)
+    monkeypatch.setattr(ur5, "MOVE_S", 0.0)
+    start_s = time.monotonic()
+    assert fault_of(arm.move, LOW, 50, 500) == "deadline"
+    assert fault_of(arm.state) == "lost"
+    time.sleep(max(0.0, start_s + REST_S + 0.1 - time.monotonic()))
+    assert last_motion_s(robot) < start_s + REST_S
+
+
+def test_program_is_ended_at_a_protective_stop_without_being_asked(robot: EmulatedUR5, arm: UR5) -> None:
+    """Paused, it would go on with the old move once a person unlocks the arm and presses play."""
+    start_slow_move(arm)
+    n_lines, end_s = len(robot.dashboard_log), time.monotonic() + LONGEST_CALL_S
+    robot.protective_stop()
+    while "stop" not in robot.dashboard_log[n_lines:]:
+        assert time.monotonic() < end_s
+        time.sleep(0.01)
+    robot.clear()
+    arm.connect()
+
+
 @pytest.mark.slow
 def test_play_does_not_resume_old_move(robot: EmulatedUR5, arm: UR5) -> None:
     start_slow_move(arm)
