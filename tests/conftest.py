@@ -6,6 +6,7 @@
 import os
 import signal
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -100,6 +101,21 @@ def figures(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
 
     monkeypatch.setattr(Figure, "__init__", remember)
     return drawn
+
+
+@pytest.fixture
+def taken(monkeypatch: pytest.MonkeyPatch) -> Callable[[Any], dict[Any, Any]]:
+    """Evaluations of one quick round of a benchmark, by trial."""
+    from padforge.benchmarks import harness
+    from padforge.common.progress import ignore_progress
+
+    def evaluate(bench: harness.Bench) -> dict[Any, Any]:
+        rounds = harness.BenchRounds()
+        harness.measure_round(bench, rounds, ignore_progress, lambda key: False)
+        return rounds.results
+
+    monkeypatch.setattr(harness, "BUDGET_S", 0)
+    return evaluate
 
 
 @pytest.fixture(scope="session")

@@ -7,8 +7,6 @@ import numpy as np
 import pytest
 import shapely
 
-from padforge.benchmarks import harness
-from padforge.common.progress import ignore_progress
 from padforge.design import Morphology, Twin, flatten
 from padforge.design.morphology import assemble_knots
 from padforge.design.published.objective import information
@@ -62,19 +60,6 @@ def little_scored(monkeypatch: pytest.MonkeyPatch) -> None:
     """Pads are compared by few presses, and information is bounded by the cells of a coarse grid."""
     compare_little(monkeypatch)
     monkeypatch.setattr("padforge.design.published.objective.information", partial(information, side=5))
-
-
-@pytest.fixture
-def taken(monkeypatch):
-    """Evaluations of one quick round of a benchmark, by trial."""
-    monkeypatch.setattr(harness, "BUDGET_S", 0)
-
-    def found(bench):
-        rounds = harness.BenchRounds()
-        harness.measure_round(bench, rounds, ignore_progress, lambda key: False)
-        return rounds.results
-
-    return found
 
 
 @pytest.fixture

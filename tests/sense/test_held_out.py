@@ -74,12 +74,16 @@ def test_calibration_learns_nothing_from_its_test_nor_networks_from_presses_of_r
 
 
 def test_cross_validated_localizer_learns_nothing_from_other_presses(brief: Recording) -> None:
-    """Of a recording, of which those of a fold are selected as scikit-learn does it."""
-    params = TINY.model_dump(exclude={"seed"})
-    fits = [Localizer(**params).fit(each[np.arange(30)]) for each in (brief, without_sense(brief, 30))]
-    assert learnt(fits[0].model_) == learnt(fits[1].model_)
-    assert fits[0].test_presses_.size == 0
-    assert fits[0].score(brief[np.arange(30, 40)]) < 0
+    """Of a recording, of which those of a fold are selected as scikit-learn does it; another seed learns otherwise."""
+    params, spoilt = TINY.model_dump(exclude={"seed"}), without_sense(brief, 30)
+    plain, same, other = (
+        Localizer(random_state=seed, **params).fit(each[np.arange(30)])
+        for seed, each in ((0, brief), (0, spoilt), (7, brief))
+    )
+    assert learnt(same.model_) == learnt(plain.model_)
+    assert learnt(other.model_)["released.first.w"] != learnt(plain.model_)["released.first.w"]
+    assert plain.test_presses_.size == 0
+    assert plain.score(brief[np.arange(30, 40)]) < 0
 
 
 def test_recalibration_predicts_each_fold_by_models_that_have_not_seen_it(

@@ -38,6 +38,7 @@ def padforge_sense(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixtur
 
     def run(*arguments: str) -> tuple[int, str, str]:
         monkeypatch.setattr(sys, "argv", ["padforge", "sense", *arguments])
+        capsys.readouterr()  # what the making of models has said, if this test is the first to ask for them
         with pytest.raises(SystemExit) as caught:
             main()
         out, err = capsys.readouterr()

@@ -13,18 +13,6 @@ from padforge.sense.signals.press_detection import first_readings
 from tests.sense.conftest import first_presses
 
 
-def test_locate_excludes_fibres_by_number(few) -> None:
-    code, out, _ = few("locate", "--model", "model", "rec", "--exclude-fibres", "1,4")
-    assert (code, out) == (0, "60 positions -> places.csv\n")
-    table = np.genfromtxt("places.csv", delimiter=",", names=True)
-    assert table.dtype.names == ("press", "x_mm", "y_mm", "std_x_mm", "std_y_mm", "r50_mm", "r90_mm", "unlike")
-    assert len(table) == 60
-    assert (table["r50_mm"] < table["r90_mm"]).all()
-    prediction = LocalizerModel.load("model").predict(Recording.open("rec"), (0, 3))
-    positions_mm = np.column_stack([table["x_mm"], table["y_mm"]])
-    np.testing.assert_allclose(positions_mm, prediction.positions_mm, atol=1e-4)
-
-
 def test_two_fingers_are_marked_in_the_table(enough) -> None:
     """A recording is superposed on itself, some presses later."""
     whole = Recording.open("rec")

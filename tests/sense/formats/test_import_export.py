@@ -23,7 +23,6 @@ from padforge.sense import (
     open_recording,
 )
 from padforge.sense.cli.main import sense
-from padforge.sense.formats.annotations import ModelAnnotations
 from padforge.sense.formats.import_export import arm_states, export_file
 
 
@@ -102,7 +101,7 @@ def test_readers_and_writers_refuse_other_arguments(brief: Recording, tmp_path: 
         with pytest.raises(InputError, match=r"recording is 3, expected a Recording"):
             write(other, tmp_path / "x")
     ones = np.ones((40, 2))
-    touches = ModelAnnotations(ones, ones, ones[:, 0], ones[:, 0], ones[:, 0])
+    touches = Localization(ones, ones, ones[:, 0], ones[:, 0])
     with pytest.raises(InputError, match=r"predictions of a model can be written as \.mcap"):
-        export_file(brief, tmp_path / "r.csv", annotations=touches)
+        export_file(brief, tmp_path / "r.csv", localization=touches)
     assert list(tmp_path.iterdir()) == []

@@ -88,6 +88,13 @@ def test_sensor_reads_what_the_pipeline_says(boards, sensor: PadSensor, few: Rec
     assert [sensor.read()[name] for name in ("pressed", "valid", "x_mm", "r90_mm")] == [0, 0, 0, 0]
 
 
+def test_a_position_from_before_is_not_that_of_a_press_under_way(boards, sensor: PadSensor, monkeypatch) -> None:
+    """A model of method `published` estimates a press once it is over."""
+    monkeypatch.setattr(Live, "pressed", True)
+    sensor.connect()
+    assert [sensor.read()[name] for name in ("pressed", "valid", "x_mm")] == [1, 0, 0]
+
+
 def read_for(sensor: PadSensor, duration_s: float) -> None:
     end_s = time.monotonic() + duration_s
     while time.monotonic() < end_s:

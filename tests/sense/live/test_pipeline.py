@@ -12,24 +12,19 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from padforge.common.validation import InputError
 from padforge.sense import Recording, calibrate
 from padforge.sense.health.fault_detector import FibreFault
+from padforge.sense.live import pipeline
 from padforge.sense.live.pipeline import MAX_TRACK, RELEASE, Estimate, Live
 from padforge.sense.localizer.model import Localization, LocalizerModel
 from padforge.sense.signals.press_detection import PressEvent
+from tests.helpers.constants import with_constants
 from tests.helpers.golden import Golden, json_text
 from tests.sense.conftest import QUICK, few_moments, first_presses
 from tests.sense.live.test_messages import EVENTS
 
-
-@pytest.fixture(autouse=True, scope="module")
-def no_delays() -> Iterator[None]:
-    """Scripted presses begin as they are commanded."""
-    with pytest.MonkeyPatch.context() as monkeypatch:
-        monkeypatch.setattr("padforge.sense.live.pipeline.TOUCH_DELAY_S", 0.0)
-        monkeypatch.setattr("padforge.sense.live.pipeline.RELEASE_DELAY_S", 0.0)
-        yield
+no_delays = with_constants((pipeline, {"TOUCH_DELAY_S": 0.0, "RELEASE_DELAY_S": 0.0}))
+"""Scripted presses begin as they are commanded."""
 
 
 class ScriptedDetector:
@@ -325,27 +320,3 @@ def test_track_has_the_places_that_a_finger_has_moved_to(recording, hasty, monke
     assert track == [[1.0 + 3 * k, 0.0] for k in range(len(track))]
     live.feed(part.times_s[next_down:][:3], part.readings[next_down:][:3])
     assert len(live.view()["track"]) == 1  # of the next press
-
-
-def test_live_refuses_what_does_not_fit(recording, hasty) -> None:
-    with pytest.raises(InputError, match=r"9\.9 readings a second, the localizer needs 10 or"):
-        Live(hasty, rate_hz=9.9)
-    with pytest.raises(InputError, match="of 3 fibres"):
-        Live(hasty, rate_hz=20.0, fibres=3)
-    with pytest.raises(InputError, match="fitted to arrays"):
-        Live(replace(hasty, features="array"), rate_hz=hasty.rate_hz)
-    live = Live(hasty, rate_hz=hasty.rate_hz)
-    live.feed(recording.times_s[:9], recording.readings[:9])
-    with pytest.raises(InputError, match=r"times begin at .* later than"):
-        live.feed(recording.times_s[8:12], recording.readings[8:12])
-
-
-def test_estimate_has_moved_beyond_the_larger_radius_and_is_sharper_by_a_quarter() -> None:
-    def estimate(x_mm: float, y_mm: float, r90_mm: float) -> Estimate:
-        return Estimate(0, 0.0, 1.0, "touch", 1, 1.0, False, x_mm, y_mm, 1.0, 1.0, r90_mm / 2, r90_mm, ())
-
-    at_first = estimate(0.0, 0.0, 4.0)
-    for x_mm, y_mm, r90_mm, has_moved in ((3.0, 4.0, 2.0, True), (2.0, 3.0, 2.0, False), (3.0, 4.0, 6.0, False)):
-        later = estimate(x_mm, y_mm, r90_mm)
-        assert later.has_moved_from(at_first) == at_first.has_moved_from(later) == has_moved
-    assert [estimate(0, 0, r90_mm).is_sharper_than(at_first) for r90_mm in (2.9, 3.0, 3.1)] == [True, True, False]

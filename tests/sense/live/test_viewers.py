@@ -113,23 +113,6 @@ def test_foxglove_names_a_port_in_use() -> None:
             FoxgloveOutput(port, **AREA)
 
 
-@pytest.mark.parametrize(
-    ("target", "error"),
-    [
-        (
-            "localhost:9876",
-            r"^--rerun is 'localhost:9876', expected an address like rerun\+http://HOST:PORT/proxy",
-        ),
-        ("file/pad.rrd", r"^file/pad\.rrd: cannot be written"),
-    ],
-)
-def test_rerun_refuses_other_targets(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, target: str, error: str) -> None:
-    monkeypatch.chdir(tmp_path)
-    Path("file").write_text("")
-    with pytest.raises(InputError, match=error):
-        RerunOutput(target, 2, **AREA)
-
-
 def test_foxglove(golden: Golden) -> None:
     """All topics with their schemas, and the messages that a client gets that subscribes to all."""
     sent = messages()

@@ -78,16 +78,6 @@ def test_evaluate_counts_presses_held_back(calibrated: tuple[LocalizerModel, Eva
     assert own.errors == [evaluation.errors[0], evaluation.errors[2]]
     other = evaluate(localizer, replace(recording, times_s=recording.times_s + 1.0), [0])
     assert (own.split, other.split, other.test_presses) == ("random", "none", 300)
-    for lost, said in (([4], "n_failed is 4, allowed is a whole number from 0 to 3"), ([], "levels name no number")):
-        with pytest.raises(InputError, match=said):
-            evaluate(localizer, recording, lost)
-
-
-def test_calibrate_refuses_options_out_of_range(recording: Recording) -> None:
-    with pytest.raises(InputError, match="holds 0 back"):
-        calibrate(recording, SHORT.model_copy(update={"test_share": 1e-4}))
-    with pytest.raises(InputError, match="expected method ensemble"):
-        calibrate(recording, Options(method="published"), time_budget=5)
 
 
 def test_calibrate_published_takes_no_failures(recording: Recording, tmp_path: Path) -> None:
@@ -99,8 +89,6 @@ def test_calibrate_published_takes_no_failures(recording: Recording, tmp_path: P
     localizer.save(tmp_path)
     again = LocalizerModel.load(tmp_path).predict(recording)
     assert np.array_equal(again.positions_mm, localizer.predict(recording).positions_mm)
-    with pytest.raises(InputError, match="method published knows no fibre loss"):
-        localizer.predict(recording, [1])
 
 
 def test_calibrate_reports_divergence(brief: Recording, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -152,18 +140,19 @@ def test_calibrate_learns_depth_and_force(deep_recording: Recording, deeply_cali
         ({"forces_n": np.empty(0)}, ["depth_mm"], []),
         ({"depths_mm": np.empty(0)}, [], []),
         ({"depths_mm": np.full(400, 5.0)}, [], []),
-        ({"depths_mm": np.nan}, [], ["depth is not learnt: it is known of 399 of 400 presses, needed is of all"]),
-        ({"reached_mm": 0.0}, [], ["depth is not learnt: 1 of 400 presses reached 0 mm or less"]),
+        ({"depths_mm": np.nan}, [], ["depth is not learnt: it is known of 398 of 399 presses, needed is of all"]),
+        ({"reached_mm": 0.0}, [], ["depth is not learnt: 1 of 399 presses reached 0 mm or less"]),
     ],
 )
 def test_known_measures_need_depth_that_varies(
     deep_recording: Recording, localizer: LocalizerModel, change: dict, learnt: list, lines: list
 ) -> None:
-    """A number is that of one press, the others are as they were."""
+    """A number is that of one press, the others are as they were; another press is of unknown position."""
     for name, value in change.items():
         if isinstance(value, float):
             change = {name: np.where(np.arange(400) == 7, value, deep_recording.depths_mm)}
-    changed = replace(deep_recording, **change)
+    places = np.where(np.arange(400)[:, None] == 3, np.nan, deep_recording.presses_mm)
+    changed = replace(deep_recording, presses_mm=places, **change)
     assert list(trainable_targets(changed, np.arange(400))) == learnt
     if not learnt:
         assert missing_target_lines(changed, localizer) == lines
@@ -254,5 +243,3 @@ def test_calibrate_needs_fewer_presses_with_the_plan_of_the_pad(recording: Recor
     found = (each.predict(recording).positions_mm for each in (without, with_plan))
     plain, told = (distances(positions_mm, recording.presses_mm)[60:].mean() for positions_mm in found)
     assert told < 0.9 * plain
-    with pytest.raises(InputError, match="pad has 6 fibres, the recording 4; expected as many"):
-        calibrate(few, options, pad=Morphology.random(3, knots=2, seed=0))

@@ -79,7 +79,7 @@ def test_conformal_covers_of_few_presses_and_several_sets(presses: int) -> None:
 def test_idle_share_is_that_of_changes_below_a_share_of_their_range() -> None:
     """Of five presses of 20 readings, fibre 1 changes by 0 to 1 V, fibre 2 by far less than its 2 V in one."""
     steps = np.array([[0.0, 1.0], [0.015, -1.0], [0.025, 0.03], [1.0, 0.05], [0.5, 0.5]])
-    is_pressed = np.repeat([0.0, 1.0, 0.0], [15, 21, 4])
+    is_pressed = np.repeat([0.0, 1.0, 0.0], [15, 20, 5])  # no longer in the last reading, which is in no window
     readings = (is_pressed[:, None] * steps[:, None]).reshape(200, 2)
     down_command = np.arange(5) * 40 + 15
     recording = Recording(readings, np.arange(200) / 13, np.zeros((5, 2)), down_command, down_command + 21)

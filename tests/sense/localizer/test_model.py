@@ -53,43 +53,7 @@ def test_predict_widens_radii_with_fewer_fibres(localizer: LocalizerModel, recor
     assert localizer.predict_features(presses[:0]).positions_mm.shape == (0, 2)
 
 
-@pytest.mark.parametrize("until", [1, 9, 20, 28])
-def test_predict_at_a_moment_is_that_of_a_recording_cut_off_there(
-    localizer: LocalizerModel, recording: Recording, until: int
-) -> None:
-    press = 100
-    moments = recording.down_command + until
-    end, kept = int(moments[press]), slice(press + 1)
-    presses = {name: getattr(recording, name)[kept] for name in ("presses_mm", "down_command", "up_command")}
-    presses["up_command"] = np.minimum(presses["up_command"], end)
-    cut = localizer.predict(Recording(recording.readings[:end], recording.times_s[:end], **presses))
-    readings = np.array(recording.readings)
-    readings[end:] = np.random.default_rng(0).uniform(0, 5, readings[end:].shape)
-    for found in (recording, replace(recording, readings=readings)):
-        whole = localizer.predict(found, until=moments)
-        np.testing.assert_allclose(whole.positions_mm[press], cut.positions_mm[press], atol=1e-4)
-        np.testing.assert_allclose(whole.r90_mm[press], cut.r90_mm[press], rtol=1e-4)
-
-
-def test_predict_refuses_unknown_fibres_other_pads_and_few_readings(
-    localizer: LocalizerModel, recording: Recording
-) -> None:
-    """It takes three quarters of the readings a second, and more."""
-    presses = localizer.scaled_features(recording)
-    for failed, message in (([4], "failed is .4., expected indices of fibres, 0 to 3"), (range(4), "all 4 fibres")):
-        with pytest.raises(InputError, match=message):
-            localizer.predict_features(presses, failed)
-    for changes, message in (
-        ({"readings": recording.readings[:, :3]}, "3 fibres, the localizer was learnt from 4"),
-        ({"times_s": recording.times_s / 0.74}, "readings a second, the localizer needs"),
-    ):
-        with pytest.raises(InputError, match=message):
-            localizer.scaled_features(replace(recording, **changes))
-    for ratio in (0.76, 7.0):
-        localizer.scaled_features(replace(recording, times_s=recording.times_s / ratio))
-
-
-def test_predict_compares_the_names_of_fibres_and_the_plans_of_pads(
+def test_names_of_fibres_and_plans_of_pads_are_compared_where_both_are_known(
     localizer: LocalizerModel, recording: Recording
 ) -> None:
     learnt = replace(localizer, fibre_names=("c1", "c2", "c3", "c4"))
@@ -99,19 +63,12 @@ def test_predict_compares_the_names_of_fibres_and_the_plans_of_pads(
 
     for names in ((), ("c1", "c2", "c3", "c5")):
         learnt.check_recording(named(*names))
-    message = "fibre 2 is 'c3', the localizer learnt it as 'c2'; import the fibres in the order 'c1', 'c2', 'c3', 'c4'"
-    with pytest.raises(InputError, match=message):
-        learnt.predict(named("c1", "c3", "c2", "c4"))
     localizer.check_recording(named("c1", "c3", "c2", "c4"))  # it knows no names
     assert localizer.pad_sha256 == recording.pad_digest != ""
     plan = recording.source["morphology"]
     knots = [[[value + 1e-9 for value in row] for row in fibre] for fibre in plan["knots"]]
     localizer.check_recording(replace(recording, source={"morphology": plan | {"knots": knots}}))
     localizer.check_recording(replace(recording, source={}))  # an imported one does not know
-    other = replace(recording, source={"morphology": plan | {"pitch_mm": 9.0}})
-    message = f"recording is of a pad with the plan {other.pad_digest[:12]}, the localizer was learnt from {'.' * 12}$"
-    with pytest.raises(InputError, match=message):
-        localizer.predict(other)
 
 
 def test_predict_gives_intervals_of_depth_and_force(deep_localizer: LocalizerModel, deep_recording: Recording) -> None:
@@ -139,8 +96,6 @@ def test_write_localization_writes_one_line_a_press(tmp_path: Path) -> None:
         "0,1.2346,-2.0000,0.5000,0.2500,0.4000,3.0000,1,1.2500,0.5000,7.0000,1.0000",
         "1,0.0000,3.5000,1.0000,2.0000,1.5000,3.0000,0,2.0000,1.0000,8.0000,1.0000",
     ]
-    with pytest.raises(InputError, match="cannot be written"):
-        write_localization(found, tmp_path)
 
 
 @pytest.mark.parametrize("fixture", ["localizer", "deep_localizer"])

@@ -11,6 +11,7 @@ from padforge.sense.localizer.moments import LATEST_WINDOWS, N_PRESS_WINDOWS, N_
 from padforge.sense.localizer.press_sampler import PressSampler
 from padforge.sense.localizer.response_model import grid_positions, interpolate_grid
 from padforge.sense.localizer.scaler import FeatureScaler, TrainingPresses
+from tests.helpers.constants import with_constants
 from tests.helpers.presses import training_presses
 
 PRESSES, FIBRES, SIDE, BATCH = 60, 2, 9, 400
@@ -48,9 +49,7 @@ def draw(presses: TrainingPresses, table: np.ndarray, phase: Phase) -> tuple[np.
     return rows, features.reshape(BATCH, FIBRES, N_FEATURES), seen == 1
 
 
-@pytest.fixture(autouse=True)
-def noiseless(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(press_sampler, "LATEST_NOISE", 0.0)
+noiseless = with_constants((press_sampler, {"LATEST_NOISE": 0.0}))
 
 
 @pytest.mark.parametrize("name", PHASES[N_TIMED])

@@ -11,7 +11,7 @@ from padforge.common.page import PageSection
 from padforge.sense import Evaluation, LocalizerSettings, Recording, evaluate
 from padforge.sense.localizer import evaluation as evaluation_module
 from padforge.sense.localizer.evaluation import calibration_lines, moment_lines
-from padforge.sense.localizer.model import LocalizerModel, write_localization
+from padforge.sense.localizer.model import LocalizerModel
 from padforge.sense.localizer.moments import MOMENTS
 from padforge.sense.report import calibration
 from padforge.sense.report.sections import calibration_sections, fibre_loss_sections
@@ -71,13 +71,6 @@ def test_calibration_is_kept_whole(
     golden("sense/calibration/page.md", sections_text(calibration_sections(tmp_path, document)), rtol=1e-3)
     for name, figure in zip(("error_map", "error_by_loss", "error_by_moment"), figures, strict=True):
         golden(f"sense/calibration/{name}.txt", figure, rtol=1e-2)
-
-
-def test_places_are_kept_whole(
-    kept: tuple[LocalizerModel, Evaluation], few: Recording, golden: Any, tmp_path: Path
-) -> None:
-    write_localization(kept[0].predict(few), tmp_path / "places.csv")
-    golden("sense/calibration/places.csv", (tmp_path / "places.csv").read_text(), rtol=1e-3)
 
 
 MEASURED = {"depth_mean_mm": 0.214, "depth_p95_mm": 0.523, "depth_within_r90": 0.87}

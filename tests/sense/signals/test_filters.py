@@ -1,4 +1,4 @@
-"""Filters against optimality conditions, exhaustive search and numpy."""
+"""Filters against optimality conditions, other solvers and numpy."""
 
 import numpy as np
 import pytest
@@ -7,7 +7,6 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from padforge.benchmarks.filter import admm, fibre, linear_program
-from padforge.common.validation import InputError
 from padforge.sense import running_median, total_variation
 
 STEP_V = 3.3 / 1023
@@ -19,7 +18,6 @@ VALUES = st.one_of(
     st.floats(-10, 10).map(lambda v: round(v, 9)),
 )
 """Many ties, a converter's steps, or any but the very smallest."""
-PRESENT = hnp.arrays(np.float64, st.integers(1, 40), elements=VALUES)
 READINGS = hnp.arrays(np.float64, st.integers(1, 40), elements=st.one_of(VALUES, VALUES, st.just(np.nan)))
 
 
@@ -57,15 +55,6 @@ def excess_squares(y, x, lam):
     return max(abs(sums[-1]), beyond.max(initial=0)) if len(sums) else 0.0
 
 
-def least_by_search(y, lam):
-    """The least robust objective, over all choices of x_i among the readings: a minimiser is always among them."""
-    levels = np.unique(y)
-    cost = np.zeros(len(levels))
-    for reading in y:
-        cost = (cost[:, None] + lam * np.abs(levels[:, None] - levels)).min(axis=0) + np.abs(levels - reading)
-    return cost.min()
-
-
 @settings(max_examples=25)
 @given(READINGS, LAMS)
 def test_total_variation_meets_the_optimality_conditions(y, lam):
@@ -73,14 +62,6 @@ def test_total_variation_meets_the_optimality_conditions(y, lam):
     assert excess_robust(y, total_variation(y, lam), lam) <= 1e-10
     # sums of 40 readings up to 10, or of shares of lam, to rounding
     assert excess_squares(y, total_variation(y, lam, "squares"), lam) <= 1e-12 * (1 + min(lam, 400))
-
-
-@settings(max_examples=25)
-@given(PRESENT, LAMS)
-def test_robust_total_variation_is_the_least_of_an_exhaustive_search(y, lam):
-    x = total_variation(y, lam)
-    assert objective(y, x, lam) <= least_by_search(y, lam) * (1 + 1e-9)
-    assert y.min() <= x.min() <= x.max() <= y.max()
 
 
 @settings(max_examples=25)
@@ -161,20 +142,6 @@ def test_running_median_is_that_of_numpy(y, width, causal):
     windows = [y[max(i - before, 0) : i + after + 1] for i in range(len(y))]
     expected = [np.median(w[~np.isnan(w)]) if (~np.isnan(w)).any() else np.nan for w in windows]
     np.testing.assert_allclose(running_median(y, width, causal=causal), expected, rtol=1e-15)
-
-
-@pytest.mark.parametrize(
-    ("call", "message"),
-    [
-        (lambda: total_variation([1, np.inf], 4), r"readings hold infinity \(first at \[1\]\)"),
-        (lambda: total_variation([1], 0), "lam is 0, allowed is a number above 0"),
-        (lambda: total_variation(np.zeros((1, 1, 1)), 4), r"expected \(R,\) or \(R, C\)"),
-        (lambda: running_median([1], 2), "width is 2, allowed is an odd whole number"),
-    ],
-)
-def test_filters_refuse_wrong_arguments(call, message):
-    with pytest.raises(InputError, match=message):
-        call()
 
 
 def test_total_variation_agrees_with_the_solvers_of_the_bench():

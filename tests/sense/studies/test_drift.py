@@ -1,13 +1,11 @@
 """The study of drift, in small: levels of readings, drift compensation, and what the networks may see."""
 
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from padforge import InputError
 from padforge.design import Morphology, signals
 from padforge.design.published.networks import training_presses
 from padforge.design.published.objective import idle_share
@@ -19,10 +17,12 @@ from padforge.sense.simulation.simulated_recording import simulate
 from padforge.sense.studies import drift
 from padforge.sense.studies.drift import COMPENSATIONS, drift_study, level_indices, network_inputs
 from padforge.sense.studies.study import run
+from tests.helpers.constants import with_constants
 
 PAD = Morphology.random(2, knots=3, seed=5)
 STRONG = RigSettings(presses=180, drift_mv=300, creep=0, hysteresis=0)
 CYCLES = 5
+small = with_constants((drift, {"MEMBERS": 2, "HIDDEN": 8, "EPOCHS": 15, "RIG": STRONG}))
 DOWN, UP = 40 * np.arange(CYCLES) + 20, 40 * np.arange(1, CYCLES + 1)
 
 
@@ -34,14 +34,6 @@ def recorded() -> Recording:
     readings[100:110, 0] = np.nan
     positions_mm[7] = np.nan
     return replace(recording, readings=readings, presses_mm=positions_mm, source={"kind": "test"})
-
-
-@pytest.fixture(scope="module", autouse=True)
-def small() -> Iterator[None]:
-    with pytest.MonkeyPatch.context() as patched:
-        for name, value in (("MEMBERS", 2), ("HIDDEN", 8), ("EPOCHS", 15), ("RIG", STRONG)):
-            patched.setattr(drift, name, value)
-        yield
 
 
 def test_levels_are_the_readings_10_30_and_50_of_a_cycle() -> None:
@@ -105,14 +97,6 @@ def test_networks_do_not_depend_on_positions_of_test_presses(
     for key, count in (("test_0", len(test)), ("last_0", len(last))):
         assert right[key].shape == (2, count)
         np.testing.assert_allclose(right[key] + left[key], 2 * far_mm, rtol=0, atol=0.01)
-
-
-def test_drift_study_rejects_duplicate_and_short_recordings(recorded: Recording) -> None:
-    with pytest.raises(InputError, match="a: label of a morphology and of a recording"):
-        drift_study({"a": PAD}, {"a": recorded})
-    few = np.where(np.arange(len(recorded.presses_mm))[:, None] < 3, recorded.presses_mm, np.nan)
-    with pytest.raises(InputError, match="few: recording has 3 presses of known"):
-        drift_study({}, {"few": replace(recorded, presses_mm=few)})
 
 
 def test_idle_share_of_the_published_pad(published: Path) -> None:

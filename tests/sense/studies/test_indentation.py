@@ -1,16 +1,14 @@
 """The studies of force and of shape, in small: estimates are better than guesses."""
 
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from padforge import InputError
 from padforge.design import Contact, Morphology, contact
 from padforge.sense.studies import indentation
 from padforge.sense.studies.indentation import FOOTPRINTS, SETS, circumradius, force_study, shape_study, tool_contacts
-from padforge.sense.studies.study import Sizes, Study, run
+from padforge.sense.studies.study import Sizes, run
 
 PAD = {"random": Morphology.random(2, 2, 0)}
 UNIT_MM = 11.25
@@ -46,12 +44,6 @@ def test_tools_have_one_size_and_the_layer_of_the_contact_and_polygons_one_area(
         radius = circumradius(sides)
         area = np.pi * radius**2 if sides is None else sides / 2 * radius**2 * np.sin(2 * np.pi / sides)
         assert area == pytest.approx(np.pi)
-
-
-@pytest.mark.parametrize("study", [force_study, shape_study])
-def test_contact_without_depth_is_refused(study: Callable[..., Study]) -> None:
-    with pytest.raises(InputError, match=r"\[contact\] model is shape, allowed is layer"):
-        study(PAD, contact=Contact(radius=0.6))
 
 
 @pytest.mark.slow

@@ -1,8 +1,6 @@
 """Learning curves: the power law is recovered, the forecast follows, and an interrupt ends it at once."""
 
 import json
-from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -12,10 +10,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from padforge.common.validation import InputError
 from padforge.sense import Recording
+from padforge.sense.localizer import response_model
 from padforge.sense.settings import LocalizerSettings as Options
+from padforge.sense.studies import learning_curve as study
 from padforge.sense.studies.learning_curve import fit_power_law, learning_curve, power_law
+from tests.helpers.constants import with_constants
 from tests.helpers.door import called
 from tests.helpers.golden import Golden, json_text
 
@@ -40,13 +40,7 @@ def test_fit_power_law_never_rises(errors: list[float]) -> None:
     assert min(fit) >= 0
 
 
-@pytest.fixture(scope="module", autouse=True)
-def quick() -> Iterator[None]:
-    """Few resamplings, and a coarse response model."""
-    with pytest.MonkeyPatch.context() as patched:
-        patched.setattr("padforge.sense.studies.learning_curve.RESAMPLINGS", 20)
-        patched.setattr("padforge.sense.localizer.response_model.RBF_SIDE", 7)
-        yield
+quick = with_constants((study, {"RESAMPLINGS": 20}), (response_model, {"RBF_SIDE": 7}))
 
 
 class Trained:
@@ -67,7 +61,7 @@ def test_learning_curve_command_writes_document_and_figure(
     recording: Recording, golden: Golden, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Errors are those of the test presses alone, and the interval is that of 80 % of the resamplings."""
-    monkeypatch.setattr("padforge.sense.studies.learning_curve.fit_recording", Trained)
+    monkeypatch.setattr(study, "fit_recording", Trained)
     recording.save(tmp_path / "rec", {})
     ended = called("sense", "learning-curve", "rec", "--out", "out", "--json", cwd=tmp_path)
     document = json.loads(ended.out)
@@ -77,13 +71,6 @@ def test_learning_curve_command_writes_document_and_figure(
     golden("studies/learning_curve.json", json_text(document))
     for point in document["points"]:
         assert point["mean_mm"] == pytest.approx(1 + 8 / np.sqrt(point["presses"]), rel=0.15)
-
-
-def test_learning_curve_rejects_too_few_presses(recording: Recording) -> None:
-    positions_mm = recording.presses_mm.copy()
-    positions_mm[100:] = np.nan
-    with pytest.raises(InputError, match="85 presses to train on, expected at least 160"):
-        learning_curve(replace(recording, presses_mm=positions_mm), QUICK)
 
 
 def test_interrupt_ends_a_learning_curve_at_once(recording: Recording) -> None:

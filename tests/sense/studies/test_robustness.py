@@ -1,30 +1,22 @@
 """The study of robustness, and its files."""
 
 from collections import Counter
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from padforge import InputError
 from padforge.design import Contact, Morphology
 from padforge.design.published.networks import SimulatedPresses
 from padforge.sense.studies import robustness
 from padforge.sense.studies.robustness import MIN_NETWORKS, robustness_study
 from padforge.sense.studies.study import load_pads, run
+from tests.helpers.constants import with_constants
 from tests.sense.conftest import blank_pictures
 
 PADS = {"square": Morphology.straight(2), "random": Morphology.random(2, 3, 0)}
 
-
-@pytest.fixture(autouse=True, scope="module")
-def small() -> Iterator[None]:
-    with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(robustness, "HIDDEN", 8)
-        patched.setattr(robustness, "TEST", 150)
-        patched.setattr(robustness, "MIN_NETWORKS", 4)
-        yield
+small = with_constants((robustness, {"HIDDEN": 8, "TEST": 150, "MIN_NETWORKS": 4}))
 
 
 @pytest.fixture(scope="module")
@@ -89,9 +81,3 @@ def test_every_mean_is_over_sixteen_networks_or_more(tmp_path: Path, monkeypatch
     by_size = {size: {count for failed, count in trained.items() if len(failed) == size} for size in range(3)}
     assert by_size == {0: {16}, 1: {4}, 2: {3}}
     assert [row["of"] for row in document["rows"]] == [1, 4, 6]
-
-
-@pytest.mark.parametrize("failed", [(4,), (0, 1, 2, 3)])
-def test_study_refuses_failed_fibres_that_are_all_or_none_of_a_pad(failed: tuple[int, ...]) -> None:
-    with pytest.raises(InputError, match="allowed are some of the 4 fibres of square"):
-        robustness_study(PADS, failed=failed)

@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from padforge import InputError
 from padforge.design import Morphology, signals
 from padforge.design.settings import PUBLISHED_CONTACT
 from padforge.sense.studies import scaling
@@ -38,10 +37,3 @@ def test_tile_inputs_are_the_same_in_every_tile() -> None:
 def test_spread_presses_draws_one_in_each_cell() -> None:
     positions = spread_presses(((1, 1), (9, 9)), 8, 0)
     assert set(map(tuple, np.floor(positions - 1).astype(int))) == {(x, y) for x in range(8) for y in range(8)}
-
-
-def test_scaling_study_rejects_tiles_that_do_not_repeat() -> None:
-    with pytest.raises(InputError, match="grids has 6, expected multiples of 4"):
-        scaling_study({"square": Morphology.straight(4)}, grids=(4, 6))
-    with pytest.raises(InputError, match=r"wide has 1 \+ 2 fibres, pitch 8 mm, expected tiles of M \+ M fibres"):
-        scaling_study({"wide": Morphology.straight((1, 2), 8.0)}, grids=(4,))

@@ -4,20 +4,16 @@ from pathlib import Path
 
 import pytest
 
-from padforge import InputError
 from padforge.design import Contact, Morphology
 from padforge.design.settings import PUBLISHED_CONTACT
 from padforge.sense.studies import sensitivity
 from padforge.sense.studies.sensitivity import sensitivity_study
 from padforge.sense.studies.study import run
+from tests.helpers.constants import with_constants
 
 PADS = {"square": Morphology.straight(3)}
 
-
-@pytest.fixture(autouse=True)
-def small(monkeypatch: pytest.MonkeyPatch) -> None:
-    for name, value in (("SIDE", 12), ("TEST", 150), ("MEMBERS", 2), ("HIDDEN", 10), ("RADII", (0.6, 1.0))):
-        monkeypatch.setattr(sensitivity, name, value)
+small = with_constants((sensitivity, {"SIDE": 12, "TEST": 150, "MEMBERS": 2, "HIDDEN": 10, "RADII": (0.6, 1.0)}))
 
 
 def test_tool_and_depth_of_half_size_err_more_between_fibres(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -35,15 +31,13 @@ def test_tool_and_depth_of_half_size_err_more_between_fibres(tmp_path: Path, mon
 
 
 def test_tools_and_depths_are_half_and_one_and_a_half_times_those_of_the_contact() -> None:
-    """Without depths beyond the thickness; a profile has no size to vary."""
+    """Without depths beyond the thickness."""
     settings = sensitivity_study(PADS, contact=Contact(tool_radius_mm=4.0, depth_mm=2.0)).settings
     assert (settings["tool_radius_mm"], settings["depth_mm"]) == ([2, 4, 6], [1, 2, 3])
     deep, shallow = (sensitivity_study(PADS, contact=Contact(depth_mm=depth_mm)) for depth_mm in (5.0, 3.0))
     assert deep.settings["depth_mm"] == [2.5, 5.0]
     assert shallow.settings["depth_mm"] == [1.5, 3.0, 4.5]
     assert len(shallow.tasks) == 9
-    with pytest.raises(InputError, match=r"\[contact\] model is profile, allowed are layer and shape"):
-        sensitivity_study(PADS, contact=Contact(model="profile"))
 
 
 def test_study_finds_that_larger_objects_are_localized_better(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from padforge import InputError
 from padforge.design import Contact, Morphology, PadSettings, SearchSettings, contact
 from padforge.design.optimize.search import SearchResult
 from padforge.design.settings import PUBLISHED_CONTACT, Layout
@@ -29,6 +28,7 @@ from padforge.sense.studies.study import (
     StudyResult,
     Task,
     compute_states,
+    describe_pads,
     draw_confusions,
     fit_and_predict,
     load_pads,
@@ -135,14 +135,29 @@ def test_invalid_study_command_fails_in_one_line(arguments: list[str], message: 
     assert message in refused("study", *arguments, "--out", "out", cwd=tmp_path)
 
 
-@pytest.mark.parametrize("name", ["multicontact", "scaling"])
-def test_study_takes_contact_scatter_and_pads_from_the_settings(
-    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """And is the paper's where they state no contact."""
+@pytest.fixture
+def studies(monkeypatch: pytest.MonkeyPatch) -> list[Study]:
+    """Studies that commands would run."""
     studies: list[Study] = []
     monkeypatch.setattr("padforge.sense.studies.study.run", lambda study, *_, **__: studies.append(study) or {})
     monkeypatch.setattr("padforge.sense.studies.study.study_lines", lambda document: [])
+    return studies
+
+
+@pytest.mark.parametrize("name", [*SMALLEST, "robustness", "sensitivity"])
+def test_seed_of_a_command_is_that_of_its_pads_and_of_its_study(
+    name: str, studies: list[Study], tmp_path: Path
+) -> None:
+    assert called("study", name, "random-2@2", "--seed", "3", "--out", "out", cwd=tmp_path).code == 0
+    assert studies[0].settings["seed"] == 3
+    assert studies[0].settings["pads"] == describe_pads({"random-2@2": Morphology.random(2, 2, 3)})
+
+
+@pytest.mark.parametrize("name", ["multicontact", "scaling"])
+def test_study_takes_contact_scatter_and_pads_from_the_settings(
+    name: str, studies: list[Study], tmp_path: Path
+) -> None:
+    """And is the paper's where they state no contact."""
     layer = "[contact]\ndepth_mm = 3\n[search]\nscatter = 0.1\n[pad]\ngrid = 3\npitch_mm = 8\n"
     for path, text in (("layer.toml", layer), ("paper.toml", "")):
         (tmp_path / path).write_text(text)
@@ -202,10 +217,6 @@ def test_load_pads_by_file_by_name_or_by_a_search(tmp_path: Path, monkeypatch: p
     names = ("optimised", "optimised-5", "genetic-1@2", "optimised-30@3")
     assert tuple(load_pads(names, seed=4)) == names
     assert requests == [(4, "descent", 21, 4), (4, "descent", 5, 4), (2, "genetic", 1, 4), (3, "descent", 30, 4)]
-    with pytest.raises(InputError, match="genetic search knots: got 65"):
-        load_pads(("genetic-65",), seed=0)
-    with pytest.raises(InputError, match="none of square, optimised, random-N, optimised-N, genetic-N"):
-        load_pads(("optimised-0",), seed=0)
 
 
 def test_read_counts_gives_whole_counts_up_to_full_scale_of_the_training() -> None:

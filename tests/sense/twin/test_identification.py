@@ -1,15 +1,14 @@
 """Identification of pads whose truth is known, and recordings that do not suffice."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 
 from padforge import InputError
-from padforge.benchmarks import harness
 from padforge.benchmarks import twin as bench
 from padforge.benchmarks.twin import printed_pad
-from padforge.common.progress import ignore_progress
 from padforge.design import Morphology
 from padforge.design.settings import Contact, PadSettings
 from padforge.design.twin import Twin
@@ -145,16 +144,13 @@ def test_identify_recognizes_a_rectangle_turned_by_a_quarter() -> None:
 @pytest.mark.slow
 @few_candidates()
 @few_compared()
-def test_twin_predicts_better_than_baselines(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_twin_predicts_better_than_baselines(monkeypatch: pytest.MonkeyPatch, taken: Any) -> None:
     small = {"PRESSES": (150,), "GRID": 2, "KNOTS": 3, "WORLDS": {"small": ("gaussian", 0.5, 1)}}
     for name, value in small.items():
         monkeypatch.setattr(bench, name, value)
-    monkeypatch.setattr(harness, "BUDGET_S", 0)
     for cached in (bench.printed, bench.recorded):
         cached.cache_clear()
-    measured = harness.BenchRounds()
-    harness.measure_round(bench.BENCH, measured, ignore_progress, lambda key: False)
-    results = {key[1]: row for key, row in measured.results.items()}
+    results = {key[1]: row for key, row in taken(bench.BENCH).items()}
     for cached in (bench.printed, bench.recorded):
         cached.cache_clear()
     assert list(results) == ["twin", "plan", "place"]

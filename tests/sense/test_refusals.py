@@ -1,0 +1,136 @@
+"""What filters, localizers, studies and live pads refuse of a program, and in which words."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from padforge.design import Contact, Morphology
+from padforge.design.settings import Layout
+from padforge.sense import (
+    Live,
+    Localizer,
+    PressDetector,
+    PressWindows,
+    Recording,
+    calibrate,
+    evaluate,
+    recalibrate,
+    running_median,
+    total_variation,
+)
+from padforge.sense.deploy.onnx_export import export_onnx
+from padforge.sense.live.outputs import JsonLines
+from padforge.sense.live.viewers import RerunOutput
+from padforge.sense.localizer.model import LocalizerModel, write_localization
+from padforge.sense.localizer.response_priors import planned_pad
+from padforge.sense.settings import LocalizerSettings
+from padforge.sense.studies.drift import drift_study
+from padforge.sense.studies.fibre_loss import fibre_loss_study
+from padforge.sense.studies.indentation import force_study, shape_study
+from padforge.sense.studies.learning_curve import learning_curve
+from padforge.sense.studies.robustness import robustness_study
+from padforge.sense.studies.scaling import scaling_study
+from padforge.sense.studies.sensitivity import sensitivity_study
+from padforge.sense.studies.study import load_pads
+from tests.helpers.golden import Golden
+from tests.helpers.refusals import refusal_table
+
+PADS = {"square": Morphology.straight(2)}
+SIX = Morphology.random(3, knots=2, seed=0)
+
+
+def known(recording: Recording, presses: int) -> Recording:
+    """The recording, with the positions of its first presses alone."""
+    is_known = np.arange(len(recording.presses_mm))[:, None] < presses
+    return replace(recording, presses_mm=np.where(is_known, recording.presses_mm, np.nan))
+
+
+def test_what_programs_ask_of_signals_and_localizers_in_vain(
+    localizer: LocalizerModel, recording: Recording, golden: Golden, tmp_path: Path
+) -> None:
+    detector, presses = PressDetector(2), localizer.scaled_features(recording)
+    detector.update([0.0, 0.1], np.zeros((2, 2)))
+    detector.update([], np.zeros((0, 2)))
+    published, few = replace(localizer, method="published"), LocalizerSettings(epochs=1, test_share=1e-4)
+    learnt, x = replace(localizer, fibre_names=("c1", "c2", "c3", "c4")), np.zeros((9, 4, 3))
+    swapped = replace(recording, source={"fibre_names": ["c1", "c3", "c2", "c4"]})
+    other = replace(recording, source={"morphology": recording.source["morphology"] | {"pitch_mm": 9.0}})
+    live = Live(localizer, rate_hz=recording.rate_hz)
+    live.feed(recording.times_s[:9], recording.readings[:9])
+    of_arrays = Localizer()
+    of_arrays.model_ = replace(localizer, features="array")
+    rows = {
+        "a filter of an infinite reading": lambda: total_variation([1, np.inf], 4),
+        "a filter without weight": lambda: total_variation([1], 0),
+        "a filter of a cube": lambda: total_variation(np.zeros((1, 1, 1)), 4),
+        "a median of two": lambda: running_median([1], 2),
+        "a detector of other fibres": lambda: PressDetector(4).update(np.zeros(3), np.zeros((3, 2))),
+        "a detector at the time before": lambda: detector.update([0.1, 0.3], np.zeros((2, 2))),
+        "no press to test on": lambda: calibrate(recording, few),
+        "the published method in a given time": lambda: calibrate(
+            recording, LocalizerSettings(method="published"), time_budget=5
+        ),
+        "a plan of more fibres": lambda: planned_pad(recording, SIX),
+        "as many failed fibres as there are": lambda: evaluate(localizer, recording, [4]),
+        "no number of failed fibres": lambda: evaluate(localizer, recording, []),
+        "a recording of the recalibration": lambda: evaluate(
+            replace(localizer, recalibrated_by=(recording.digest,)), recording
+        ),
+        "few presses to recalibrate by": lambda: recalibrate(localizer, known(recording, 9)),
+        "a fibre that is not there": lambda: localizer.predict_features(presses, [4]),
+        "no fibre that works": lambda: localizer.predict_features(presses, range(4)),
+        "failed fibres by the published method": lambda: published.predict(recording, [1]),
+        "a fibre that is missing": lambda: localizer.predict(replace(recording, readings=recording.readings[:, :3])),
+        "few readings a second": lambda: localizer.predict(replace(recording, times_s=recording.times_s / 0.74)),
+        "fibres in another order": lambda: learnt.predict(swapped),
+        "another plan": lambda: localizer.predict(other),
+        "a table where a folder is": lambda: write_localization(localizer.predict(recording), tmp_path),
+        "a localizer before its fit": lambda: Localizer().predict(recording),
+        "more presses than positions": lambda: Localizer().fit(x, recording.presses_mm),
+        "positions beside a recording": lambda: Localizer().fit(recording, recording.presses_mm),
+        "a recording by a localizer of arrays": lambda: of_arrays.predict(recording),
+        "arrays of other windows": lambda: of_arrays.predict(x),
+        "an option that is none": lambda: Localizer(depth=3, **dict.fromkeys("hgfedcba", 0)),
+        "windows before their fit": lambda: PressWindows().transform(recording),
+        "windows of other presses": lambda: PressWindows().fit(recording, np.zeros((3, 2))),
+        "a graph of the published method": lambda: export_onnx(published, "", tmp_path / "l.onnx"),
+        "a graph of arrays": lambda: export_onnx(of_arrays.model_, "", tmp_path / "l.onnx"),
+        "few readings a second, live": lambda: Live(localizer, rate_hz=9.9),
+        "other fibres, live": lambda: Live(localizer, rate_hz=20.0, fibres=3),
+        "arrays, live": lambda: Live(of_arrays, rate_hz=20.0),
+        "readings of before, live": lambda: live.feed(recording.times_s[8:12], recording.readings[8:12]),
+        "lines for all without a token": lambda: JsonLines("0.0.0.0", 0),
+        "a viewer without an address": lambda: RerunOutput("localhost:9876", 2, [1.0, 2.0], [20.0, 10.0]),
+        "a file for a viewer in no folder": lambda: RerunOutput(
+            str(tmp_path / "no.csv/pad.rrd"), 2, [1.0, 2.0], [20.0, 10.0]
+        ),
+    }
+    (tmp_path / "no.csv").touch()
+    digests, tokens = rf"{other.pad_digest[:12]}|{localizer.pad_sha256[:12]}", r"(?<=--token )\S+"
+    golden("sense/refusals.txt", refusal_table(rows), forget=[digests, tokens, r"(?<=cannot be written )\(.*\)"])
+    for ratio in (0.76, 7.0):  # three quarters of the readings a second will do, and more
+        localizer.scaled_features(replace(recording, times_s=recording.times_s / ratio))
+    detector.update([0.11], np.zeros((1, 2)))
+
+
+def test_what_studies_are_asked_in_vain(localizer: LocalizerModel, recording: Recording, golden: Golden) -> None:
+    shape, profile = Contact(radius=0.6), Contact(model="profile")
+    rows = {
+        "a fibre that a pad has not": lambda: robustness_study(PADS, failed=(4,)),
+        "all fibres of a pad": lambda: robustness_study(PADS, failed=(0, 1, 2, 3)),
+        "a label twice": lambda: drift_study({"a": PADS["square"]}, {"a": recording}),
+        "a recording of three presses": lambda: drift_study({}, {"few": known(recording, 3)}),
+        "the size of a profile": lambda: sensitivity_study(PADS, contact=profile),
+        "the depth of a shape": lambda: force_study(PADS, contact=shape),
+        "tools of a shape": lambda: shape_study(PADS, contact=shape),
+        "a fibre that a recording has not": lambda: fibre_loss_study(recording, localizer, failed=(4,)),
+        "all fibres of a recording": lambda: fibre_loss_study(recording, localizer, failed=(0, 1, 2, 3)),
+        "neither method of fibre loss": lambda: fibre_loss_study(recording),
+        "half a tile": lambda: scaling_study({"square": Morphology.straight(4)}, grids=(4, 6)),
+        "a tile that is not square": lambda: scaling_study({"wide": Morphology.straight((1, 2), 8.0)}, grids=(4,)),
+        "a curve of 85 presses": lambda: learning_curve(known(recording, 100)),
+        "more knots than are searched for": lambda: load_pads(("genetic-65",), 0),
+        "no knots": lambda: load_pads(("optimised-0",), 0, Layout.create((1, 2), 8.0)),
+    }
+    golden("studies/refusals.txt", refusal_table(rows))
