@@ -10,6 +10,7 @@ from click.testing import CliRunner
 
 from padforge.common.validation import InputError
 from padforge.sense import (
+    Localization,
     Recorder,
     Recording,
     export_bag,
