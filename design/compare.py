@@ -136,7 +136,7 @@ def compare(
                 raise KeyboardInterrupt  # ends the comparison, not only this search
             pad = result.morphology
         rows.append(_evaluate(variant, pad, seed) | dict(make_pad(pad, variant.spec, folder)))
-    origin = provenance("padforge design compare", seed or 0)
+    origin = provenance("padforge design compare", seed)
     document = {"format": FORMAT, "rows": rows, "provenance": origin}
     write_json(out / NAME, document)
     _draw_comparison(rows, out / "comparison.png")

@@ -32,11 +32,11 @@ def failure_shares(max_failures: int | tuple[float, ...]) -> tuple[float, ...]:
 
 
 def sample_failures(fibres: int, shares: tuple[float, ...], rng: np.random.Generator) -> Array:
-    """Draw masks (L, F), 1 for a working fibre: two sets of failed fibres of each size, and the one of size 0.
+    """Draw masks (L, F), 1 for a working fibre: a set of failed fibres of each size.
 
     Sizes of probability 0 by `shares`, and those that leave no fibre, are omitted.
     """
-    sizes = [size for size, share in enumerate(shares[:fibres]) if share > 0 for _ in range(2 if size else 1)]
+    sizes = [size for size, share in enumerate(shares[:fibres]) if share > 0]
     masks = np.ones((len(sizes), fibres))
     for mask, n_failed in zip(masks, sizes, strict=True):
         mask[rng.choice(fibres, n_failed, replace=False)] = 0
