@@ -299,7 +299,7 @@ def _compile_build(fabrication: Fabrication, names: list[str], origin: Mapping[s
 def _write_files(out: Path, writers: Mapping[str, Callable[[Path], None]], result: Build) -> Build:
     """Write the files of a mould and their digests atomically, and delete those of an earlier mould."""
     try:
-        earlier = files.read_json(out / "fabrication.json", FORMAT)["sha256"]
+        earlier = files.read_json(out / "fabrication.json", FORMAT).get("sha256", {})
     except InputError:
         earlier = {}
     deleted = files.find_unchanged(out, earlier) - writers.keys()

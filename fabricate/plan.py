@@ -85,7 +85,7 @@ _DIGITS = (
 def draw_number(number: int, height_mm: float, width_mm: float) -> BaseGeometry:
     """Return the outline of a number, centred, and mirrored so that it is legible on the casting.
 
-    A bar under the digits distinguishes 6 from 9 and connects them; `height_mm` is from the centre lines of the top
+    A bar under the digits shows their foot and connects them; `height_mm` is from the centre lines of the top
     strokes to that of the bar.
     """
     digit_mm = max(height_mm - width_mm, height_mm / 2)
@@ -136,7 +136,7 @@ def _position_numbers(plan: "Plan", numbers: Sequence[BaseGeometry]) -> list[Bas
 def _find_free(
     middles: Array, half: Array, floor: BaseGeometry, obstacles: Sequence[BaseGeometry], clearance: float
 ) -> Array | None:
-    """Return the first middle (2,), of (n, 2), of a box with half sides (2,) on the floor and clear of obstacles."""
+    """Return the first of `middles` (n, 2) whose box, with half sides (2,), is on the floor and clear, or None."""
     for batch in np.split(middles, range(_NUMBER_TRIES, len(middles), _NUMBER_TRIES)):
         boxes = shapely.box(*(batch - half).T, *(batch + half).T)
         is_free = shapely.contains(floor, boxes)
@@ -177,7 +177,7 @@ class Plan:
         check_type("pad", self.pad, Morphology)
         check_type("settings", self.settings, FabricationSettings).require_consistent(self.pad.layout)
         if self.settings.pad.keep_out_mm and self.nominal is None:
-            keep_outs(self.settings.pad.for_layout(self.pad.layout))
+            keep_outs(self.settings.pad.for_layout(self.pad.layout))  # raises
 
     @cached_property
     def shrinkage_compensated(self) -> "Plan":
@@ -233,14 +233,14 @@ class Plan:
 
         Args:
             step: maximum turn between successive points, radians.
-            past_mm: length of the traces past the ends of their tongues.
+            past_mm: length beyond the outer ends of the exits.
         """
-        past = self.settings.mould.exit_mm + past_mm
+        out = self.settings.mould.exit_mm + past_mm
         traces = []
         shapes = zip(curves.beziers(self.pad), curves.slope_beziers(self.pad), strict=True)
         for fibre, (spans, slopes) in enumerate(shapes):
             points, headings = curves.trace_curve(spans, slopes, step)
-            (start, start_headings), (end, end_headings) = (lead.trace(step, past) for lead in self.leads.pairs[fibre])
+            (start, start_headings), (end, end_headings) = (lead.trace(step, out) for lead in self.leads.pairs[fibre])
             headings = np.pi / 2 - headings if self.family(fibre) else headings
             headings = np.concatenate([start_headings[::-1] + np.pi, headings, end_headings])
             traces.append((np.vstack([start[::-1], self.pad.to_mm(points), end]), np.unwrap(headings)))
@@ -259,7 +259,7 @@ class Plan:
 
     @cached_property
     def lengths_mm(self) -> Array:
-        """Length of every fibre within the silicone, tongues included; shape (F,)."""
+        """Length of every fibre within the silicone, exits included; shape (F,)."""
         leads = [start.length_mm + end.length_mm for start, end in self.leads.pairs]
         return curves.lengths(self.pad) * self.pad.unit_mm + leads + 2 * self.settings.mould.exit_mm
 
@@ -337,8 +337,8 @@ class Plan:
     def heights_mm(self) -> tuple[float, ...]:
         """Ridge height of every layer, ascending, mm above the tray's floor.
 
-        The lowest is that of the shallow family, or of the deep one if the pad has no other: designs assume the depth
-        of each family, whether the other one exists or not.
+        The lowest is that of the shallow family if the pad has one, else that of the deep one: a design assumes the
+        same depth of a family with and without the other.
         """
         mould = self.settings.mould
         has_shallow = self.pad.layout.counts[self.settings.pad.deep_family == "horizontal"] > 0
@@ -407,8 +407,8 @@ class Plan:
         if not self.settings.pad.keep_out_mm:
             return shapely.MultiPolygon()
         into_mm = self.flare_mm + INTO_WALL_MM
-        keep_outs = self.settings.pad.keep_out_mm
-        discs = [self._disc(*each[:3]) if is_hole(each) else shapely.Polygon(each) for each in keep_outs]
+        shapes = self.settings.pad.keep_out_mm
+        discs = [self._disc(*each[:3]) if is_hole(each) else shapely.Polygon(each) for each in shapes]
         outlines = shapely.union_all(discs).intersection(self.cavity.buffer(into_mm, join_style="mitre"))
         low, high = np.reshape(self.cavity.bounds, (2, 2))
         for axis in (0, 1):  # in sequence, so that corners are filled as well
@@ -463,7 +463,7 @@ class Plan:
 def _wall_extensions(
     outlines: BaseGeometry, low: Array, high: Array, axis: int, into_mm: float
 ) -> list[shapely.Polygon]:
-    """Return boxes that extend outlines into the walls, at `low` and `high` (2,) along an axis, that they touch."""
+    """Return boxes that extend outlines into the walls they touch, at `low` and `high` (2,) along an axis."""
     extensions = []
     for edge, outward in ((low[axis], -1), (high[axis], 1)):
         strip = np.stack([low, high])

@@ -46,7 +46,7 @@ MAX_COMPARISONS = 10**8
 class Gradient:
     """Gradients of the sum of all penalties by their inputs, to which each penalty adds its own.
 
-    The arc lengths by which samples are weighted are treated as constants (see `rule_penalties`).
+    The shares of arc length that weight samples are treated as constants (see `rule_penalties`).
 
     Attributes:
         points: by the samples; shape (F, P, 2).
@@ -110,7 +110,7 @@ class FibreSamples:
         """Number and spacing of the fibres."""
         return self.pad.layout
 
-    def scale(self, limit_mm: float) -> float:
+    def limit(self, limit_mm: float) -> float:
         """Return a lower limit with the margin, grid units."""
         return self.margin * limit_mm / self.layout.unit_mm
 
@@ -189,11 +189,11 @@ def penalties(
     return Penalties(values, gradient.along + through_slopes[0], gradient.across + through_slopes[1])
 
 
-def check_comparisons(fibres: int, samples: int) -> None:
-    """Check that comparing the samples of so many fibres, or pairs of fibres, does not take too long."""
-    if fibres * samples**2 > MAX_COMPARISONS:
+def check_comparisons(pairs: int, samples: int) -> None:
+    """Raise InputError if comparing the samples of so many fibres, or pairs of them, takes too long."""
+    if pairs * samples**2 > MAX_COMPARISONS:
         raise InputError(
-            f"the rules take {fibres * samples**2} comparisons for so many fibres and knots, allowed are "
+            f"the rules take {pairs * samples**2} comparisons for so many fibres and knots, allowed are "
             f"{MAX_COMPARISONS}; take fewer, or no limit on crossings"
         )
 
@@ -207,7 +207,7 @@ def _bends(fibres: FibreSamples, gradient: Gradient) -> float | None:
     radius_mm = fibres.rules.min_mean_bend_radius_mm
     if radius_mm == 0:
         return None
-    radius, window = fibres.scale(radius_mm), radius_mm / fibres.layout.unit_mm / 2
+    radius, window = fibres.limit(radius_mm), radius_mm / fibres.layout.unit_mm / 2
     rolled = radius_mm / 2 / (fibres.pad.bent_radius_mm or math.inf)
     weight, all_bends = 1 / len(fibres.arc) / fibres.mean_run, fibres.all_bends
     return sum_excess_turns(
@@ -217,7 +217,7 @@ def _bends(fibres: FibreSamples, gradient: Gradient) -> float | None:
 
 def _gaps(fibres: FibreSamples, gradient: Gradient) -> float | None:
     """Penalise neighbours of a family that are nearer to each other than the gap, relative to it."""
-    gap, lower = fibres.scale(fibres.rules.min_gap_mm), fibres.lower
+    gap, lower = fibres.limit(fibres.rules.min_gap_mm), fibres.lower
     if gap == 0 or not lower:
         return None
     pairs = [pair for fibre in lower for pair in ((fibre, fibre + 1), (fibre + 1, fibre))]
@@ -226,8 +226,8 @@ def _gaps(fibres: FibreSamples, gradient: Gradient) -> float | None:
 
 def _folds(fibres: FibreSamples, gradient: Gradient) -> float | None:
     """Penalise a fibre that is nearer than the gap to a part of itself that is FOLD gaps or more away along it."""
-    gap = fibres.scale(fibres.rules.min_gap_mm)
-    if gap <= fibres.scale(fibres.rules.min_mean_bend_radius_mm):  # a bend of that radius keeps the gap
+    gap = fibres.limit(fibres.rules.min_gap_mm)
+    if gap <= fibres.limit(fibres.rules.min_mean_bend_radius_mm):  # a bend of that radius keeps the gap
         return None
     return _closeness(fibres, [(fibre, fibre) for fibre in range(len(fibres.arc))], gap, gradient)
 
@@ -246,7 +246,7 @@ def _family_crossings(fibres: FibreSamples, gradient: Gradient) -> float | None:
     if limit > 0:
         pairs = [pair for rows in layout.families for pair in combinations(range(rows.start, rows.stop), 2)]
         return _excess_crossings(fibres, pairs, limit / fibres.margin, gradient)
-    gap = max(fibres.scale(fibres.rules.min_gap_mm), 0.01)
+    gap = max(fibres.limit(fibres.rules.min_gap_mm), 0.01)
     stations = math.ceil(40 * max(layout.extent)) + 1  # 40 per grid unit
     return sum_order(
         fibres.along,
@@ -297,7 +297,7 @@ def _common_tracks(fibres: FibreSamples, gradient: Gradient) -> float | None:
         pairs = one.start + stretches.line[is_long], other.start + stretches.other[is_long]
         samples = fibres.points, fibres.slope, fibres.arc
         total += sum_overlaps(*samples, pairs, middle, limit / 2, width, grad_points)
-    weight = COMMON_WEIGHT * limit / 4 / len(fibres.arc) / fibres.mean_run  # the mean of two points, along either fibre
+    weight = COMMON_WEIGHT * limit / 4 / len(fibres.arc) / fibres.mean_run  # mean of two points, for either family
     gradient.points += weight * grad_points
     return weight * total
 
@@ -318,7 +318,7 @@ def _keep_outs(fibres: FibreSamples, gradient: Gradient) -> float | None:
     """Penalise fibres that are inside a keep-out or nearer to it than the clearance, relative to it."""
     if not fibres.pad.keep_out_mm:
         return None
-    clearance, plan = max(fibres.scale(fibres.rules.keep_out_mm), 0.1), fibres.swap_axes(fibres.points)
+    clearance, plan = max(fibres.limit(fibres.rules.keep_out_mm), 0.1), fibres.swap_axes(fibres.points)
     samples, grad_plan, total = np.asarray(shapely.points(plan)), np.zeros_like(plan), 0.0
     for polygon in keep_outs(fibres.pad):
         shapely.prepare(polygon)
@@ -355,7 +355,7 @@ PENALTIES: dict[str, Callable[[FibreSamples, Gradient], float | None]] = {
     "keep_out_mm": _keep_outs,
     "max_length_mm": _lengths,
 }
-"""Penalties by the key of their rule in `[rules]`; None if it cannot be broken on this pad. Two have other names:
+"""Penalties by the key of their rule in `[rules]`; they return None if no fibres can break it. Two have no key:
 `folds` belongs to `min_gap_mm`, and `end_slopes` keeps fibres from running along the walls at which they end.
 """
 
@@ -370,7 +370,7 @@ def _excess_crossings(fibres: FibreSamples, pairs: list[tuple[int, int]], limit:
 def _crossings(
     fibres: FibreSamples, pairs: list[tuple[int, int]], limit: float, weights: tuple[float, float], gradient: Gradient
 ) -> tuple[float, float]:
-    """Return `sum_crossings`, with crossings blurred by 0.1 grid units, and add its gradient with these weights."""
+    """Return number and flatness of crossings, blurred by 0.1 grid units; add their weighted gradient."""
     check_comparisons(len(pairs), fibres.arc.shape[1])
     axes = np.repeat([0, 1], fibres.layout.counts)
     plan, grad_plan = fibres.swap_axes(fibres.points), np.zeros_like(fibres.points)

@@ -41,7 +41,7 @@ if TYPE_CHECKING:
 SLICE_STEPS = {"descent": 20, "genetic": 2}  # steps or generations of a slice, by method: about a third of a second
 SLICE_S = 1.0  # time after which a slice ends early, so that a time budget is kept even if steps are slow
 GRACE_S = 10.0
-"""Time after a deadline for running slices to end. One takes a second or so, but an executor may hang."""
+"""Time after a deadline for running slices to end: a second or so, but an executor may hang."""
 LAYOUT_KEYS = ("grid", "horizontals", "verticals", "pitch_mm", "size_mm")
 """Keys of `[pad]` that determine where fibres end."""
 BUDGET_SHARES = {"default": 0.35, "twin": 0.4, "from default": 0.2}
@@ -91,7 +91,7 @@ class SearchResult:
         candidate: name of the candidate: "start 2", "genetic", "straight fibres", or "origin", the pad to start from.
         straight: expected errors and ambiguities of straight fibres on the same pad, by name, for comparison.
         enforced: whether rules were enforced.
-        history: one entry per logged step: {"run", "step", "objective"}.
+        history: {"run", "step", "objective"}; of "descent" means of 10 steps.
         seconds: wall time.
         stopped: why the search ended early: "interrupted", "out of time", or "" if it did not.
     """
@@ -307,11 +307,11 @@ def _finish_starts(problem: SearchProblem, states: dict[int, State], stop: Stop)
 
 def _straight_pad(problem: SearchProblem, stop: Stop) -> Morphology:
     """Return straight fibres with as many knots as searched ones, led around keep-outs and repaired if necessary."""
-    pad_settings, search = problem.pad, problem.search
-    pad = Morphology.from_layout(straight_paths(pad_settings, problem.rules, search.knots), pad_settings.layout)
+    pad_settings, options = problem.pad, problem.search
+    pad = Morphology.from_layout(straight_paths(pad_settings, problem.rules, options.knots), pad_settings.layout)
     if not pad_settings.keep_out_mm or not problem.violations(pad):
         return pad
-    repair = replace(problem, search=search.model_copy(update={"method": "descent"}), origin=pad)
+    repair = replace(problem, search=options.model_copy(update={"method": "descent"}), origin=pad)
     return _finish_start(repair, 0, None, stop.repair_until() if stop else math.inf)
 
 
@@ -371,11 +371,11 @@ def search_for_twin(
     """Search for the next pad of a printed one, for its measured contact and scatter.
 
     Three searches run: for the default contact, which needs no measurement; for the measured contact from random
-    starts; and for the measured contact from the default pad. Among their pads and straight fibres, the one with the
-    least expected error under the measured contact is returned, but never one that locates less well than the default
-    pad or straight fibres; its `candidate` is "twin", "from default", "default" or "straight fibres".
+    starts; and for the measured contact from the default pad. Among their pads and straight fibres, `choose` takes
+    the best under the measured contact, but none that errs over 3 % more than the default pad or straight fibres, if it
+    can; its `candidate` is "twin", "from default", "default" or "straight fibres".
 
-    `settings` are those of the searches for the measured contact, the second of which starts from `origin` if that is
+    `settings` are those of the searches for the measured contact, the first of which starts from `origin` if that is
     stated. The options `run` are those of all three searches together.
     """
     run = run or SearchOptions()
@@ -391,7 +391,7 @@ def search_for_twin(
     problem = build_problem(pad, contact, settings, rules)
     pads = {"default": default.morphology, "straight fibres": Morphology.straight(pad.layout)}
     pads |= {name: result.morphology for name, result in results.items()}
-    buildable = {name: fibres for name, fibres in pads.items() if not problem.violations(fibres)}
+    buildable = {name: each for name, each in pads.items() if not problem.violations(each)}
     pads = buildable or {"twin": twin.morphology}
     with profiling.stage("judge"):
         errors = errors_by_contact(pads, {"": contact}, pad, settings)
@@ -406,9 +406,9 @@ def search_for_twin(
 
 
 def choose(errors: Mapping[str, Array]) -> str:
-    """Return the pad of least mean error that is, with any number of failures, no worse than the reference pads.
+    """Return the pad of least mean log error among those within 3 % of the best reference at each number of failures.
 
-    Errors are with 0, 1, ... fibres failed. The reference pads are "default" and "straight fibres", if present.
+    If none is, the nearest counts. Errors are with 0, 1, ... fibres failed; references "default", "straight fibres".
     """
     references = [errors[name] for name in ("default", "straight fibres") if name in errors]
     ratios = {name: error / np.min(references or list(errors.values()), axis=0) for name, error in errors.items()}

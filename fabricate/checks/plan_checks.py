@@ -127,7 +127,7 @@ def _check_track_size(plan: Plan) -> Finding:
 
 
 def _check_layers(plan: Plan) -> Finding:
-    """Check that steps have at least two printed layers, and a whole number; slicers round others."""
+    """Check that floor and ridges have two printed layers or more; slicers round fractions."""
     printer, mould = plan.settings.printer, plan.settings.mould
     layer = printer.layer_mm
     steps = {key: getattr(mould, key) for key in ("floor_mm", "shallow_ridge_height_mm", "deep_ridge_height_mm")}
@@ -190,7 +190,7 @@ def _check_common_tracks(plan: Plan) -> list[Finding]:
 
 
 def _check_silicone_wall(plan: Plan) -> Finding:
-    """Check the silicone between tracks of one depth, of two fibres or one that turns back, and keep-outs.
+    """Check the silicone between tracks of one depth (of two fibres or one), and beside keep-outs.
 
     `_check_tray_wall` checks the silicone beside the walls. The minimum width is found by bisection to 2 % or 10 µm.
     """
@@ -312,10 +312,10 @@ def _check_folds(plan: Plan) -> Finding:
         cuts = half - shapely.distance(shapely.LineString(pad.to_mm(line)), shapely.points(walls[:, axes]))
         folds += list(positions[cuts > mould.tolerance_mm][:, axes])
         max_cut = float(cuts.max(initial=max_cut))
-    bends = "1 bend is" if len(folds) == 1 else f"{len(folds)} bends are"
+    noun = "1 bend is" if len(folds) == 1 else f"{len(folds)} bends are"
     message = f"no bend cuts a track's inner wall by more than {mould.tolerance_mm:g} mm"
     if folds:
-        message = f"{bends} tighter than half the track's width, which cuts its inner wall by up to {max_cut:.2f} mm"
+        message = f"{noun} tighter than half the track's width, which cuts its inner wall by up to {max_cut:.2f} mm"
     return check_result("folds", "warn" if folds else "pass", len(folds), 0, message, folds)
 
 
@@ -360,7 +360,7 @@ def _check_keep_outs(plan: Plan) -> Iterator[Finding]:
     status: Status = "fail" if len(thin) else "warn" if len(weak) else "pass"
     positions = _points_in(thin if len(thin) else weak)
     subject, limit = ("pillars are" if positions else "no pillar is"), (line if len(thin) else _PILLAR_LINES * line)
-    message = f"{subject} thinner than {limit:g} mm, which a printer can make"
+    message = f"{subject} thinner than {limit:g} mm, the width needed"
     yield check_result("pillars", status, len(positions), 0, message, positions)
 
     pieces = sorted(shapely.get_parts(plan.silicone), key=lambda piece: piece.area)
@@ -376,7 +376,7 @@ def compute_bending_strains(plan: Plan) -> list[tuple[float, float, Position]]:
     thickness t with an inner radius R has the radius R + t / 2. At a distance z outside of it, lengths along x grow by
     the factor 1 + z / (R + t / 2), and lengths along y are constant. To first order, the strain of an element at an
     angle a to x is cos(a)^2 z / (R + t / 2). The axis of a fibre is half a diameter above the bottom of its track.
-    Each layer, the shallowest first, has its depth, its strain, negative if compressive, and where that is.
+    Returned for each layer, shallowest first, are depth, strain, negative if compressive, and its place.
     """
     radius = plan.settings.pad.bent_radius_mm
     if radius is None:

@@ -30,7 +30,7 @@ UNFINISHED = ".unfinished-"  # prefix of the names of temporary files and folder
 LOCK = ".lock"  # name of the file that locks a folder
 MAX_BYTES = 2**28  # size limit of a file; only recordings may be larger
 
-_MORPHOLOGY = "padforge-morphology/"  # prefix of the format of pads, which are independent of pads they derive from
+_MORPHOLOGY = "padforge-morphology/"  # prefix of the format of pads; none depends on the pad it derives from
 
 
 @contextmanager
@@ -76,7 +76,7 @@ def locked(folder: Path, busy: str) -> Iterator[None]:
         yield
     finally:
         if lock.is_locked:
-            with suppress(OSError):  # before the release, or another process could hold it; Windows removes it itself
+            with suppress(OSError):  # before release, or it may be another's; Windows removes the file itself
                 (folder / LOCK).unlink()
             lock.release()
 
@@ -170,7 +170,7 @@ def sync(path: Path) -> None:
         finally:
             os.close(handle)
     except OSError as error:
-        # Some network disks cannot synchronise a folder, and it needs a permission that writing there does not.
+        # Some network disks cannot synchronise a folder, and opening it needs the permission to read it.
         if error.errno not in (errno.EINVAL, errno.EACCES) or not path.is_dir():
             raise
 
@@ -297,7 +297,7 @@ def find_dependents(path: Path, remade: Collection[str] = ()) -> list[str]:
     sources, dependents = [path], set[str]()
     for source in sources:
         digest, origin = None, dict[str, Any]()
-        if not source.is_dir():  # documents have another kind of digest of a recording, a folder
+        if not source.is_dir():  # of a recording, a folder, documents hold another digest
             digest, origin = sha256(source), _as_dict(_read_dict(source).get("provenance"))
         for name, document in documents.items():
             is_pad = str(document.get("format")).startswith(_MORPHOLOGY)
@@ -310,7 +310,7 @@ def find_dependents(path: Path, remade: Collection[str] = ()) -> list[str]:
 def check_replaceable(
     path: Path, by: Path | Mapping[str, Any], remade: Collection[str] = (), force: bool = False
 ) -> None:
-    """Check that a file, if there is one, may be replaced: by an equal one, or if no other result was made from it.
+    """Raise InputError if a file exists, differs from what replaces it, and another result was made from it.
 
     `by` is the file that replaces it, or the part of its provenance known in advance; `remade` are the names of files
     that are replaced together with it.

@@ -134,7 +134,7 @@ class Spec:
         return cls(tables, str(path), sections)
 
     def section(self, model: type[AnySettings], **overrides: Any) -> AnySettings:
-        """Validate the section of `model`.
+        """Return the validated section.
 
         Args:
             model: model of the section.
@@ -153,7 +153,8 @@ class Spec:
             tables: other values, by section and key.
             source: name of the source in errors; that of these settings if empty.
         """
-        Spec(tables, source := source or self.source)
+        source = source or self.source
+        Spec(tables, source)  # checks them
         names = {*self._tables, *tables}
         return Spec({name: {**self._tables.get(name, {}), **tables.get(name, {})} for name in names}, source)
 
@@ -216,7 +217,7 @@ def _key_path(loc: Sequence[str | int], model: type[Settings], values: object) -
             path += f".{item}"
         else:
             continue
-        with suppress(LookupError, TypeError):  # a number in place of an array of one
+        with suppress(LookupError, TypeError):  # the value here is no table or list
             values = cast("Any", values)[item]
     return path.removeprefix(".")
 
@@ -238,7 +239,7 @@ def commented_toml(models: Mapping[str, type[Settings]], preset: Mapping[str, Se
 def settings_schema(models: Mapping[str, type[Settings]]) -> dict[str, Any]:
     """Return the JSON Schema of a `pad.toml`, with which editors complete and check it.
 
-    It uses draft 7, the latest one that editors for TOML support. It has no rules on several keys.
+    It uses draft 7, the latest one that editors for TOML support. It leaves out rules across keys.
     """
     from pydantic.json_schema import models_json_schema  # slow to import, and needed by one command only
 

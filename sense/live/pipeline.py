@@ -57,7 +57,7 @@ MIN_COMPLETE = 3  # complete windows of a change from which on it may be taken f
 MIN_EXPLAINED = 0.8  # minimum share of such a change that a press at its position explains
 MAX_DEEPENING = 0.6  # maximum share that the first finger, pressing deeper or less deep, explains
 LIFT_WINDOWS = 2, 3  # `RELEASE_WINDOWS` that show which of two fingers lifts off
-MAX_ERROR_RATIO = 0.5  # maximum squared error of that, relative to the second-best explanation
+MAX_ERROR_RATIO = 0.5  # maximum ratio of squared errors, best explanation to second-best
 RELEASE = max(RELEASE_WINDOWS[-1][1], RELEASED)  # readings after `up_command` that complete a press
 
 
@@ -69,7 +69,7 @@ class Estimate:
     time_s: float  # time of the touch, by the clock of the readings
     now_s: float  # time of the latest reading
     since: Literal["touch", "lift"]  # "lift" if a release has been detected
-    readings: int  # number of readings since the touch was detected, or since the lift
+    readings: int  # number of frames since the touch was detected, or since the lift
     since_s: float  # time from the touch, or the lift, to the latest reading
     final: bool  # whether it is the last estimate of the press
     x_mm: float
@@ -146,16 +146,16 @@ class BufferedPress:
     number: int  # index of the press, from 0
     time_s: float  # time of the touch
     touched: int  # first reading that shows the touch
-    down_command: int  # first reading after the command of a probe with the same touch
+    down_command: int  # first reading after the command down, estimated by the touch
     previous_end: int  # `up_command` of the previous press, < `down_command`
     baseline: Array  # readings (1, C) before the press, V
     history: Array  # history features (1, C, J), V, see `PressFeatures`
     up_command: int | None = None  # first reading after the command up; None while the press is held
     up_s: float = 0.0  # time of `up_command`
     finger: int = 1  # see `Estimate`
-    other: "BufferedPress | None" = None  # of the finger that rested before, whose relaxation is no part of this press
-    fixed: Estimate | None = None  # the last one, if another finger has changed the readings since
-    course: PressCourse | None = None  # expected one, at that position
+    other: "BufferedPress | None" = None  # that of the finger held before; its relaxation is no part of this one
+    fixed: Estimate | None = None  # last estimate before another finger changed the readings
+    course: PressCourse | None = None  # expected, at the last position
     _opening: Array | None = None
 
     def relaxation(self, rows: Indices) -> Array:
@@ -237,7 +237,7 @@ class Live:
         response_v = (np.abs(scaler.mean_v) + 2 * scaler.scale_v)[:, :n_windows].max(axis=1)
         self._response_v = np.where(response_v > 0, response_v, 1.0)  # typical maximum, the scale of the view
         self._detector = PressDetector(fibres)
-        self._frames, self._last_s = FrameStream(rate_hz, fibres), -np.inf  # time of the last reading
+        self._frames, self._last_s = FrameStream(rate_hz, fibres), -np.inf  # _last_s: last reading
         self._buffer = RingBuffer(1 + fibres)  # times and voltages of frames
         self._presses: list[BufferedPress] = []  # current ones, in the order of their touches
         # A change that may be a second finger, and the estimate of the first one before it.
@@ -254,10 +254,10 @@ class Live:
     @property
     def pressed(self) -> bool:
         """Whether the pad is pressed now."""
-        return bool(self._resting)
+        return bool(self._held)
 
     @property
-    def _resting(self) -> list[BufferedPress]:
+    def _held(self) -> list[BufferedPress]:
         return [press for press in self._presses if press.up_command is None]
 
     @property
@@ -280,7 +280,7 @@ class Live:
             readings: readings, NaN where missing; V, shape (C,) or (n, C).
 
         Returns:
-            Estimates and faults in chronological order.
+            Events, in chronological order.
 
         Raises:
             InputError: `check_stream` refuses the arrays, or times do not follow those of the last block.
@@ -342,8 +342,8 @@ class Live:
         """Start a press, and return the remaining events of the previous one."""
         touched = max(touched, self._buffer.end - SLACK)  # a slow change may be recognised as a touch hours later
         down_command = self._buffer.command_index(touched, TOUCH_DELAY_S)
-        ends = [press.up_command + 1 for press in self._presses if press.up_command is not None]
-        down_command = max([down_command, *ends])
+        free = [press.up_command + 1 for press in self._presses if press.up_command is not None]
+        down_command = max([down_command, *free])
         events = self._cut(self._presses, down_command)
         self._candidate = self._lift = None
         down_command = max(down_command, self._previous_end + 1)
@@ -369,44 +369,44 @@ class Live:
 
     def _end(self, released: int) -> list[Event]:
         """End the press whose release shows at a reading; which one of two that is, `_tell_released` finds out."""
-        self._candidate, resting = None, self._resting
-        if not resting or self._lift is not None:
+        self._candidate, held = None, self._held
+        if not held or self._lift is not None:
             return []
-        command = max(self._buffer.command_index(released, RELEASE_DELAY_S), resting[-1].touched)
-        if len(resting) > 1:
+        command = max(self._buffer.command_index(released, RELEASE_DELAY_S), held[-1].touched)
+        if len(held) > 1:
             self._lift = command
             return []
-        events = self._cut([press for press in self._presses if press is not resting[0]], command)
-        resting[0].release(command, self._buffer)
+        events = self._cut([press for press in self._presses if press is not held[0]], command)
+        held[0].release(command, self._buffer)
         return events
 
     def _suspect(self, touched: int) -> None:
         """Consider a change under a press, from a reading on, for the touch of a second finger."""
-        resting = self._resting
-        if len(resting) != 1 or self._localizer.features != "windows":
+        held = self._held
+        if len(held) != 1 or self._localizer.features != "windows":
             return
         touched = max(touched, self._buffer.end - SLACK)
-        first, down_command = resting[0], self._buffer.command_index(touched, TOUCH_DELAY_S)
-        settled = first.down_command + EARLY_WINDOWS  # earlier readings belong to the touch of the first finger
-        if down_command <= settled:
+        first, down_command = held[0], self._buffer.command_index(touched, TOUCH_DELAY_S)
+        sunk_in = first.down_command + EARLY_WINDOWS  # earlier readings belong to the touch of the first finger
+        if down_command <= sunk_in:
             return
         time_s = float(self._buffer.rows(touched, touched + 1)[0, 0])
         before = first.fixed or self._estimate(first, down_command, False)
         if before.unlike:
             return
         press = BufferedPress(
-            self._n_presses, time_s, touched, down_command, settled, baseline=first.baseline, history=first.history
+            self._n_presses, time_s, touched, down_command, sunk_in, baseline=first.baseline, history=first.history
         )
         press.finger, press.other = 3 - first.finger, first
         if first.fixed is None:
             first.course = self._course(first, down_command, before)
-        rows = np.arange(max(settled, down_command + REST[0]), down_command)
+        rows = np.arange(max(sunk_in, down_command + REST[0]), down_command)
         readings = interpolate_gaps(self._buffer.rows(int(rows[0]), down_command)[:, 1:])
         press.baseline = (readings - press.relaxation(rows)).mean(axis=0)[None]
         self._candidate = press, before
 
     def _course(self, press: BufferedPress, until: int, estimate: Estimate) -> PressCourse:
-        """Return the expected course of a press, in proportion to its readings, at an estimated position."""
+        """Return the course expected of a press at an estimated position, scaled to its readings."""
         features = self._features_of_working_fibres(press, until)
         return PressCourse.fit(self._localizer, features, np.array([estimate.x_mm, estimate.y_mm]))
 
@@ -423,8 +423,8 @@ class Live:
         return events
 
     def _judge(self, press: BufferedPress, before: Estimate) -> list[Event]:
-        """Follow a candidate as a second finger if that explains it; forget it if it does not once it is complete."""
-        first, until = self._resting[0], self._buffer.end
+        """Follow a candidate if a second finger explains it; forget one that is complete and not explained."""
+        first, until = self._held[0], self._buffer.end
         press.store_opening(self._buffer)
         n_complete = int(complete_windows(*(np.array([index]) for index in (press.down_command, until, until))).sum())
         if n_complete < MIN_COMPLETE or first.course is None:
@@ -434,7 +434,7 @@ class Live:
         elsewhere, deepening = (self._course(press, until, each) for each in (estimate, before))
         is_elsewhere = distance > before.r90_mm + estimate.r90_mm and elsewhere.explained_share > MIN_EXPLAINED
         if is_elsewhere and max(deepening.explained_share, elsewhere.share_explained_by(first.course)) < MAX_DEEPENING:
-            events = self._cut([press for press in self._presses if press is not first], press.down_command)
+            events = self._cut([each for each in self._presses if each is not first], press.down_command)
             self._candidate, first.fixed = None, before
             self._add(press)
             return [*events, self._show(before)]
@@ -443,13 +443,13 @@ class Live:
         return []
 
     def _tell_released(self, lift: int) -> list[Event]:
-        """Release those of two fingers whose release explains the change since a reading, if that can be told."""
-        resting, events = self._resting, list[Event]()
-        for press in resting:
+        """Release the one of two fingers, or both, whose release best explains the change since a reading."""
+        held, events = self._held, list[Event]()
+        for press in held:
             if press.fixed is None:
                 press.fixed = self._estimate(press, lift, False)
                 press.course = self._course(press, lift, press.fixed)
-        courses = [press.course for press in resting if press.course is not None]
+        courses = [press.course for press in held if press.course is not None]
         window = RELEASE_WINDOWS[LIFT_WINDOWS[0]][0], RELEASE_WINDOWS[LIFT_WINDOWS[-1]][1]
         after, before = (self._mean(lift + first, lift + end) for first, end in (window, (-3, 0)))
         steps = np.array([course.changes_by_release[list(LIFT_WINDOWS)].mean(axis=0) for course in courses])
@@ -458,17 +458,17 @@ class Live:
         best, second_best = np.argsort(errors)[:2]
         ends = sets[best]
         if errors[best] > MAX_ERROR_RATIO * errors[second_best]:
-            ends = [1]  # one is taken to rest on, but either may be the one, so that neither is located any more
+            ends = [1]  # one counts as held on, but it may be either, so both count as of unknown position
             names, anywhere_mm = ("std_x_mm", "std_y_mm", "r50_mm", "r90_mm"), np.array(UNIFORM)[[0, 0, 1, 2]]
             radii_mm = dict(zip(names, (self._localizer.scaler.scale_mm * anywhere_mm).tolist(), strict=True))
-            for press in resting:
+            for press in held:
                 if press.fixed is not None:
                     press.fixed = replace(press.fixed, unlike=True, **radii_mm)
                     events.append(self._show(press.fixed))
         elif ends == [1]:
-            resting[1].fixed = None  # its release shows undisturbed, and locates it better
+            held[1].fixed = None  # its release shows undisturbed, and locates it better
         for number in ends:
-            resting[number].release(lift, self._buffer)
+            held[number].release(lift, self._buffer)
         if len(ends) == 1:
             self._detector.hold(courses[1 - ends[0]].pressed[-1])
         return events
@@ -498,7 +498,7 @@ class Live:
         if press.up_command is not None and is_complete:
             if press.fixed is None and press.other is None:
                 events += [*self._check_pad(press, until), *self._check_fibres(press, until)]
-            elif self._monitor is not None:
+            elif self._monitor is not None:  # counts presses that it is not shown
                 self._monitor.n_presses += 1
             self._previous_end = max(self._previous_end, press.up_command)
             self._presses.remove(press)
@@ -520,9 +520,9 @@ class Live:
         else:
             moment = "lift", until - press.up_command, now_s - press.up_s
         failed = tuple(np.flatnonzero(~scaled.fibre_mask[0]).tolist())
-        judged = {"failed": failed, "unlike": bool(result.unlike is not None and result.unlike[0])}
-        judged |= {"finger": press.finger}
-        return Estimate(press.number, press.time_s, now_s, *moment, final, *numbers, **judged, **measures)
+        unlike = bool(result.unlike is not None and result.unlike[0])
+        more = {"failed": failed, "unlike": unlike, "finger": press.finger}
+        return Estimate(press.number, press.time_s, now_s, *moment, final, *numbers, **more, **measures)
 
     def _features_of_working_fibres(self, press: BufferedPress, until: int) -> PressFeatures:
         features = self._features(press, until)

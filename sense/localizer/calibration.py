@@ -51,8 +51,8 @@ from padforge.sense.settings import LocalizerSettings
 FEW_PRESSES = 500  # up to which the plan of a pad predicts its response better than basis functions
 MIN_TRAINING = 3  # training presses that a split must leave, since fewer have no scale
 CALIBRATION_SHARE = {"ensemble": 0.08, "published": 0.15 / 0.85}
-"""Share of the training presses that calibrate the uncertainty; for the published method 15 % of all presses, half of
-them for early stopping."""
+"""Share of the presses not tested that calibrates the uncertainty: "published" 15 % of all if 15 % are tested, half of
+it for early stopping."""
 MAX_TIME_BUDGET_S = 1e9
 MIN_DEPTH_RANGE_MM = 0.2  # range of the central 90 % of depths, at or below which depth does not vary
 PRIOR_COUNT = 2  # weight of the expected error of a member in the calibration of its scale, in presses
@@ -67,17 +67,17 @@ MOMENT_SUBSETS = 4  # the same where there are several moments
 class Experience:
     """Errors of 26 other localizers at a moment of a press, as a prior for the radii.
 
-    They were of nine pads, simulated ones and the published one, with the defaults of `SIZE_KEYS`, trained out, and 235
-    to 3500 training presses. The mean ratio of distance to expected radius differed by `PAD_SPREAD` between them.
+    They are of nine pads, simulated or published, and have the default size, all steps of training and 235 to 3500
+    training presses. The standard deviation of their mean ratios is `PAD_SPREAD`.
     """
 
     growth_presses: float  # with n training presses, new presses err 1 + this / n times as much as expected
-    mean_ratio: float  # mean ratio of distance to expected radius, with that growth included
+    mean_ratio: float  # mean of distance / r50 before calibration, growth included
 
     @staticmethod
     def at(n_complete: int) -> "Experience":
         """Return the experience when `n_complete` windows of a press are complete."""
-        return TOUCH if n_complete < N_PRESS_WINDOWS else REST if n_complete == N_PRESS_WINDOWS else RELEASE
+        return TOUCH if n_complete < N_PRESS_WINDOWS else HELD if n_complete == N_PRESS_WINDOWS else RELEASE
 
     def growth(self, n_trained: int) -> float:
         """Return the ratio of the errors on new presses to the expected ones after `n_trained` presses."""
@@ -92,10 +92,10 @@ class Experience:
 
 
 TOUCH = Experience(growth_presses=70, mean_ratio=0.78)
-REST = Experience(growth_presses=180, mean_ratio=0.84)
+HELD = Experience(growth_presses=180, mean_ratio=0.84)
 RELEASE = Experience(growth_presses=190, mean_ratio=0.73)
 FAILURE_DECREASE = 1.1
-"""Decrease of the growth of errors, relative, per share of failed fibres."""
+"""Relative decrease of the growth of errors, per share of failed fibres."""
 PAD_SPREAD = 0.1
 """Standard deviation of the mean ratio between pads, relative."""
 
@@ -138,8 +138,8 @@ def calibrate(
         time_budget: seconds of training, which decide on the number of members; the result then depends on the speed
             of the machine. None for the length and the members of `options`.
         by_moment: as in `evaluate`.
-        on_progress: called with (steps done, total steps, "") in the training, in seconds if there is a time budget;
-            before and after it with the stage of the work.
+        on_progress: called in the training with (done, total, ""), in steps, or in seconds of a time budget; before
+            and after it with the stage of the work.
 
     Returns:
         The localizer, and its evaluation on the test presses.
@@ -166,8 +166,8 @@ def calibrate(
     origin = {"fibre_names": recording.fibre_names, "pad_sha256": recording.pad_digest, "provenance": made_by}
     model = replace(model, split=options.split, test=tuple(test.tolist()), **origin)
     with stage("evaluate"), one_thread():
-        levels = range(_n_levels(options, recording.fibres))
-        evaluation = evaluate(model, recording, levels, by_moment=by_moment, on_progress=on_progress)
+        counts = range(_n_levels(options, recording.fibres))
+        evaluation = evaluate(model, recording, counts, by_moment=by_moment, on_progress=on_progress)
     evaluation = replace(evaluation, training_presses=len(training), settings=options.model_dump())
     return replace(model, errors=evaluation.errors), evaluation
 
@@ -199,8 +199,8 @@ def fit_recording(
         return compute_features(readings, *commands, until, history=features.history)[presses]
 
     feature_set: FeatureSet = "published" if is_published else "windows"
-    origin = feature_set, recording.rate_hz, recording.digest
-    data = CalibrationData(features, detected, recording.presses_mm, measures, *origin, None if is_published else at)
+    source = feature_set, recording.rate_hz, recording.digest
+    data = CalibrationData(features, detected, recording.presses_mm, measures, *source, None if is_published else at)
     if pad is not None:
         data = replace(data, pad=pad, contact=stated_contact(recording))
     return fit_model(data, training, options, rng, on_progress, time_budget)
@@ -276,18 +276,18 @@ def fit_model(
         moments = [scaler.transform(data.features[calibration])]
     else:
         moments = [scaler.transform(data.at(n_complete, calibration)) for n_complete in range(1, n_timed + 1)]
-    # features without moments have one stage, 0, and one entry of `moments`
-    tests = (test.calibrated(moments[n - 1]) for test, n in zip(tests, stages(n_timed), strict=True))
-    model = replace(model, single_press=tuple(tests))
-    positions_mm = data.positions_mm[calibration]
-    measures = {name: values[calibration] for name, values in data.measures.items()}
+    # without moments n is 0, and moments[-1] is the only entry
+    tests = tuple(test.calibrated(moments[n - 1]) for test, n in zip(tests, stages(n_timed), strict=True))
+    model = replace(model, single_press=tests)
+    true_mm = data.positions_mm[calibration]
+    true_measures = {name: values[calibration] for name, values in data.measures.items()}
     defaults = LocalizerSettings()
     is_default = all(getattr(options, name) == getattr(defaults, name) for name in SIZE_KEYS)
     is_trained_out = trained_share * options.epochs >= TRAINED_OUT * defaults.epochs
-    has_prior = is_default and is_ensemble and n_timed and not measures and is_trained_out
-    n_trained = len(train) if has_prior else None
+    is_usual = is_default and is_ensemble and n_timed and not data.measures and is_trained_out
+    n_trained = len(train) if is_usual else None
     levels = _n_levels(options, model.fibres)
-    return calibrate_uncertainty(model, moments, positions_mm, levels, measures, on_progress, n_trained)
+    return calibrate_uncertainty(model, moments, true_mm, levels, true_measures, on_progress, n_trained)
 
 
 def calibrate_uncertainty(
@@ -305,7 +305,7 @@ def calibrate_uncertainty(
         model: to calibrate.
         moments: features of the presses when 1, 2, ... windows are complete, or once for features without moments.
         positions_mm: of the presses; shape (Q, 2).
-        levels: numbers of failed fibres, from 0.
+        levels: most failed fibres, plus one.
         measures: as in `evaluation.conformal`.
         on_progress: called with the stage of the work.
         n_trained: number of training presses, if the experience with other pads serves as a prior.
@@ -385,7 +385,7 @@ def _calibrate_scales(
     ]
 
     # 1. Mean ratio of error to expected error of each member, by moment and set of failed fibres, with the expected
-    # ratio as the prior; the members of the networks that answer at the moment follow each other
+    # ratio as the prior; `outputs` and `ratios` hold the members of each of `names` in turn
     ratios_of: dict[str, list[Array]] = {}  # by network
     n_presses = len(positions_mm)
     first = int(len(moments) > 1)
@@ -437,7 +437,7 @@ def check_trained(networks: Networks, residual_network: Weights, options: Locali
 def _split_training(
     training: Indices, options: LocalizerSettings, rng: np.random.Generator
 ) -> tuple[Indices, Indices, Indices]:
-    """Presses for training, for early stopping of a published training, and for calibration."""
+    """Return presses for training, for early stopping if published, and for calibration."""
     share = CALIBRATION_SHARE[options.method]
     train, held_back = (training[part] for part in split_presses(len(training), options.split, share, rng, 2))
     if options.method == "ensemble" or len(held_back) < 2:
@@ -447,7 +447,7 @@ def _split_training(
 
 
 def trainable_targets(recording: Recording, presses: Indices) -> dict[str, Array]:
-    """Return depth if it is known of all `presses` and varies, and with it force if it is known of all."""
+    """Return the depths, if known, above 0 and varying in `presses`, and then forces if known there."""
     measures = recording.measures
     depth, force = (measures[name][presses] for name in ("depth_mm", "force_n"))
     if np.isnan(depth).any() or depth.min() <= 0 or np.ptp(np.percentile(depth, [5, 95])) <= MIN_DEPTH_RANGE_MM:
@@ -499,6 +499,7 @@ def split_presses(
     Raises:
         InputError: fewer than `min_training` presses would be left.
     """
+    # a split within the training presses holds one back at least
     n_held_back = max(round(share * presses), 1 if min_training < MIN_TRAINING else 0)
     if not 1 <= n_held_back <= presses - min_training:
         raise InputError(

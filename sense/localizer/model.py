@@ -47,12 +47,12 @@ MEASURE_COLUMNS = {"depth_mm": ("depth_mm", "depth_r90_mm"), "force_n": ("force_
 COLUMNS = ("press", "x_mm", "y_mm", "std_x_mm", "std_y_mm", "r50_mm", "r90_mm", "unlike")
 """Columns of `write_localization`; those of `MEASURE_COLUMNS` follow where depth and force are predicted."""
 Digest = Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
-_CHUNK = 2**16
+_CHUNK = 2**16  # presses times fibres
 
 
 @dataclass(frozen=True)
 class MeasureEstimate:
-    """Depth or force of Q presses, and the half-width of the interval that holds it in 90 % of cases."""
+    """Depth, mm, or force, N, of Q presses, and the half-width that holds it in 90 % of cases."""
 
     values: Array
     r90: Array
@@ -68,7 +68,7 @@ class Localization:
         r50_mm: (Q,) radius that holds the true position in 50 % of cases.
         r90_mm: (Q,) radius that holds it in 90 % of cases.
         measures: depth and force by the names of `Recording.measures`, where they are predicted.
-        unlike: (Q,) whether two presses explain the responses much better than one, as those to two fingers; the radii
+        unlike: (Q,) whether two presses explain the responses much better than one, as of two fingers; the radii
             of such a press are those of an unknown position. None if not tested.
     """
 
@@ -113,12 +113,12 @@ class LocalizerDocument:
     features: FeatureSet
     rate_hz: Annotated[float, Field(ge=MIN_RATE_HZ, le=MAX_RATE_HZ)]  # of the training recording
     scaler: FeatureScaler
-    # (K + 1, L, 3 + T) by numbers of complete windows and of failed fibres: factors from the predicted standard
-    # deviation to the calibrated one, the radii of 50 and 90 %, and the r90 of T measures, by presses held back
+    # (K + 1, L, 3 + T) by numbers of complete windows and of failed fibres: factors on predicted standard
+    # deviations that give calibrated ones, the radii of 50 and 90 %, and the r90 of T measures
     interval_factors: Annotated[Array, *array_field(1e-9, 1e6)]
     training_recording_sha256: Digest
     split: Split = "random"  # of training and test presses
-    test: tuple[Annotated[int, Field(ge=0)], ...] = ()
+    test: tuple[Annotated[int, Field(ge=0)], ...] = ()  # indices of test presses
     recalibrated_by: tuple[Digest, ...] = ()  # recordings of recalibrations
     fibre_names: tuple[str, ...] = ()  # of the training recording, if it was imported
     pad_sha256: Digest | Literal[""] = ""  # `pad_digest` of the training recording
@@ -171,7 +171,7 @@ class LocalizerModel(LocalizerDocument):
         return Sliding(weights, *self.scaler.latest_window_map(N_TIMED)) if weights else None
 
     def check_recording(self, recording: Recording) -> None:
-        """Raise InputError unless a recording is of the pad of the training, with its fibres, their names and its rate.
+        """Raise InputError unless a recording has the pad, the fibres, their names and the rate of the training.
 
         Args:
             recording: to be localized. Names and plans are compared if both have them.
@@ -197,7 +197,7 @@ class LocalizerModel(LocalizerDocument):
             until: (Q,) first frames (see `framed`) that are not used; None for all frames up to the next press.
 
         Raises:
-            InputError: another pad, a localizer that was fitted to arrays, or `until` is no reading for each press.
+            InputError: another pad, a localizer fitted to arrays, or `until` is not one frame for each press.
         """
         if self.features == "array":
             raise InputError("the localizer was fitted to arrays of features, expected such arrays, not a recording")
@@ -213,8 +213,8 @@ class LocalizerModel(LocalizerDocument):
         """Return the scaled features of every press.
 
         Args:
-            recording: as `raw_features`, and raises as it does.
-            until: as there.
+            recording: as in `raw_features`, which raises.
+            until: likewise.
         """
         return self.scaler.transform(self.raw_features(recording, until))
 
@@ -260,8 +260,8 @@ class LocalizerModel(LocalizerDocument):
         """Return `single_press`, calibrated on some presses of a recording that were not used in training.
 
         Args:
-            recording: as `raw_features`, and raises as it does.
-            presses: their indices.
+            recording: as in `raw_features`, which raises.
+            presses: indices in it.
         """
         frames, tests = framed(recording), []
         for test, n_complete in zip(self.single_press, stages(len(self.interval_factors) - 1), strict=True):
@@ -320,6 +320,7 @@ class LocalizerModel(LocalizerDocument):
         targets, std, slid = (np.concatenate(part) for part in zip(*parts, strict=True))
         fibre_mask, n_complete = presses.fibre_mask, count_complete(presses.complete)
         level = np.minimum((~fibre_mask).sum(axis=1), self.max_failures)
+        # a finger that slid is located as before it settled
         factors = self.interval_factors[np.where(slid, N_PRESS_WINDOWS - 1, n_complete), level]
         to_std, to_r50, to_r90 = factors[:, :3].T * self.scaler.scale_mm
         radius = np.hypot(*std[:, :2].T)
@@ -385,7 +386,7 @@ class LocalizerModel(LocalizerDocument):
             name = files.document.name
             raise InputError(f"{folder}: no {name}, expected a folder that `padforge sense calibrate` wrote") from error
         scaler = document.scaler
-        # an empty list has no last axis
+        # for J = 0, [] has no last axis
         coef = scaler.history_coef.reshape(*scaler.history_mean_v.shape, scaler.mean_v.shape[-1])
         document = replace(document, scaler=replace(scaler, history_coef=coef))
         n_timed = len(document.interval_factors) - 1

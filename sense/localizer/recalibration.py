@@ -41,8 +41,8 @@ MIN_PRESSES = 10  # new presses needed; fewer can neither change much nor show a
 MAX_PRESSES = 500  # new presses used at most; the time of a fit grows with their cube, and more gain nothing
 FOLDS = 5
 MIN_CORRECTION_GAIN = 2.0  # minimum gain of a correction, which is coarse, in standard errors
-MIN_REFIT_GAIN = 0.0  # minimum gain of refitting, which gains more with more presses, in standard errors
-MAX_EXPONENT = 0.5  # maximum exponent of the power law of errors by number of presses, that of a mean
+MIN_REFIT_GAIN = 0.0  # the same of refitting: any gain, since it grows with more presses
+MAX_EXPONENT = 0.5  # largest p in error ~ presses ** -p; a mean of independent errors has it
 SUBSETS = 16  # maximum sets of failed fibres of a size
 Predictions = Sequence[Sequence[Localization]]  # by number and by set of failed fibres
 Change = Callable[[LocalizerModel, PressFeatures, Array, Measures], LocalizerModel]
@@ -123,9 +123,10 @@ def recalibrate(
     features, positions_mm = model.raw_features(recording)[rows], recording.presses_mm[rows]
     measures = {each.name: recording.measures[each.name][rows] for each in model.scaler.measures}
     subsets = [failure_subsets(model.fibres, n_failed, SUBSETS) for n_failed in range(model.max_failures + 1)]
-    presses = features, positions_mm, measures
-    validation, halves = (CrossValidation(presses, n_folds, subsets) for n_folds in (FOLDS, 2))
+    given = features, positions_mm, measures
+    validation, halves = (CrossValidation(given, n_folds, subsets) for n_folds in (FOLDS, 2))
     before = validation.predict([model] * FOLDS)
+    # correction, folds, two halves, final fit
     steps, total = count(1), FOLDS + 4 if model.method == "ensemble" else 1
 
     def step() -> None:
@@ -135,11 +136,11 @@ def recalibrate(
     candidates = [validation.candidate(None, before, before)]
 
     # 1. Correction
-    predictions = validation.predict(validation.change(folds, fit_correction))
+    predictions = validation.predict(validation.adapt(folds, fit_correction))
     candidates.append(validation.candidate("corrected", before, predictions))
     gain, standard_error = validation.gain(before, predictions)
     if gain > MIN_CORRECTION_GAIN * standard_error:
-        changed, after, change = fit_correction(model, *presses), predictions, "corrected"
+        changed, after, change = fit_correction(model, *given), predictions, "corrected"
     step()
 
     # 2. Response
@@ -154,13 +155,13 @@ def recalibrate(
             step()
             return refitted
 
-        predictions = validation.predict(validation.change(folds, refit_last))
+        predictions = validation.predict(validation.adapt(folds, refit_last))
         candidates.append(validation.candidate("refitted", before, predictions))
         gain, standard_error = validation.gain(after, predictions)
         if gain > MIN_REFIT_GAIN * standard_error:
-            half = halves.predict(halves.change([model] * 2, refit_last))
+            half = halves.predict(halves.adapt([model] * 2, refit_last))
             twice_as_many_mm = _extrapolate(validation.mean_error(predictions), halves.mean_error(half))
-            changed, is_new = refit(model, *presses, plan=plan, seed=seed)
+            changed, is_new = refit(model, *given, plan=plan, seed=seed)
             after, change, new_fibres = predictions, "refitted", np.flatnonzero(is_new).tolist()
     on_progress(total, total, "")
 
@@ -194,7 +195,7 @@ def recalibrate(
 
 
 def _extrapolate(error_mm: float, half_mm: float) -> float:
-    """Extrapolate the error to twice as many presses by a power law, from cross-validation in folds and halves."""
+    """Extrapolate errors after 1 - 1 / FOLDS and 1 / 2 of the presses to twice all of them, by a power law."""
     exponent = float(np.clip(np.log(half_mm / error_mm) / np.log(2 * (1 - 1 / FOLDS)), 0, MAX_EXPONENT))
     return error_mm * (2 / (1 - 1 / FOLDS)) ** -exponent
 
@@ -211,18 +212,18 @@ def refit(
 ) -> tuple[LocalizerModel, Mask]:
     """Refit response, Bayesian localizers and networks to new presses; return the localizer, and which fibres are new.
 
-    This serves a pad that has drifted, that was cast again, or that has a new fibre: an unchanged fibre keeps its map,
+    This serves a pad that has drifted, was cast again, or has a new fibre: an unchanged fibre keeps its response,
     and a new one gets another. Positions are (Q, 2), measures the depth and force (Q,), NaN where unknown; `plan` is
     the prior from the plan of the pad. With `only_last`, only the networks that answer at the end of a press are
     retrained.
     """
     from padforge.sense.localizer.training import retrain  # torch takes long to import
 
-    # 1. Response, with the present maps or the corrected ones as the prior, by evidence
+    # 1. Response: the prior is the present table or the corrected one, by evidence
     starts = [old, fit_correction(old, features, positions_mm, measures)]
     fits = [_fit_response(start, features, positions_mm, measures, plan) for start in starts]
-    number = int(np.argmax([fit.log_evidence for *_, fit in fits]))
-    start, (presses, table, response) = starts[number], fits[number]
+    best = int(np.argmax([fit.log_evidence for *_, fit in fits]))
+    start, (presses, table, response) = starts[best], fits[best]
     presses, n_timed = leave_one_out_residuals(presses, table, response.leverage), features.complete.shape[1]
 
     # 2. Bayesian localizers, networks and tests
@@ -250,7 +251,7 @@ def refit(
 def _fit_response(
     old: LocalizerModel, features: PressFeatures, positions_mm: Array, measures: Measures, plan: ResponsePrior | None
 ) -> tuple[TrainingPresses, Floats, ResponseFit]:
-    """Scaled presses, the response table (S, S, C, F + G), and its fit, whose evidence is of windows in volts."""
+    """Return scaled presses, the response table (S, S, C, F + G) and its fit, with the log evidence of volts."""
     scaler, n_windows = old.scaler, features.windows.shape[2]
     predicted = old.predict_features(scaler.transform(features)).measures
     # Unknown depths and forces are replaced by their predictions.
@@ -268,19 +269,19 @@ def fit_correction(
 ) -> LocalizerModel:
     """Correct gains of fibres, rotation, scale and shift by robust least squares with a normal prior.
 
-    They are folded into the scaling of the features and the last layer of the networks.
+    Gains go into the scaling, the pose into last layers, `bayes` and `table`.
     """
     from scipy.optimize import least_squares  # slow to import
 
-    expected = model.predict_features(model.scaler.transform(features))
+    before = model.predict_features(model.scaler.transform(features))
 
     def residuals(parameters: Array) -> Array:
         # Parameters are offset by 1, since the steps of the solver are relative to their values.
         corrected = _corrected(model, parameters - 1)
         prediction = corrected.predict_features(corrected.scaler.transform(features))
-        errors = [((prediction.positions_mm - positions_mm) / expected.std_mm).ravel()]
+        errors = [((prediction.positions_mm - positions_mm) / before.std_mm).ravel()]
         errors += [
-            (estimate.values - measures[name]) / (expected.measures[name].r90 / R90_STD)
+            (estimate.values - measures[name]) / (before.measures[name].r90 / R90_STD)
             for name, estimate in prediction.measures.items()
             if name in measures
         ]
@@ -293,7 +294,7 @@ def fit_correction(
 
 
 def _transform(parameters: Array) -> tuple[Array, Array, Array]:
-    """Gains (C,), rotation with scale (2, 2) and shift (2,), scaled, from parameters in prior standard deviations."""
+    """Return gains (C,), rotation times scale (2, 2) and scaled shift (2,) of parameters in prior deviations."""
     angle, log_scale = ROTATION_STD * parameters[-4:-2]
     rotation = np.exp(log_scale) * np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
     return np.exp(GAIN_STD * parameters[:-4]), rotation, SHIFT_STD * parameters[-2:]
@@ -307,6 +308,7 @@ def _corrected(model: LocalizerModel, parameters: Array) -> LocalizerModel:
         model,
         networks={name: _transformed_weights(each, rotation, shift) for name, each in model.networks.items()},
         bayes=bayes,
+        # outputs offsets, which do not shift
         residual_network=_transformed_weights(model.residual_network, rotation, np.zeros(2)) if bayes else {},
         scaler=replace(model.scaler, **{name: gains[:, None] * getattr(model.scaler, name) for name in names}),
     )
@@ -337,7 +339,7 @@ class CrossValidation:
         self.presses = presses
         self._folds, self._subsets = np.array_split(np.arange(len(presses[1])), n_folds), subsets
 
-    def change(self, models: Sequence[LocalizerModel], change: Change) -> list[LocalizerModel]:
+    def adapt(self, models: Sequence[LocalizerModel], change: Change) -> list[LocalizerModel]:
         """Change each model, one per fold, by the presses outside its fold."""
         features, positions_mm, measures = self.presses
         changed = []

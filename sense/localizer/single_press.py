@@ -28,18 +28,18 @@ STAGES = (N_PRESS_WINDOWS, N_TIMED)
 COMPONENTS = 4  # linear discriminants of a fibre; further ones are noise
 COARSENING = 6  # cells of the response table along a side of a cell of the grid
 MIN_CELLS = 2  # minimum distance of two presses in cells of the grid; below it lie errors of the response model
-MIN_SHARE = 0.2  # minimum response to the weaker of two presses relative to the stronger, for the same reason
+MIN_SHARE = 0.2  # minimum ratio of the weaker of two presses to the stronger; below it lie the same errors
 MAX_STRENGTH = 1.5
 """Maximum response to either of two presses relative to the strongest of the training: a single press that is twice as
 deep has a large misfit, which two strong presses would explain."""
 FALSE_RATE = 0.01  # share of single presses that the test rejects
 LEVELS = 4  # numbers of failed fibres, from 0, that the tests are calibrated for
 SUBSETS = 4  # sets of failed fibres of a size in the calibration
-MAX_LEFT_OUT = 2  # fibres that may have failed on the same pad, up to a third of all: few fibres fit any press
-# Mean logarithm of the misfits above that of the calibration, in standard deviations of single presses, from which on a
-# pad is another one. With 30 presses after 1500 of training, pads cast again by the same plan had 2.0 and 0.6 or more,
-# healthy ones 0.5 and 0.3 or less, those with two failed fibres 0.4 or less without them; pads whose gains drifted by
-# up to 20 % did not exceed both limits.
+MAX_LEFT_OUT = 2  # most fibres left out as failed, up to a third of all: the few others would fit any press
+# Excess of the mean log misfit over that of the calibration, in standard deviations of single presses, above which a
+# pad is another one. With 30 presses after 1500 of training, pads cast again had 2.0 with all fibres and 0.6 without
+# the worst, or more; healthy ones 0.5 and 0.3 or less; with two failed fibres the second was 0.4 or less, and with
+# gains drifted by up to 20 % one stayed below.
 MIN_MISFIT = 1.35  # with all fibres
 MIN_MISFIT_LEFT_OUT = 0.4  # without the fibres that fit worst
 MIN_PRESSES = 25  # with fewer presses a pad is not tested
@@ -67,7 +67,7 @@ class SinglePressTest:
     max_strength: Array  # (1,), of either of two presses
     limit: Array  # (L,), highest root likelihood ratio of a single press, by number of failed fibres
     usual_misfit: Array  # (L, 2), mean and standard deviation of its logarithm, by number of failed fibres
-    n_presses: Array  # (1,), presses of the calibration of the last two; 0 before `calibrated`
+    n_presses: Array  # (1,), presses behind `limit` and `usual_misfit`; 0 before
 
     @classmethod
     def fit(
@@ -78,7 +78,7 @@ class SinglePressTest:
         n_complete: int,
         earlier: "SinglePressTest | None" = None,
     ) -> "SinglePressTest":
-        """Fit the scatter of presses, with leave-one-out residuals, about the response at a stage of a press.
+        """Fit the leave-one-out scatter of presses about the response, by the first `n_complete` windows.
 
         The table (S, S, C, F + G) is the scaled response over [-1, 1] in x and y; `centring` (C, F + G) is what
         scaling has subtracted from the features. Discriminants of an earlier pad are kept, since few
@@ -106,14 +106,14 @@ class SinglePressTest:
         scatter = local_scatter(grid[inside], positions, residual, presses.fibre_mask, cell)
         # Each position of the grid stands for its cell, over which the response varies by its slope.
         blurred = scatter + cell**2 / 12 * slopes @ slopes.swapaxes(2, 3)
-        response = relative_depth * interpolate_grid(responses.reshape(side, side, -1), positions)
+        modelled = relative_depth * interpolate_grid(responses.reshape(side, side, -1), positions)
         return cls(
             projection=projection,
             positions=grid[inside],
             expected=responses[::COARSENING, ::COARSENING][inside],
             precision=np.linalg.inv(blurred),
             offset=offset,
-            floor_share=np.array([_floor_share(residual, response.reshape(residual.shape))]),
+            floor_share=np.array([_floor_share(residual, modelled.reshape(residual.shape))]),
             max_strength=np.array([MAX_STRENGTH * float(relative_depth.max())]),
             limit=np.full(LEVELS, np.inf),
             usual_misfit=np.tile([0.0, 1.0], (LEVELS, 1)),
@@ -145,7 +145,7 @@ class SinglePressTest:
         return unlike
 
     def misfits(self, inputs: Floats, fibre_mask: Mask) -> Array:
-        """Return (Q, M) misfits, in standard deviations from the usual, without each set of up to MAX_LEFT_OUT fibres.
+        """Return (Q, M) log misfits, standardized by the usual, without each set of up to MAX_LEFT_OUT fibres.
 
         The first of the M sets is empty: all fibres in the (Q, C) mask are used.
         """
@@ -159,22 +159,22 @@ class SinglePressTest:
     def _fit(self, inputs: Floats, masks: Mask) -> "_Fit":
         """Fit a single press to inputs (Q, C, F + G), with the fibres in each of the masks (Q, M, C)."""
         parts = [
-            self._fit_chunk(self._project(inputs[first : first + _CHUNK]), masks[first : first + _CHUNK])
-            for first in range(0, max(len(inputs), 1), _CHUNK)
+            self._fit_chunk(self._project(inputs[start : start + _CHUNK]), masks[start : start + _CHUNK])
+            for start in range(0, max(len(inputs), 1), _CHUNK)
         ]
         return _Fit(*map(np.concatenate, zip(*parts, strict=True)))
 
     def _fit_chunk(self, z: Array, masks: Mask) -> "_Fit":
         """Fit presses of (Q, C, D) discriminants; the strength at each position has a closed form."""
         first, second = np.triu_indices(COMPONENTS)
-        squares = self.precision[:, :, first, second] * np.where(first == second, 1.0, 2.0)
+        factors = self.precision[:, :, first, second] * np.where(first == second, 1.0, 2.0)
         weighted = np.einsum("pcde,pce->pcd", self.precision, self.expected)
         fibre_masks = masks.swapaxes(1, 2).astype(np.float64)
 
         def over_fibres(part: Array) -> Array:  # (Q, P, C) or (P, C) to (Q, P, M)
             return part @ fibre_masks
 
-        norm_z = over_fibres(np.einsum("qcm,pcm->qpc", z[:, :, first] * z[:, :, second], squares, optimize=True))
+        norm_z = over_fibres(np.einsum("qcm,pcm->qpc", z[:, :, first] * z[:, :, second], factors, optimize=True))
         cross = over_fibres(np.einsum("qcd,pcd->qpc", z, weighted, optimize=True))
         norm = over_fibres(np.einsum("pcd,pcd->pc", weighted, self.expected))
         strength = np.maximum(cross / np.maximum(norm, 1e-9), 0.0)
@@ -182,8 +182,8 @@ class SinglePressTest:
         misfit = (norm_z - strength * cross) / growth
         best = misfit.argmin(axis=1)
         misfit, growth = (np.take_along_axis(part, best[:, None], axis=1)[:, 0] for part in (misfit, growth))
-        numbers = np.maximum(COMPONENTS * masks.sum(axis=2), 1)
-        return _Fit(np.log(np.maximum(misfit / numbers, MIN_RELATIVE_MISFIT)), misfit, best, growth)
+        n_terms = np.maximum(COMPONENTS * masks.sum(axis=2), 1)
+        return _Fit(np.log(np.maximum(misfit / n_terms, MIN_RELATIVE_MISFIT)), misfit, best, growth)
 
     def _root_likelihood_ratio(self, inputs: Floats, fibre_mask: Mask) -> Array:
         """Return the root (Q,) of twice the log-likelihood ratio of two presses over one.
@@ -209,13 +209,14 @@ class SinglePressTest:
         return ratios
 
     def _project(self, inputs: Floats) -> Array:
-        """Discriminants (Q, C, D) of scaled features (Q, C, F + G); missing values count as 0."""
+        """Return discriminants (Q, C, D) of scaled features (Q, C, F + G), with NaN as 0."""
         return np.einsum("qcf,cfd->qcd", np.nan_to_num(inputs), self.projection, optimize=True) + self.offset
 
     @cached_property
     def _is_apart(self) -> Mask:
         """Pairs of positions (P, P) that are distant enough for two presses."""
         distance = np.linalg.norm(self.positions[:, None] - self.positions, axis=2)
+        # half a cell against rounding
         return distance > (MIN_CELLS - 0.5) * distance[distance > 0].min(initial=np.inf)
 
 

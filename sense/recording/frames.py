@@ -13,7 +13,7 @@ from padforge.sense.arrays import Array
 from padforge.sense.recording.recording import Recording
 
 FRAME_S = 0.075  # length of a frame
-AS_READ = 0.9, 1.1  # range of readings per frame, by the median interval, in which each reading is a frame
+AS_READ = 0.9, 1.1  # readings per frame, low and high, between which each reading is a frame
 MIN_PRESENT = 0.25  # minimum fraction of a frame with readings of a fibre; otherwise the fibre is missing in it
 # Intervals between readings count as at most the larger of these two, so that a computer's sleep makes no frames.
 MAX_PAUSE_S = 1.0
@@ -28,7 +28,7 @@ def framed(recording: Recording) -> Recording:
     pauses_s = np.append(0.0, np.cumsum(_excess_s(np.diff(recording.times_s), rate_hz)))
     clock_s = recording.times_s - pauses_s  # without the excess of pauses
     edges = reading_edges(clock_s)
-    # 1. Segments between the commands, and their numbers of frames.
+    # 1. Segments between commands; 1 frame or more if not empty.
     commands = np.stack([recording.down_command, recording.up_command], axis=1).ravel()
     starts = np.concatenate([[0], commands, [len(recording.readings)]])
     start_s = edges[starts]

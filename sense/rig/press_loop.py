@@ -62,7 +62,7 @@ class DiskThread(ThreadPoolExecutor):
 
     def check(self) -> None:
         """Re-raise the exception of a failed call."""
-        if self._last.done():  # soon after a failure, since later calls fail at once
+        if self._last.done():  # true soon after a failure: later calls fail at once
             self._last.result()
 
 
@@ -121,7 +121,7 @@ class PressLoop:
         self._recent: deque[float] = deque(maxlen=4096)  # times of the latest readings
         self._disk, self._n_readings = DiskThread(), recorder.n_readings
         self._interrupts = Interrupts()
-        self._zero_s = 0.0
+        self._zero_s = 0.0  # host time that is 0 in the recording
         self._forces_n: list[float] = []  # measured since the probe came to rest
 
     def run(
@@ -133,7 +133,7 @@ class PressLoop:
         """Make every press of the plan that the recorder does not have.
 
         `on_progress` is called after every press, once it is on the disk, and `planner` before every press with the
-        plan and its number; it returns the plan, or one with the presses from that number on moved. After a RigFault
+        plan and the press; it returns the plan, or one with the presses from that one on moved. After a RigFault
         the arm stands still, and completed presses are on the disk.
         """
         check_plan(plan, self._rig)
@@ -282,7 +282,7 @@ class PressLoop:
         return None
 
     def _lift(self) -> None:
-        """Lift the tool straight up to its travelling height; raises RigFault if it is outside the box, or stopped."""
+        """Lift the tool straight up to travelling height; raises RigFault if outside the box, or the arm stopped."""
         state = self._arm.state()
         check_state(state, self._limits, clock.now())
         if any(not low <= x <= high for x, (low, high) in zip(state.pose, self._limits.box_mm, strict=False)):

@@ -157,11 +157,11 @@ def check_start_state(state: ArmState, limits: Limits) -> None:
         _refuse(f"[rig] max_force_n is {limits.max_force_n:g}, but this arm measures no force", '"unwatched"')
 
 
-def check_tcp(tcp_mm: Vector | None, arm: Mapping[str, Any]) -> None:
-    """Raise RigFault("refused") unless `[rig]` tcp_mm is the tool centre point of the arm, if that stores one."""
-    if "tcp" not in arm:
+def check_tcp(tcp_mm: Vector | None, identity: Mapping[str, Any]) -> None:
+    """Raise RigFault("refused") unless `[rig]` tcp_mm is the tool centre point that an arm stores, if any."""
+    if "tcp" not in identity:
         return
-    measured = tuple(round(float(value), 3) for value in arm["tcp"][:3])
+    measured = tuple(round(float(value), 3) for value in identity["tcp"][:3])
     if tcp_mm is None:
         _refuse("[rig] tcp_mm is unknown", f"x, y and z of the tip as measured; the controller says {list(measured)}")
     if not all(abs(a - b) <= TCP_TOLERANCE_MM for a, b in zip(tcp_mm, measured, strict=True)):
@@ -170,7 +170,7 @@ def check_tcp(tcp_mm: Vector | None, arm: Mapping[str, Any]) -> None:
 
 
 def check_state(state: ArmState, limits: Limits, now_s: float, until_s: float = math.inf) -> None:
-    """Raise RigFault if the latest state during a move is beyond the limits, or the move not over at `until_s`."""
+    """Raise RigFault if the latest state in a move is beyond the limits, or the move is not over at `until_s`."""
     advice = "look at the arm, unlock it at the pendant, then connect again"
     if state.emergency_stop:
         raise RigFault("emergency_stop", "the arm is in an emergency stop", advice)
@@ -244,15 +244,15 @@ def retreat(arm: Arm, limits: Limits) -> None:
 
 def _await_state(arm: Arm) -> ArmState:
     """Return the first state that is not stale, or the latest after `FRESH_S`; raises the RigFault of `arm.state`."""
-    deadline_s = clock.now() + FRESH_S
+    until_s = clock.now() + FRESH_S
     while True:
         try:
             state = arm.state()
         except RigFault as fault:
-            if fault.cause != "stale" or clock.now() >= deadline_s:
+            if fault.cause != "stale" or clock.now() >= until_s:
                 raise
         else:
-            if clock.now() - state.time_s <= MAX_STATE_AGE_S or clock.now() >= deadline_s:
+            if clock.now() - state.time_s <= MAX_STATE_AGE_S or clock.now() >= until_s:
                 return state
         clock.sleep(POLL_S)
 

@@ -61,13 +61,13 @@ class MeasuredContact:
     """Fits of the stated contact to the presses on a pad."""
 
     stated: Contact  # a layer, pressed as deep as the recording says if it does
-    as_built: ContactFit  # of the fibres as built, which a profile without direction was fitted with
+    as_built: ContactFit  # of the fibres as built, whose paths another profile was fitted with
     on_plan: ContactFit  # of fibres that lie as planned
     gaussian_on_plan: ContactFit  # the same of a Gaussian profile, of which only the width is fitted
 
     @property
     def best(self) -> ContactFit:
-        """The fit that explains more: paths as built were fitted with another profile, planned ones do not deviate."""
+        """The fit that explains more; either may, since the paths as built were fitted with another profile."""
         return max(self.as_built, self.on_plan, key=lambda fit: fit.explained)
 
 
@@ -85,21 +85,21 @@ class Identification:
     noise: float  # that of live channels as a share of full scale
     alternatives: list[Wiring]  # those that the presses do not rule out
     parts: dict[str, AsBuiltFit]  # of a press, by name in `PARTS`; none where there are too few presses
-    residual: TwinResidual | None  # smooth part of the residuals of all parts; as `readings`
+    residual: TwinResidual | None  # smooth residuals of the parts; None as `readings`
     readings: TwinReadings | None  # None where there are too few presses
     scatter: TwinScatter
-    contact: MeasuredContact | None  # None of a contact that is no layer, or thinner than a press is deep
+    contact: MeasuredContact | None  # None if no layer, or one thinner than a press is deep
     training: Responses
     held_out: Responses
 
     def lateral_offsets_mm(self) -> list[tuple[Array, Array, Mask]]:
         """Compute for each live channel the lateral offset of its fibre from the plan, to the left, mm.
 
-        Returned are the offset of each element (F,), its standard deviation, and a mask of the pressed elements.
+        Returned are the offset of each element (E,), its standard deviation, and a mask of the pressed elements.
         """
         built, unit_mm = self.fit.pad, self.pad.unit_mm
-        pressed = built.plan.to_grid(built.transform.to_plan(self.training.positions_mm))
-        low, high = pressed.min(axis=0), pressed.max(axis=0)
+        presses = built.plan.to_grid(built.transform.to_plan(self.training.positions_mm))
+        low, high = presses.min(axis=0), presses.max(axis=0)
         out = []
         for row, fibre in enumerate(built.fibres):
             planned, tangent = built.plan.paths[fibre], built.plan.tangents[fibre]
@@ -118,11 +118,11 @@ class Identification:
         channels = [TwinChannel(c, None, 0.0, float(noise_v), 0.0) for c, noise_v in enumerate(self.noise_v)]
         for row, channel in enumerate(self.live.tolist()):
             fibre, path = built.fibres[row], built.path(row)[0]
-            ends = [1.5 * path[:1] - 0.5 * path[1:2], (path[1:] + path[:-1]) / 2, 1.5 * path[-1:] - 0.5 * path[-2:-1]]
-            paths_mm[fibre] = self.pad.to_mm(np.vstack(ends))
+            line = [1.5 * path[:1] - 0.5 * path[1:2], (path[1:] + path[:-1]) / 2, 1.5 * path[-1:] - 0.5 * path[-2:-1]]
+            paths_mm[fibre] = self.pad.to_mm(np.vstack(line))
             gain_v, explained = float(response.gains_v[channel]), float(self.explained[row])
             channels[channel] = replace(channels[channel], fibre=fibre, gain_v=gain_v, explained=explained)
-        pressed = built.transform.to_plan(self.training.positions_mm)
+        presses = built.transform.to_plan(self.training.positions_mm)
         return Twin(
             morphology=self.pad,
             channels=tuple(channels),
@@ -131,7 +131,7 @@ class Identification:
             weight=response.weight,
             as_built_mm=tuple(paths_mm),
             noise=self.noise,
-            sensed_mm=tuple(np.ptp(pressed, axis=0).tolist()),
+            sensed_mm=tuple(np.ptp(presses, axis=0).tolist()),
             presses=len(self.training),
             angular_weight=response.angular_weight,
             sensitivity=response.sensitivity,
@@ -211,7 +211,6 @@ def identify_pad(
 
     # 2. Live channels: a Gaussian process of the position explains them better than noise
     gps = fit_gps(responses.select(rows), pad.unit_mm)
-    noise_v = np.array([gp.noise_v for gp in gps])
     live = np.flatnonzero([gp.log_bayes_factor > MIN_LOG_BAYES_FACTOR for gp in gps])
     if not len(live):
         raise InputError("no channel of the recording responds to where the pad is pressed")
@@ -244,14 +243,14 @@ def identify_pad(
     # 6. Contact, by a fit of the layer that is believed to be pressed; and the scatter of responses
     on_plan = replace(best.on_plan.pad, plan=plan)
     measured = _measure_contact(contact, recording, fit.pad, on_plan, training, held_out)
-    noise_v = np.nan_to_num(noise_v)
+    noise_v = np.nan_to_num([gp.noise_v for gp in gps])
     held = parts["held"].pad if parts else fit.pad
     noise_v[live] = estimate_noise(held.residuals(pressed), pad.unit_mm)
     scatter = estimate_scatter(held, pressed, noise_v[live])
-    if readings:  # which contains that of gains that wander
+    if readings:  # whose wander of gains `share` includes
         scatter = replace(scatter, share=float(np.sqrt(max(scatter.share**2 - readings.gain_wander**2, 0))))
     smooth = np.column_stack([gps[channel].predict(held_out.positions_mm / pad.unit_mm) for channel in live])
-    likeliest_on_plan = max((candidate.on_plan for candidate in candidates), key=lambda fit: fit.log_evidence)
+    likeliest_on_plan = max((candidate.on_plan for candidate in candidates), key=lambda one: one.log_evidence)
     planned = fit_as_built(replace(likeliest_on_plan.pad, plan=plan), training, Priors()).pad
     full_scale_v = np.abs(fit.pad.predict(training.positions_mm) - fit.pad.channel_values[:, 1]).max(axis=0)
     return Identification(
@@ -321,7 +320,7 @@ def _fit_candidates(
     """
     candidates: dict[tuple[bool, tuple[int, ...]], _FittedWiring] = {}
 
-    def fit(wirings: list[Wiring]) -> _FittedWiring:
+    def add(wirings: list[Wiring]) -> _FittedWiring:
         for wiring in wirings:
             start = AsBuiltPad.from_plan(plan, wiring.fibres, wiring.transform, wiring.width)
             on_plan = fit_as_built(start.fit_gains(compared), compared, Priors())
@@ -342,8 +341,8 @@ def _fit_candidates(
         )
     if live.max() < plan.layout.fibres:
         wirings.append(as_stated(live, training, plan.layout.unit_mm))
-    best = fit(wirings)
-    best = fit(images(replace(best.wiring, transform=best.fit.pad.transform), plan.layout))
+    best = add(wirings)
+    best = add(images(replace(best.wiring, transform=best.fit.pad.transform), plan.layout))
     for key, candidate in candidates.items():  # which of them is best is decided by where they converge
         if candidate.log_posterior > best.log_posterior - 2 * MIN_LOG_ODDS:
             refit = fit_as_built(candidate.fit.pad, compared, candidate.fit.priors)
@@ -375,7 +374,7 @@ def _fit_all(pad: AsBuiltPad, training: Responses, on_progress: OnProgress) -> A
 
 
 def _noise_inflation(pad: AsBuiltPad, responses: Responses) -> Array:
-    """Return the factor (C,) on the noise by which residuals smooth in position weigh N_COMPARED presses."""
+    """Return factors (C,) on the noise with which smooth residuals count as N_COMPARED presses would."""
     residuals = pad.residuals(responses)
     noise_var = estimate_noise(residuals, pad.plan.layout.unit_mm) ** 2
     systematic_var = np.maximum(residuals.variance - noise_var, 0)
@@ -393,7 +392,7 @@ def _measure_contact(
 ) -> MeasuredContact | None:
     """Fit a layer to a pad as built, and for comparison to the pad as planned, as well as a Gaussian.
 
-    The layer is pressed as deep as the recording says, if it does. None if it is thinner, or the contact is no layer.
+    The layer is pressed as deep as the recording says, if it does. None of a thinner layer, or another contact.
     """
     depths_mm = recording.actual_depths_mm[recording.has_position]
     depths_mm = depths_mm[depths_mm > 0]
@@ -423,18 +422,18 @@ def _fit_part(fit: AsBuiltFit, training: Responses) -> AsBuiltFit:
 
 
 def _residual_maps(
-    parts: PressParts[Responses], fits: dict[str, AsBuiltFit], live: Indices, training: Mask
+    parts: PressParts[Responses], fits: dict[str, AsBuiltFit], live: Indices, trained: Mask
 ) -> TwinResidual:
     """Return the smooth function of the position in the residuals of the parts of presses."""
     positions, middle_mm, half_mm = normalize(parts.held.positions_mm)
-    valid = parts.held.valid[training][:, live]
+    valid = parts.held.valid[trained][:, live]
     residuals = []
     for name, fit in fits.items():
         part: Responses = getattr(parts, name)
         # without the rest of the channel, so that the response far from any fibre belongs to the residual
-        stretched = fit.pad.predict(part.positions_mm[training]) - fit.pad.channel_values[:, 1]
-        residuals.append(part.volts[training][:, live] - stretched)
-    maps = smooth_maps(positions[training], np.stack(residuals, axis=2), valid)[::MAP_STRIDE, ::MAP_STRIDE]
+        stretched = fit.pad.predict(part.positions_mm[trained]) - fit.pad.channel_values[:, 1]
+        residuals.append(part.volts[trained][:, live] - stretched)
+    maps = smooth_maps(positions[trained], np.stack(residuals, axis=2), valid)[::MAP_STRIDE, ::MAP_STRIDE]
     volts = np.zeros((len(fits), parts.held.volts.shape[1], *maps.shape[:2]))
     volts[:, live] = maps.transpose(3, 2, 0, 1)
     return TwinResidual(tuple(middle_mm.tolist()), half_mm, volts)

@@ -84,7 +84,7 @@ def test_cross_validation_compares_presses_left_out() -> None:
         seen.append(raw.tolist())
         return localizer + 1
 
-    assert validation.change([10, 20], change) == [11, 21]
+    assert validation.adapt([10, 20], change) == [11, 21]
     assert seen == [[2, 3], [0, 1]]  # a fold is changed by the other presses only
 
 
