@@ -1,5 +1,6 @@
 """The problem that a search solves."""
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -10,7 +11,7 @@ from padforge.common.validation import MAX_VALUES, InputError, check_type
 from padforge.design.contact_set import served_contacts
 from padforge.design.morphology import Array, Morphology
 from padforge.design.objectives.ambiguity import free_presses
-from padforge.design.objectives.criterion import criterion_errors, relative_error
+from padforge.design.objectives.criterion import criterion_errors
 from padforge.design.objectives.fibre_loss import failure_shares
 from padforge.design.objectives.rules import Violation, check_rules
 from padforge.design.objectives.score import ScoredPad, sharpness
@@ -55,12 +56,15 @@ class SearchProblem:
         return self._criterion(Morphology.straight(self.pad.layout))
 
     def objective(self, pad: Morphology) -> float:
-        """Return the objective of the search, always on the same presses.
+        """Return the value by which finished pads are compared, always on the same presses.
 
-        It is the relative error over all contacts, plus the weighted sharpness under the main contact.
+        It is the geometric mean of the errors relative to straight fibres, over all contacts and numbers of failed
+        fibres, plus the weighted sharpness under the main contact. A search descends a power mean, in which the worst
+        dominates. Of finished pads the worst is the case that straight fibres all but win, in which they hardly differ.
         """
-        shares = failure_shares(self.search.max_failures)
-        error, _ = relative_error(self._criterion(pad), self.straight_errors, shares)
+        log_ratios = np.log(self._criterion(pad) / self.straight_errors)
+        shares = failure_shares(self.search.max_failures)[: log_ratios.shape[1]]
+        error = math.exp(np.average(log_ratios.mean(axis=0), weights=shares))
         weight = self.search.sharpness
         return error + (weight * sharpness(self.scored(pad).serpentine_signals.T) if weight else 0.0)
 

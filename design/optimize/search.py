@@ -84,7 +84,7 @@ class SearchResult:
     """The best candidate of a search.
 
     Attributes:
-        morphology: the candidate that breaks the fewest rules, and among those the one with the lowest objective.
+        morphology: the candidate that breaks the fewest rules, and among those the one that errs least.
             Straight fibres are a candidate, except for the published method.
         terms: every term of `score` for it.
         violations: the rules that it breaks; empty if rules are not enforced.
@@ -178,7 +178,7 @@ class Candidate:
 
     @cached_property
     def objective(self) -> float:
-        """The value that the search minimises."""
+        """The value by which it is compared with others."""
         return self.problem.objective(self.pad)
 
     @cached_property
