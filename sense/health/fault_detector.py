@@ -306,7 +306,7 @@ class FaultDetector:
     """Detect faulty fibres in recordings of a pad, from the readings alone.
 
     Args:
-        false_alarm_rate: false alarms a press, all fibres and kinds of fault together; above 0, up to 0.1.
+        false_alarm_rate: false alarms a press, all fibres and kinds of fault together; 1e-12 to 0.1.
         seed: of all that is random in `fit`.
 
     Attributes:
@@ -318,9 +318,7 @@ class FaultDetector:
     """
 
     def __init__(self, false_alarm_rate: float = FALSE_ALARM_RATE, seed: int = 0) -> None:
-        self.false_alarm_rate = check_float("false_alarm_rate", false_alarm_rate, 0.0, MAX_FALSE_ALARM_RATE)
-        if not self.false_alarm_rate > 0:
-            raise InputError(f"false_alarm_rate is {false_alarm_rate}, allowed is above 0 to {MAX_FALSE_ALARM_RATE}")
+        self.false_alarm_rate = check_float("false_alarm_rate", false_alarm_rate, 1e-12, MAX_FALSE_ALARM_RATE)
         self.seed = seed
         self.model_: HealthModel
         self.live_model_: HealthModel
