@@ -123,8 +123,8 @@ def recalibrate(
     features, positions_mm = model.raw_features(recording)[rows], recording.presses_mm[rows]
     measures = {each.name: recording.measures[each.name][rows] for each in model.scaler.measures}
     subsets = [failure_subsets(model.fibres, n_failed, SUBSETS) for n_failed in range(model.max_failures + 1)]
-    given = features, positions_mm, measures
-    validation, halves = (CrossValidation(given, n_folds, subsets) for n_folds in (FOLDS, 2))
+    samples = features, positions_mm, measures
+    validation, halves = (CrossValidation(samples, n_folds, subsets) for n_folds in (FOLDS, 2))
     before = validation.predict([model] * FOLDS)
     # correction, folds, two halves, final fit
     steps, total = count(1), FOLDS + 4 if model.method == "ensemble" else 1
@@ -140,7 +140,7 @@ def recalibrate(
     candidates.append(validation.candidate("corrected", before, predictions))
     gain, standard_error = validation.gain(before, predictions)
     if gain > MIN_CORRECTION_GAIN * standard_error:
-        changed, after, change = fit_correction(model, *given), predictions, "corrected"
+        changed, after, change = fit_correction(model, *samples), predictions, "corrected"
     step()
 
     # 2. Response
@@ -161,7 +161,7 @@ def recalibrate(
         if gain > MIN_REFIT_GAIN * standard_error:
             half = halves.predict(halves.adapt([model] * 2, refit_last))
             twice_as_many_mm = _extrapolate(validation.mean_error(predictions), halves.mean_error(half))
-            changed, is_new = refit(model, *given, plan=plan, seed=seed)
+            changed, is_new = refit(model, *samples, plan=plan, seed=seed)
             after, change, new_fibres = predictions, "refitted", np.flatnonzero(is_new).tolist()
     on_progress(total, total, "")
 
