@@ -360,7 +360,7 @@ def _check_keep_outs(plan: Plan) -> Iterator[Finding]:
     status: Status = "fail" if len(thin) else "warn" if len(weak) else "pass"
     positions = _points_in(thin if len(thin) else weak)
     subject, limit = ("pillars are" if positions else "no pillar is"), (line if len(thin) else _PILLAR_LINES * line)
-    message = f"{subject} thinner than {limit:g} mm, the width needed"
+    message = f"{subject} thinner than {limit:g} mm, the least that prints"
     yield check_result("pillars", status, len(positions), 0, message, positions)
 
     pieces = sorted(shapely.get_parts(plan.silicone), key=lambda piece: piece.area)
