@@ -28,7 +28,8 @@ HOME: Pose = (-120.0, -430.0, 200.0, 0.0, 3.141592653589793, 0.0)
 """Where the emulated arm stands at first: 200 mm up, the tool pointing down."""
 SCRIPT_PORT = 30003
 PORTS = {"rtde": rtde.RTDE_PORT, "script": SCRIPT_PORT, "dashboard": rtde.DASHBOARD_PORT}
-INPUTS = ord("I")  # the kind of frame by which a client claims registers
+VERSION, CONTROLLER, OUTPUTS, INPUTS, START, DATA = b"VvOISU"  # types of RTDE frames; all numbers are big-endian
+HEADER = struct.Struct(">HB")  # size of a frame, with its header, and type
 TO_MM = np.array([1000.0, 1000.0, 1000.0, 1.0, 1.0, 1.0])
 COMMAND_S = 5.0  # longest wait for a command to be executed
 _CODES = {"DOUBLE": "d", "INT32": "i", "UINT32": "I", "UINT64": "Q"}
@@ -54,6 +55,11 @@ def variable_type(name: str) -> str:
 def recipe_layout(types: list[str]) -> struct.Struct:
     """Return the layout of the values of a recipe."""
     return struct.Struct(">" + "".join(_CODES[kind] for kind in types))
+
+
+def pack_frame(kind: int, payload: bytes) -> bytes:
+    """Return a frame with its header."""
+    return HEADER.pack(HEADER.size + len(payload), kind) + payload
 
 
 class Connection:
@@ -220,7 +226,7 @@ class EmulatedUR5:
             return
         state = self._controller.state()
         for connection in [connection for connection in self._connections if connection.streaming]:
-            self._send(connection, rtde.pack_frame(rtde.DATA, connection.pack_state(state)))
+            self._send(connection, pack_frame(DATA, connection.pack_state(state)))
 
     def _poll(self, timeout: float) -> None:
         """Wait for the sockets."""
@@ -265,7 +271,7 @@ class EmulatedUR5:
                 self._answer(connection, self._controller.answer_dashboard(line.decode().strip()).encode() + b"\n")
 
     def _process_frame(self, connection: Connection, kind: int, payload: bytes) -> None:
-        if kind == rtde.DATA:
+        if kind == DATA:
             if not 0 < payload[0] <= len(connection.inputs):
                 return  # a client that reconnects, as ur-rtde does, sends the recipes of its last link first
             names, layout = connection.inputs[payload[0] - 1]
@@ -273,21 +279,21 @@ class EmulatedUR5:
             self._do(lambda: self._controller.write(values, clock.now()))
             return
         answer = b"\x01"
-        if kind == rtde.CONTROLLER:
+        if kind == CONTROLLER:
             answer = struct.pack(">4I", *VERSIONS[self._controller.series])
-        elif kind in (rtde.OUTPUTS, INPUTS):
+        elif kind in (OUTPUTS, INPUTS):
             # A rate of eight bytes precedes the names of outputs, and ur-rtde leaves a comma after the last name.
-            names = payload[8 * (kind == rtde.OUTPUTS) :].decode().strip(",").split(",")
+            names = payload[8 * (kind == OUTPUTS) :].decode().strip(",").split(",")
             types = [variable_type(name) for name in names]
-            if kind == rtde.OUTPUTS:
+            if kind == OUTPUTS:
                 connection.outputs = names, [int(_CODES[name][:-1] or 1) for name in types], recipe_layout(types)
             elif "IN_USE" not in (types := [self._claim(connection, name) for name in names]):
                 connection.inputs.append((names, recipe_layout(types)))
                 answer = bytes([len(connection.inputs)])
             answer += ",".join(types).encode()
-        elif kind != rtde.VERSION:
-            connection.streaming = kind == rtde.START
-        self._answer(connection, rtde.pack_frame(kind, answer))
+        elif kind != VERSION:
+            connection.streaming = kind == START
+        self._answer(connection, pack_frame(kind, answer))
 
     def _claim(self, connection: Connection, name: str) -> str:
         """Return the type of an input, or "IN_USE" if another client writes it."""

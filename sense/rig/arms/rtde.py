@@ -1,8 +1,7 @@
-"""RTDE, the data link of Universal Robots controllers: a reader of states, and the dashboard. Frames are big-endian."""
+"""States of a Universal Robots arm, read by ur-rtde, and the dashboard of its controller."""
 
 import math
 import socket
-import struct
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,34 +9,18 @@ from typing import Any
 
 RTDE_PORT = 30004
 DASHBOARD_PORT = 29999
-VERSION, CONTROLLER, OUTPUTS, START, DATA = b"VvOSU"  # types of frames
-PROTOCOL = 2  # version of the protocol
 RUNNING = 7  # robot mode: the arm is powered on and its brakes are released
 STOPPED, PLAYING = 1, 2  # runtime states of the program; others are paused, pausing and so on
 PROTECTIVE_BITS = 1 << 2 | 1 << 3 | 1 << 4 | 1 << 8 | 1 << 9 | 1 << 10
 """Protective and safeguard stop, recovery, violation, fault: the controller does not move the arm."""
 EMERGENCY_BITS = 1 << 5 | 1 << 6 | 1 << 7
-VARIABLES = {
-    "timestamp": "DOUBLE",
-    "actual_TCP_pose": "VECTOR6D",
-    "actual_TCP_speed": "VECTOR6D",
-    "actual_TCP_force": "VECTOR6D",
-    "robot_mode": "INT32",
-    "runtime_state": "UINT32",
-    "safety_status_bits": "UINT32",
-    "output_int_register_2": "INT32",
-}
-"""Requested variables and their types; in the register ur-rtde's program reports the progress of moves."""
+VARIABLES = (
+    *("timestamp", "actual_TCP_pose", "actual_TCP_speed", "actual_TCP_force"),
+    *("robot_mode", "runtime_state", "safety_status_bits"),
+)
 FORCE_SERIES = 5  # first major version of PolyScope whose arms have a force sensor at the tool
 MAX_CLOCK_SKEW = 2e-4  # relative rate difference between the controller's clock and the host's
-
-_HEADER = struct.Struct(">HB")  # size of the frame, with its header, and type
-_LAYOUT = struct.Struct(">19diIIi")  # the values of `VARIABLES`; a byte, the number of the recipe, precedes them
-
-
-def pack_frame(kind: int, payload: bytes = b"") -> bytes:
-    """Return a frame with its header."""
-    return _HEADER.pack(_HEADER.size + len(payload), kind) + payload
+POLL_S = 5e-4  # interval of polls for a new state; a state lasts 2 or 8 ms
 
 
 def ask_dashboard(host: str, questions: Sequence[str], timeout_s: float) -> list[str]:
@@ -51,6 +34,14 @@ def ask_dashboard(host: str, questions: Sequence[str], timeout_s: float) -> list
                 raise ConnectionError("the dashboard closed the link")
             answers.append(answer.decode(errors="replace").strip())
         return answers
+
+
+def major_version(polyscope: str) -> int:
+    """Return the first number of a version of PolyScope, such as "5.12.2 (Jan 01 2024)"; ValueError if it has none."""
+    major = polyscope.partition(".")[0]
+    if not major.isdecimal():
+        raise ValueError(f"the dashboard says PolyScope {polyscope!r}, expected a version such as 5.12")
+    return int(major)
 
 
 def stop_program(host: str, timeout_s: float) -> bool:
@@ -74,7 +65,6 @@ class RtdeState:
     emergency_stop: bool  # whether a person has stopped the arm
     mode: int  # robot mode
     runtime: int  # runtime state of the program
-    progress: int  # register in which ur-rtde's program reports its moves
 
 
 class HostClock:
@@ -94,43 +84,47 @@ class HostClock:
 
 
 class RtdeReader:
-    """A link to the RTDE port that reads every state of the arm.
+    """A link to the RTDE port through which ur-rtde receives the states of the arm.
 
-    ur-rtde's own receiver stores the latest state only: a program that polls it misses states and cannot tell that the
-    arm has fallen silent.
-
-    Methods raise OSError if the link cannot be opened or ends, TimeoutError if nothing arrives, and ValueError for
-    damaged frames.
+    ur-rtde stores the latest state only, so it is polled several times a control cycle. It notices a closed link at
+    once, but a silent arm only after 2.5 s, which `read` notices earlier by the time stamps.
     """
 
-    def __init__(self, host: str, timeout_s: float) -> None:
-        """Connect and start the stream; ValueError if the controller lacks the protocol or a variable."""
-        self._link = socket.create_connection((host, RTDE_PORT), timeout_s)
-        self._link.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        self._stream = self._link.makefile("rb")
-        self._clock = HostClock()
-        if self._request(VERSION, struct.pack(">H", PROTOCOL)) != b"\x01":
-            raise ValueError(f"the controller does not speak RTDE {PROTOCOL}")
-        self.version: tuple[int, ...] = _unpack(struct.Struct(">4I"), self._request(CONTROLLER))  # of PolyScope
-        self._has_sensor = self.version[0] >= FORCE_SERIES
+    def __init__(self, host: str, major: int) -> None:
+        """Connect to a controller of a major version of PolyScope; RuntimeError if none is there."""
+        import rtde_receive
+
+        self._has_sensor = major >= FORCE_SERIES
         self.rate_hz = 500 if self._has_sensor else 125  # one state per control cycle
-        answer = self._request(OUTPUTS, struct.pack(">d", self.rate_hz) + ",".join(VARIABLES).encode())
-        types = answer[1:].decode().split(",")
-        if missing := [name for name, kind in zip(VARIABLES, types, strict=False) if kind == "NOT_FOUND"]:
-            raise ValueError(f"the controller has no {', '.join(missing)}")
-        if types != list(VARIABLES.values()):
-            raise ValueError(f"the controller would send {','.join(types)[:200]!r} for {','.join(VARIABLES)}")
-        self._request(START)
+        self._receive: Any = rtde_receive.RTDEReceiveInterface(host, float(self.rate_hz), list(VARIABLES))
+        self._clock = HostClock()
+        self._stamp = 0.0  # of the latest state, s since the controller was switched on
 
     def read(self, timeout_s: float) -> RtdeState:
-        """Return the next state; TimeoutError after `timeout_s` without a byte, ValueError for a damaged state."""
-        self._link.settimeout(timeout_s)
-        values = _unpack(_LAYOUT, self._read_frame(DATA)[1:])
+        """Return the next state; TimeoutError if there is none for `timeout_s`, ValueError if it is not finite."""
+        deadline = time.monotonic() + timeout_s
+        while self._receive.isConnected():
+            state = self._latest()
+            if state is not None:
+                return state
+            if time.monotonic() > deadline:
+                raise TimeoutError
+            time.sleep(POLL_S)
+        raise ConnectionError("the controller closed the link")
+
+    def _latest(self) -> RtdeState | None:
+        """Return the latest state; None if it was read before, or another arrived while it was read."""
+        receive = self._receive
+        if (stamp := receive.getTimestamp()) == self._stamp:
+            return None
         arrival_s = time.monotonic()
-        if not all(map(math.isfinite, values)):
+        pose, speed, force = receive.getActualTCPPose(), receive.getActualTCPSpeed()[:3], receive.getActualTCPForce()
+        mode, runtime, safety = receive.getRobotMode(), receive.getRuntimeState(), receive.getSafetyStatusBits()
+        if receive.getTimestamp() != stamp:  # ur-rtde replaces a state as a whole
+            return None
+        self._stamp = stamp
+        if not all(map(math.isfinite, (stamp, *pose, *speed, *force[:3]))):
             raise ValueError("the controller sent a state that holds NaN or infinity")
-        stamp, pose, speed, force = values[0], values[1:7], values[7:10], values[13:16]
-        mode, runtime, safety, progress = values[19:]
         emergency_stop = bool(safety & EMERGENCY_BITS)
         return RtdeState(
             self._clock.host_time(stamp, arrival_s),
@@ -142,30 +136,4 @@ class RtdeReader:
             emergency_stop,
             mode,
             runtime,
-            progress,
         )
-
-    def _request(self, kind: int, payload: bytes = b"") -> bytes:
-        self._link.sendall(pack_frame(kind, payload))
-        return self._read_frame(kind)
-
-    def _read_frame(self, kind: int) -> bytes:
-        """Return the payload of the next frame of a kind; other frames are skipped."""
-        while True:
-            size, received = _HEADER.unpack(self._read_bytes(_HEADER.size))
-            if size < _HEADER.size:
-                raise ValueError(f"a frame of {size} bytes; expected at least {_HEADER.size}")
-            payload = self._read_bytes(size - _HEADER.size)
-            if received == kind:
-                return payload
-
-    def _read_bytes(self, count: int) -> bytes:
-        if len(data := self._stream.read(count)) < count:
-            raise ConnectionError("the controller closed the link")
-        return data
-
-
-def _unpack(layout: struct.Struct, payload: bytes) -> tuple[Any, ...]:
-    if len(payload) != layout.size:
-        raise ValueError(f"the controller sent {len(payload)} bytes, expected {layout.size}")
-    return layout.unpack(payload)

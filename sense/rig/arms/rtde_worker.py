@@ -21,7 +21,7 @@ from importlib.metadata import version
 from typing import Any, NoReturn
 
 from padforge.sense.rig.arms import rtde
-from padforge.sense.rig.arms.rtde import RtdeReader, RtdeState
+from padforge.sense.rig.arms.rtde import RtdeReader, RtdeState, major_version
 
 KICK_S = 0.04  # a sixth of the time after which the watchdog stops the arm
 HEARTBEAT_TIMEOUT_S = 0.3  # maximum silence of the parent during a move; six times the period of its heartbeats
@@ -31,8 +31,6 @@ HALT_S = 0.15  # longest wait for the arm, and then for the parent, before this 
 ANSWER_S = 1.0  # longest wait for an answer of the arm while connecting
 SESSION_END_S = 1.0  # longest wait for the end of another session, whose watchdog takes 0.25 s
 STOP_M_S2 = 5.0  # deceleration of a stop
-OPERATION = 0x7F << 24  # bits of ur-rtde's progress register: number of the operation
-UNDER_WAY = 1 << 15  # bit of the same register: the operation is in progress
 ARM_STATE = ("time_s", "pose", "speed_mm_s", "force_n", "sideways_n", "protective_stop", "emergency_stop")
 """Fields of an `ArmState` that the controller states."""
 UNLOCK_ADVICE = "look at the arm, unlock it at the pendant, then connect again"
@@ -95,7 +93,6 @@ class UrRtdeControl:
         import rtde_control
 
         self.moving = False  # whether the last move is in progress
-        self._progress = 0  # latest value of the register
         self._previous_operation = 0  # number of the operation before the current move
         self._control: Any = rtde_control.RTDEControlInterface(host)
         if not self._control.setWatchdog(4.0):  # Hz, minimum rate of kicks
@@ -106,12 +103,10 @@ class UrRtdeControl:
         """Return the tool centre point from the flange, m and rad."""
         return self._control.getTCPOffset()
 
-    def update(self, progress: int, is_stopped: bool) -> None:
-        """Update `moving` from the progress register; a protective or emergency stop (`is_stopped`) ends the move."""
-        self._progress = progress
-        has_arrived = progress & OPERATION != self._previous_operation and not progress & UNDER_WAY
-        if has_arrived or is_stopped:
-            self.moving = False
+    def has_arrived(self) -> bool:
+        """Return whether the last move is over."""
+        status = self._control.getAsyncOperationProgressEx()
+        return status.operationId() != self._previous_operation and not status.isAsyncOperationRunning()
 
     def kick(self) -> None:
         """Kick the watchdog, which stops the arm 0.25 s after the last kick."""
@@ -119,7 +114,7 @@ class UrRtdeControl:
 
     def move(self, pose: Sequence[float], speed: float, acceleration: float) -> bool:
         """Start a straight move (m, rad, m/s, m/s²); return whether the arm accepts it."""
-        self._previous_operation = self._progress & OPERATION
+        self._previous_operation = self._control.getAsyncOperationProgressEx().operationId()
         self.moving = True
         if not (accepted := self._control.moveL(list(pose), speed, acceleration, True)):
             self.moving = False
@@ -196,12 +191,12 @@ class WorkerProcess:
     def _do_connect(self) -> dict[str, Any]:
         try:
             self._arm_lock = lock_arm(self._host)
-            reader = RtdeReader(self._host, ANSWER_S)
+            identity = self._ask_identity()
+            reader = RtdeReader(self._host, major_version(identity["polyscope"]))
             state = reader.read(ANSWER_S)
             _check_ready(state)
             state = _wait_until_idle(reader, state)
-            identity = self._ask_identity()
-        except (OSError, ValueError) as error:
+        except (OSError, RuntimeError, ValueError) as error:
             reason = getattr(error, "strerror", None) or str(error)
             message = f"no arm answers at {self._host}, ports {rtde.RTDE_PORT} and {rtde.DASHBOARD_PORT}: {reason}"
             advice = "check its address, its cable and that it is switched on"
@@ -217,7 +212,6 @@ class WorkerProcess:
             **control.identity,
             "host": self._host,
             "rate_hz": reader.rate_hz,
-            "controller": ".".join(map(str, reader.version)),
             "tcp": [*(round(1e3 * value, 3) for value in tcp[:3]), *(round(value, 6) for value in tcp[3:])],
         }
 
@@ -227,8 +221,9 @@ class WorkerProcess:
         polyscope, model, remote, serial = rtde.ask_dashboard(self._host, questions, ANSWER_S)
         if remote == "false":
             raise CommandRejected("refused", "the arm is not in remote control", "switch it over at the pendant")
-        answers = {"polyscope": polyscope.removeprefix("URSoftware "), "model": model, "serial": serial}
-        return {name: text for name, text in answers.items() if not text.startswith("could not")}
+        answers = {"model": model, "serial": serial}
+        known = {name: text for name, text in answers.items() if not text.startswith("could not")}
+        return {"polyscope": polyscope.removeprefix("URSoftware "), **known}
 
     def _do_move(self, pose_mm: list[float], speed_mm_s: float, acceleration_mm_s2: float) -> None:
         if not (control := self._playing()):
@@ -266,24 +261,28 @@ class WorkerProcess:
 
     def _report_states(self, reader: RtdeReader, state: RtdeState) -> None:
         """Send every state to the parent; on a lost link end before ur-rtde can reconnect and repeat a command."""
+        has_arrived = False
         while True:
             self._latest = state
-            self._update(state)
+            self._update(state, has_arrived)
             self._new_state.set()
             stated = {name: getattr(state, name) for name in ARM_STATE}
             self._send({"state": stated | {"moving": self._is_moving()}})
             try:
+                # The end of a move arrives by another link: asked before the next state, it is not ahead of that.
+                control = self._control
+                has_arrived = control is not None and control.moving and control.has_arrived()
                 state = reader.read(STREAM_TIMEOUT_S)
             except TimeoutError:
                 message = f"the arm has sent no state for {STREAM_TIMEOUT_S} s"
                 self._exit("stale", message, "check the network, connect again")
-            except (OSError, ValueError):
+            except (OSError, RuntimeError, ValueError):
                 self._exit("lost", "the arm closed the link", "check that it is switched on, connect again")
 
-    def _update(self, state: RtdeState) -> None:
+    def _update(self, state: RtdeState, has_arrived: bool) -> None:
         stopped = state.protective_stop or state.emergency_stop
-        if self._control is not None:
-            self._control.update(state.progress, stopped)
+        if self._control is not None and (stopped or has_arrived):
+            self._control.moving = False
         if stopped and not self._stopped_by_arm:
             # A paused program would resume the old move as soon as a person unlocks the arm and presses play.
             threading.Thread(target=rtde.stop_program, args=(self._host, ANSWER_S), daemon=True).start()

@@ -127,7 +127,7 @@ def test_locate_on_bed_keeps_the_tip_off_the_holder_and_the_bed(folder, position
 
 
 RIG = RigSettings(presses=5, channels=(0, 1, 2, 3))
-ARM = {"model": "UR5", "serial": "2018", "controller": "5.12.2", "tcp": [0.0, 0.0, 150.0, 0.0, 0.0, 0.0]}
+ARM = {"model": "UR5", "serial": "2018", "polyscope": "5.12.2", "tcp": [0.0, 0.0, 150.0, 0.0, 0.0, 0.0]}
 BOARD = {"name": "padforge-due", "serial": "ab12", "firmware": "1.0.0", "port": "/dev/ttyACM0"}
 IDENTITIES: dict[str, dict[str, Any]] = {"arm": ARM, "board": BOARD}
 
@@ -183,7 +183,7 @@ def test_resume_keeps_the_plan_and_accepts_other_limits_addresses_and_controller
     limits = {"max_force_n": 30.0, "max_depth_mm": 5.5, "box_mm": (0, 1, 0, 1, 0, 1)}
     assert resumed_plan(run, **limits, host="arm", port="COM3", mirrored=False, seed=9, presses=3) == plan
     assert json.loads((run / START).read_text())["source"]["devices"] == IDENTITIES
-    with open_recorder(config_of(out), plan, out, True, IDENTITIES | {"arm": ARM | {"controller": "5.13.0"}}):
+    with open_recorder(config_of(out), plan, out, True, IDENTITIES | {"arm": ARM | {"polyscope": "5.13.0"}}):
         pass
     with pytest.raises(InputError, match="another pad"):  # rather than that its fibres are on other inputs
         resumed_plan(run, Morphology.straight(3), channels=())

@@ -1,20 +1,18 @@
-"""What comes over the wires of the arm: states, states that are none, and times on the host's clock."""
+"""What ur-rtde receives of the arm: states, states that are none, and times on the host's clock."""
 
-import io
-import struct
-from unittest import mock
+import sys
+from types import SimpleNamespace
+from typing import Any
+from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from padforge.sense.rig.arms import rtde
-from padforge.sense.rig.arms.rtde import VARIABLES, HostClock, RtdeReader
+from padforge.sense.rig.arms.rtde import HostClock, RtdeReader, major_version
 
-TYPES = list(VARIABLES.values())
-VALUES = (1.0, *np.linspace(-0.5, 0.5, 6), 0.3, 0.0, 0.4, 0.0, 0.0, 0.0, 6.0, 8.0, -25.0, 0.0, 0.0, 0.0, 7, 1, 1, 5)
-"""Of a state: stamp, pose, speed, force, mode, runtime, safety and progress."""
+POSE, SPEED, FORCE = (-0.5, -0.3, 0.1, 0.1, 3.0, 0.5), (0.3, 0.0, 0.4, 9.0, 9.0, 9.0), (6.0, 8.0, -25.0, 9.0, 9.0, 9.0)
 
 
 @settings(max_examples=15)
@@ -26,52 +24,56 @@ def test_host_clock_ignores_late_arrivals(delays: list[float]) -> None:
     assert (np.diff(times) > 0).all()
 
 
-def state(*values: float) -> bytes:
-    return rtde.pack_frame(rtde.DATA, b"\x01" + struct.pack(">19diIIi", *values))
+@pytest.fixture
+def library(monkeypatch: pytest.MonkeyPatch) -> MagicMock:
+    """Its interface to an arm whose state never changes."""
+    state = {"Timestamp": 1.0, "ActualTCPPose": POSE, "ActualTCPSpeed": SPEED, "ActualTCPForce": FORCE}
+    state |= {"RobotMode": 7, "RuntimeState": 1, "SafetyStatusBits": 1}
+    interface = MagicMock(**{f"get{name}.return_value": value for name, value in state.items()})
+
+    def connect(host: str, rate_hz: float, variables: list[str]) -> MagicMock:
+        interface.rate_hz = rate_hz
+        return interface
+
+    monkeypatch.setitem(sys.modules, "rtde_receive", SimpleNamespace(RTDEReceiveInterface=connect))
+    return interface
 
 
-def stream(*states: bytes, major: int = 5, version: bytes = b"\x01", types: list[str] = TYPES) -> list[bytes]:
-    """What a controller sends to a reader that connects."""
-    answers = (
-        (rtde.VERSION, version),
-        (rtde.CONTROLLER, struct.pack(">4I", major, 11, 0, 0)),
-        (rtde.OUTPUTS, b"\x01" + ",".join(types).encode()),
-        (rtde.START, b"\x01"),
-    )
-    return [*(rtde.pack_frame(*answer) for answer in answers), *states]
-
-
-def reader(sent: list[bytes]) -> RtdeReader:
-    """One that connects to a controller which sends that, frame by frame, and then no more."""
-    link = mock.Mock(makefile=lambda mode: io.BytesIO(b"".join(sent)))
-    with mock.patch("socket.create_connection", return_value=link):
-        return RtdeReader("arm", 1.0)
-
-
-def test_reader_converts_state() -> None:
-    link = reader(stream(state(*VALUES)))
-    first = link.read(1.0)
-    assert (link.version, link.rate_hz) == ((5, 11, 0, 0), 500)
-    assert first.pose == pytest.approx([*(1000 * np.array(VALUES[1:4])), *VALUES[4:7]])
-    assert (first.speed_mm_s, first.force_n, first.sideways_n) == pytest.approx((500, -25.0, 10.0))
-    assert (first.mode, first.runtime, first.progress) == (7, 1, 5)
-    assert (first.protective_stop, first.emergency_stop) == (False, False)
-    without = reader(stream(state(*VALUES), major=3)).read(1.0)
+def test_reader_converts_state(library: MagicMock) -> None:
+    state = RtdeReader("arm", 5).read(1.0)
+    assert library.rate_hz == 500
+    assert state.pose == pytest.approx((-500, -300, 100, 0.1, 3.0, 0.5))
+    assert (state.speed_mm_s, state.force_n, state.sideways_n) == pytest.approx((500, -25.0, 10.0))
+    assert (state.mode, state.runtime) == (7, 1)
+    assert (state.protective_stop, state.emergency_stop) == (False, False)
+    without = RtdeReader("arm", 3).read(1.0)
+    assert library.rate_hz == 125
     assert (without.force_n, without.sideways_n) == (None, 0)
 
 
-@pytest.mark.parametrize(
-    ("sent", "match"),
-    [
-        (stream(version=b"\x00"), "does not speak RTDE 2"),
-        (stream(types=["NOT_FOUND", *TYPES[1:]]), "the controller has no timestamp"),
-        (stream(types=TYPES[::-1]), "the controller would send"),
-        (stream(rtde.pack_frame(rtde.DATA, b"\x01" + b"x" * 10)), "sent 10 bytes, expected 168"),
-        (stream(b"\x00\x02U"), "a frame of 2 bytes"),
-        (stream(state(*VALUES[:15], np.inf, *VALUES[16:])), "NaN"),
-    ],
-    ids=range(6),
-)
-def test_reader_refuses_other_controller_and_impossible_state(sent: list[bytes], match: str) -> None:
-    with pytest.raises(ValueError, match=match):
-        reader(sent).read(1.0)
+def test_reader_returns_each_state_once_and_as_a_whole(library: MagicMock) -> None:
+    reader = RtdeReader("arm", 3)
+    reader.read(0.0)
+    with pytest.raises(TimeoutError):
+        reader.read(0.002)
+    # another state arrives while the first is read
+    library.getTimestamp.side_effect = [2.0, 3.0, 3.0, 3.0]
+    library.getActualTCPPose.side_effect = [(2.0,) * 6, (3.0,) * 6]
+    assert reader.read(1.0).pose[0] == 3000
+    library.isConnected.return_value = False
+    with pytest.raises(ConnectionError):
+        reader.read(1.0)
+
+
+@pytest.mark.parametrize("spoilt", ["Timestamp", "ActualTCPPose", "ActualTCPSpeed", "ActualTCPForce"])
+def test_reader_refuses_impossible_state(library: MagicMock, spoilt: str) -> None:
+    value: Any = np.inf if spoilt == "Timestamp" else (np.inf,) * 6
+    getattr(library, f"get{spoilt}").return_value = value
+    with pytest.raises(ValueError, match="NaN or infinity"):
+        RtdeReader("arm", 5).read(1.0)
+
+
+def test_major_version_of_polyscope() -> None:
+    assert major_version("5.12.2.1101534 (Jan 01 2024)") == 5
+    with pytest.raises(ValueError, match=r"'could not understand', expected a version such as 5\.12"):
+        major_version("could not understand")

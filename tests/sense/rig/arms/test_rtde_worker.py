@@ -24,14 +24,6 @@ def test_lock_admits_one_program_until_that_ends(monkeypatch: pytest.MonkeyPatch
     another.close()
 
 
-UNDER_WAY = 1 << 15
-
-
-def operation(number: int) -> int:
-    """Return ur-rtde's register of moves while the operation of this number is not under way."""
-    return number << 24
-
-
 @pytest.fixture
 def library(monkeypatch: pytest.MonkeyPatch) -> MagicMock:
     """Its interface to an arm that takes everything."""
@@ -60,21 +52,11 @@ def test_stops_and_moves_are_asked_of_the_library(library: MagicMock) -> None:
         UrRtdeControl("host")
 
 
-def test_a_move_is_over_once_another_operation_has_ended(library: MagicMock) -> None:
-    control = UrRtdeControl("host")
-    control.update(operation(3), False)
+@pytest.mark.parametrize("number", [3, 4], ids=["of the move before", "of this move"])
+@pytest.mark.parametrize("running", [False, True])
+def test_a_move_is_over_once_another_operation_has_ended(library: MagicMock, number: int, running: bool) -> None:
+    control, status = UrRtdeControl("host"), library.getAsyncOperationProgressEx.return_value
+    status.operationId.return_value, status.isAsyncOperationRunning.return_value = 3, False
     control.move((0.0,) * 6, 0.05, 0.5)
-    control.update(operation(3), False)  # of the move before
-    assert control.moving
-    control.update(operation(4) | UNDER_WAY, False)
-    assert control.moving
-    control.update(operation(4), False)
-    assert not control.moving
-    control.move((0.0,) * 6, 0.05, 0.5)
-    control.update(operation(4), False)
-    assert control.moving
-    control.update(operation(4), True)  # a protective stop ends any move
-    assert not control.moving
-    library.moveL.return_value = False
-    assert not control.move((0.0,) * 6, 0.05, 0.5)
-    assert not control.moving
+    status.operationId.return_value, status.isAsyncOperationRunning.return_value = number, running
+    assert control.has_arrived() == (number == 4 and not running)
