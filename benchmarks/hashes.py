@@ -67,7 +67,7 @@ def hash_calibration() -> Iterator[Result]:
     yield "health", digest([fault.text for each in recordings for fault in detector.predict(each)])
     live = sense.Live(model, rate_hz=recording.rate_hz, health=detector.live_model_)
     middle = slice(half - 1000, half + 3000)
-    yield "live", digest(live.feed(recording.times_s[middle], faulty[middle]), live.view())
+    yield "live", digest(live.update(recording.times_s[middle], faulty[middle]), live.view())
 
 
 def hash_presses(recording: sense.Recording) -> str:

@@ -1,3 +1,5 @@
+from .estimators import Localizer as Localizer
+from .estimators import PressWindows as PressWindows
 from .formats.csv_recording import export_csv as export_csv
 from .formats.csv_recording import import_csv as import_csv
 from .formats.hdf5_mat import export_hdf5 as export_hdf5
@@ -17,8 +19,6 @@ from .live.pipeline import OtherPad as OtherPad
 from .localizer.calibration import calibrate as calibrate
 from .localizer.evaluation import Evaluation as Evaluation
 from .localizer.evaluation import evaluate as evaluate
-from .localizer.localizer import Localizer as Localizer
-from .localizer.localizer import PressWindows as PressWindows
 from .localizer.model import Localization as Localization
 from .localizer.model import LocalizerModel as LocalizerModel
 from .localizer.recalibration import Recalibration as Recalibration

@@ -120,7 +120,7 @@ def live(
             page.show(pad | pipeline.view() | {"ended": str(error or "") or "ended"})
 
         for times_s, readings in stream.blocks:
-            events = pipeline.feed(times_s, readings)
+            events = pipeline.update(times_s, readings)
             if len(times_s):
                 view = pad | pipeline.view() | {"ended": ""}
                 page.show(view)

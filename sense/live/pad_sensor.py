@@ -99,7 +99,7 @@ class PadSensor:
                     self._localizer, rate_hz=stream.rate_hz, fibres=stream.fibres, health=load_health(self._model)
                 )
                 for times_s, readings in stream.blocks:
-                    pipeline.feed(times_s, readings)
+                    pipeline.update(times_s, readings)
                     if len(times_s):
                         self._values = self._summarize(pipeline, readings[-1])
                         self._started.set()

@@ -9,7 +9,7 @@ its own, localized from the change since then; the position of the first one is 
 from collections import deque
 from dataclasses import asdict, dataclass, replace
 from math import hypot
-from typing import Any, Literal
+from typing import Any, Literal, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -30,7 +30,6 @@ from padforge.sense.localizer.features import (
     valid_fibres,
     windows_from_rest,
 )
-from padforge.sense.localizer.localizer import Localizer
 from padforge.sense.localizer.model import MEASURE_COLUMNS, UNIFORM, LocalizerModel
 from padforge.sense.localizer.model_files import check_same_pad
 from padforge.sense.localizer.moments import (
@@ -196,11 +195,18 @@ class BufferedPress:
         return readings, self.down_command - first, up, max(self.previous_end - first, 0)
 
 
+class FittedLocalizer(Protocol):
+    """What `padforge.sense.Localizer` is once it is fitted."""
+
+    @property
+    def model_(self) -> LocalizerModel: ...
+
+
 class Live:
     """Localizes presses in a stream of readings, with bounded memory.
 
     Args:
-        localizer: localizer of the pad.
+        localizer: fitted localizer of the pad, or its `model_`.
         rate_hz: readings per second.
         fibres: number of fibres that are read; None for that of the localizer.
         health: health model of the pad; None for no detection of faults.
@@ -217,13 +223,13 @@ class Live:
 
     def __init__(
         self,
-        localizer: Localizer | LocalizerModel,
+        localizer: FittedLocalizer | LocalizerModel,
         *,
         rate_hz: float,
         fibres: int | None = None,
         health: HealthModel | None = None,
     ) -> None:
-        if isinstance(localizer, Localizer):
+        if not isinstance(localizer, LocalizerModel):
             localizer = localizer.model_
         fibres = localizer.fibres if fibres is None else fibres
         check_same_pad(localizer, "the localizer", fibres, rate_hz)
@@ -272,7 +278,7 @@ class Live:
             return ()
         return self._monitor.model.dead if self.is_other_pad else self._monitor.failed
 
-    def feed(self, times_s: ArrayLike, readings: ArrayLike) -> list[Event]:
+    def update(self, times_s: ArrayLike, readings: ArrayLike) -> list[Event]:
         """Process readings; the events do not depend on the division of readings into blocks.
 
         Args:

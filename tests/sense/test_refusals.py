@@ -57,7 +57,7 @@ def test_what_programs_ask_of_signals_and_localizers_in_vain(
     swapped = replace(recording, source={"fibre_names": ["c1", "c3", "c2", "c4"]})
     other = replace(recording, source={"morphology": recording.source["morphology"] | {"pitch_mm": 9.0}})
     live = Live(localizer, rate_hz=recording.rate_hz)
-    live.feed(recording.times_s[:9], recording.readings[:9])
+    live.update(recording.times_s[:9], recording.readings[:9])
     of_arrays = Localizer()
     of_arrays.model_ = replace(localizer, features="array")
     rows = {
@@ -98,8 +98,9 @@ def test_what_programs_ask_of_signals_and_localizers_in_vain(
         "a graph of arrays": lambda: export_onnx(of_arrays.model_, "", tmp_path / "l.onnx"),
         "few readings a second, live": lambda: Live(localizer, rate_hz=9.9),
         "other fibres, live": lambda: Live(localizer, rate_hz=20.0, fibres=3),
-        "arrays, live": lambda: Live(of_arrays, rate_hz=20.0),
-        "readings of before, live": lambda: live.feed(recording.times_s[8:12], recording.readings[8:12]),
+        "arrays, live": lambda: of_arrays.live(20.0),
+        "a localizer before its fit, live": lambda: Localizer().live(20.0),
+        "readings of before, live": lambda: live.update(recording.times_s[8:12], recording.readings[8:12]),
         "lines for all without a token": lambda: JsonLines("0.0.0.0", 0),
         "a viewer without an address": lambda: RerunOutput("localhost:9876", 2, [1.0, 2.0], [20.0, 10.0]),
         "a file for a viewer in no folder": lambda: RerunOutput(

@@ -73,7 +73,7 @@ def test_sensor_reads_what_the_pipeline_says(boards, sensor: PadSensor, few: Rec
     values = sensor.read()
     assert tuple(values) == sensor.names
     pipeline = Live(localizer, rate_hz=few.rate_hz)
-    pipeline.feed(few.times_s[:end], few.readings[:end])
+    pipeline.update(few.times_s[:end], few.readings[:end])
     latest = pipeline.presses[-1]
     assert (pipeline.pressed, latest.final) == (is_held, not is_held)
     assert latest.press == 1 if is_held else latest.press >= PRESSES - 1

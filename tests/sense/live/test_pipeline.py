@@ -90,7 +90,7 @@ def replay(
         live = Live(model, rate_hz=recording.rate_hz)
     events = []
     for times_s, readings in zip(np.split(recording.times_s, cuts), np.split(recording.readings, cuts), strict=True):
-        events += live.feed(times_s, readings)
+        events += live.update(times_s, readings)
     return live, events
 
 
@@ -233,7 +233,7 @@ def test_live_masks_a_faulty_fibre_from_the_next_press_on(recording, hasty, monk
     monkeypatch.setattr("padforge.sense.live.pipeline.FaultMonitor", lambda model: monitor)
     monkeypatch.setattr("padforge.sense.live.pipeline.PressDetector", ScriptedDetector(part))
     live = Live(hasty, rate_hz=part.rate_hz, health=hasty)  # a stand-in for health, of the same pad
-    events = live.feed(part.times_s, part.readings)
+    events = live.update(part.times_s, part.readings)
     fault = next(index for index, event in enumerate(events) if isinstance(event, FibreFault))
     estimates = [event for event in events if isinstance(event, Estimate)]
     before, after = events[fault - 1], events[fault + 1]
@@ -275,7 +275,7 @@ def test_faults_wait_while_the_pad_is_taken_for_another(recording, hasty, monkey
     monkeypatch.setattr("padforge.sense.live.pipeline.is_other_pad", lambda *asked: bool(next(verdicts)))
     monkeypatch.setattr("padforge.sense.live.pipeline.PressDetector", ScriptedDetector(part))
     live = Live(hasty, rate_hz=part.rate_hz, health=hasty)
-    events = live.feed(part.times_s, part.readings)
+    events = live.update(part.times_s, part.readings)
     (fault,) = (index for index, event in enumerate(events) if isinstance(event, FibreFault))
     before = events[fault - 1]
     assert isinstance(before, Estimate)
@@ -287,7 +287,7 @@ def test_view_has_presses_with_their_words_and_faults(recording, hasty, golden: 
     part, down = first_presses(recording, 2), int(recording.down_command[0]) + 15
     monkeypatch.setattr("padforge.sense.live.pipeline.PressDetector", ScriptedDetector(part))
     live = Live(hasty, rate_hz=part.rate_hz)
-    live.feed(part.times_s[:down], part.readings[:down])
+    live.update(part.times_s[:down], part.readings[:down])
     live.presses.clear()
     live.presses.extend(event for event in EVENTS if isinstance(event, Estimate))
     live.track.clear()
@@ -314,9 +314,9 @@ def test_track_has_the_places_that_a_finger_has_moved_to(recording, hasty, monke
     part = replace(part, up_command=up_command)
     monkeypatch.setattr("padforge.sense.live.pipeline.PressDetector", ScriptedDetector(part))
     live, next_down = Live(hasty, rate_hz=part.rate_hz), int(part.down_command[1])
-    live.feed(part.times_s[:next_down], part.readings[:next_down])
+    live.update(part.times_s[:next_down], part.readings[:next_down])
     track = live.view()["track"]
     assert 1 < len(track) <= MAX_TRACK
     assert track == [[1.0 + 3 * k, 0.0] for k in range(len(track))]
-    live.feed(part.times_s[next_down:][:3], part.readings[next_down:][:3])
+    live.update(part.times_s[next_down:][:3], part.readings[next_down:][:3])
     assert len(live.view()["track"]) == 1  # of the next press

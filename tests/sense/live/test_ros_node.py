@@ -184,7 +184,7 @@ def messages(deep_recording: Recording, deep_localizer: LocalizerModel) -> list[
     builder, messages = MessageBuilder(pipeline), []
     for first in range(0, len(six.readings), 10):
         block = six.times_s[first : first + 10], six.readings[first : first + 10]
-        messages += builder.build(*block, [*pipeline.feed(*block), *([fault] if first == 100 else [])])
+        messages += builder.build(*block, [*pipeline.update(*block), *([fault] if first == 100 else [])])
     return messages
 
 

@@ -63,7 +63,7 @@ def follow(model: LocalizerModel, trials: list[list[Touch]], seed: int = 5) -> l
         touches += [touch._replace(down=starts[-1] + touch.down, up=starts[-1] + touch.up) for touch in trial]
     readings = simulate_fingers(pad, touches, seed)
     live = Live(model, rate_hz=RIG.rate_hz)
-    events = live.feed(np.arange(len(readings)) / RIG.rate_hz, readings)
+    events = live.update(np.arange(len(readings)) / RIG.rate_hz, readings)
     assert not live.pressed
     estimates = [event for event in events if isinstance(event, Estimate)]
     firsts = [start - REST / 2 for start in starts[WARM_UP:]]

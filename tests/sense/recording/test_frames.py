@@ -121,7 +121,7 @@ def test_live_averages_a_faster_stream(localizer: LocalizerModel, recording: Rec
         stream = repeated(recording, times)
         live = Live(localizer, rate_hz=stream.rate_hz)
         end = int(stream.down_command[6])
-        found = [e for e in live.feed(stream.times_s[:end], stream.readings[:end]) if isinstance(e, Estimate)]
+        found = [e for e in live.update(stream.times_s[:end], stream.readings[:end]) if isinstance(e, Estimate)]
         return np.array([(e.press, e.since == "lift", e.readings, e.final, e.x_mm, e.y_mm, e.r90_mm) for e in found])
 
     once, often = estimates(1), estimates(6)

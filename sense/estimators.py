@@ -12,6 +12,8 @@ from padforge.common.progress import OnProgress, ignore_progress
 from padforge.common.settings import validate
 from padforge.common.validation import InputError, check_float, check_type
 from padforge.sense.arrays import MAX_MM, MAX_VOLTS, Array, Indices, check_magnitude, check_numbers
+from padforge.sense.health.health_model import HealthModel
+from padforge.sense.live.pipeline import Live
 from padforge.sense.localizer.calibration import MAX_TIME_BUDGET_S, CalibrationData, calibrate, fit_model, fit_recording
 from padforge.sense.localizer.evaluation import Evaluation, distances, evaluate
 from padforge.sense.localizer.features import PressFeatures, compute_features, features_without_moments
@@ -191,6 +193,19 @@ class Localizer(_Estimator):
         model = self._fitted
         most = model.max_failures if max_failures is None else max_failures
         return evaluate(model, recording, range(min(most, model.fibres - 1) + 1))
+
+    def live(self, rate_hz: float, fibres: int | None = None, health: HealthModel | None = None) -> Live:
+        """Begin to follow the pad as it is read: `live.update(time_s, volts)` returns what has happened.
+
+        Args:
+            rate_hz: readings per second, at least as many as in the calibration or 13.3; more are averaged.
+            fibres: as of `Live`.
+            health: as of `Live`.
+
+        Raises:
+            InputError: not fitted, or as `Live`.
+        """
+        return Live(self._fitted, rate_hz=rate_hz, fibres=fibres, health=health)
 
     def save(self, folder: str | Path) -> None:
         """Write `localizer.json` and `localizer.safetensors`.
