@@ -163,7 +163,7 @@ def train_networks(inputs: Floats, targets: Array, rows: list[Indices], rng: np.
     import torch
     from torch.nn.functional import silu
 
-    from padforge.sense.localizer.training import fit_network
+    from padforge.sense.localizer.optimizer import fit_network
 
     generator = torch.Generator().manual_seed(int(rng.integers(2**63)))
     x, y = torch.from_numpy(inputs), torch.from_numpy(targets.astype(np.float32))

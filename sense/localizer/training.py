@@ -1,4 +1,4 @@
-"""Training of the networks in torch: the training loop, and the losses of the localizer.
+"""Training of the networks in torch: their tasks, and the losses of the localizer.
 
 The loss is the distance, not its square, plus a likelihood of the expected error. Every step masks random fibres,
 augments the positions (and depths) of presses, whose features follow the response model, and reads them at random
@@ -11,7 +11,7 @@ import math
 import os
 import time
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import CancelledError
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -40,85 +40,11 @@ from padforge.sense.localizer.network import (
     stack_members,
     unstack_members,
 )
+from padforge.sense.localizer.optimizer import fit_network
 from padforge.sense.localizer.press_sampler import PressSampler
 from padforge.sense.localizer.scaler import TrainingPresses, leave_one_out_residuals
 from padforge.sense.localizer.torch_network import EnsembleMlp
 from padforge.sense.settings import LocalizerSettings
-
-WARM_UP = 0.1  # share of the steps in which the learning rate rises
-BETAS = 0.9, 0.95  # decay rates of AdamW
-EPSILON = 1e-8  # of AdamW
-AVERAGE_DECAY = 0.995  # decay of the exponential moving average of the weights
-REPORTS = 200  # calls of `on_progress` in a training
-
-
-def one_cycle(share: float) -> float:
-    """Return the learning rate, relative to its maximum, after `share` of the steps: linear up, linear down to 0."""
-    return min(share / WARM_UP, (1 - share) / (1 - WARM_UP))
-
-
-def fit_network(
-    parameters: Mapping[str, Tensor],
-    loss_of_batch: Callable[[], Tensor],
-    steps: int,
-    learning_rate: float,
-    *,
-    seconds: float | None = None,
-    weight_decay: float = 1e-2,
-    averaged: bool = True,
-    on_progress: OnProgress = ignore_progress,
-) -> dict[str, Floats]:
-    """Minimize a loss by cautious AdamW with a one-cycle learning rate.
-
-    A weight whose step would point uphill, since its gradient has changed sign, rests (Liang et al. 2024, "Cautious
-    optimizers"); the others step further, by the share of weights that move. On a simulated pad errors are 1 % less
-    than by AdamW with as many steps, and 7 % less while it is pressed.
-
-    Args:
-        parameters: weights by name, which require gradients and are changed in place.
-        loss_of_batch: samples a batch and returns its loss.
-        steps: of the training.
-        learning_rate: maximum.
-        seconds: limit the training in place of `steps`.
-        weight_decay: of AdamW.
-        averaged: whether to return the moving average of the weights, or the last ones.
-        on_progress: called with (n, `REPORTS`, "").
-
-    Returns:
-        The weights by name.
-    """
-    begin = time.monotonic()
-    weights = list(parameters.values())
-    sizes, shapes = [weight.numel() for weight in weights], [weight.shape for weight in weights]
-    flat = torch.cat([weight.detach().flatten() for weight in weights])
-    average = flat.clone()
-    gradient, mean, square = (torch.zeros_like(flat) for _ in range(3))
-    for weight, shape, values, slopes in zip(weights, shapes, flat.split(sizes), gradient.split(sizes), strict=True):
-        weight.data, weight.grad = values.view(shape), slopes.view(shape)  # one step for all
-    share, step, reports = 0.0, 0, 0
-    torch.set_flush_denormal(True)  # denormal numbers, to which moments of vanishing gradients decay, are slow
-    try:
-        while share < 1:
-            step += 1
-            share = step / steps if seconds is None else min((time.monotonic() - begin) / max(seconds, 1e-9), 1.0)
-            gradient.zero_()
-            loss_of_batch().backward()
-            mean.lerp_(gradient, 1 - BETAS[0])
-            square.mul_(BETAS[1]).addcmul_(gradient, gradient, value=1 - BETAS[1])
-            moves = mean * gradient > 0
-            deviation = (square / (1 - BETAS[1] ** step)).sqrt_().add_(EPSILON)
-            rate = learning_rate * one_cycle(share)
-            further = rate / (1 - BETAS[0] ** step) / moves.float().mean().clamp_(min=1e-3)
-            flat.mul_(1 - rate * weight_decay).sub_(mean.mul(moves).div_(deviation).mul_(further))
-            # The first steps decay faster, so that the initial weights do not weigh on the average.
-            average.lerp_(flat, 1 - min(AVERAGE_DECAY, step / (step + 9)) if averaged else 1.0)
-            if share * REPORTS >= reports + 1:
-                reports = int(share * REPORTS)
-                on_progress(reports, REPORTS, "")
-    finally:
-        torch.set_flush_denormal(False)
-    fitted = zip(parameters, shapes, average.split(sizes), strict=True)
-    return {name: values.view(shape).numpy().copy() for name, shape, values in fitted}
 
 
 @contextmanager
