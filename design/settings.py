@@ -659,7 +659,7 @@ class PadSettings(Settings):
     @property
     def layout(self) -> Layout:
         """Positions of the fibre ends."""
-        return _layout(dict(self))
+        return _layout(vars(self))
 
     @property
     def sensed(self) -> Rectangle:

@@ -127,8 +127,10 @@ class FibreSamples:
     @cached_property
     def shares(self) -> Array:
         """Arc length that each sample represents; shape (F, P)."""
-        step = np.diff(self.arc, axis=1) / 2
-        return np.pad(step, ((0, 0), (1, 0))) + np.pad(step, ((0, 0), (0, 1)))
+        half_step, shares = np.diff(self.arc, axis=1) / 2, np.zeros_like(self.arc)
+        shares[:, :-1] += half_step
+        shares[:, 1:] += half_step
+        return shares
 
     @property
     def family_pairs(self) -> list[tuple[int, int]]:
@@ -164,12 +166,13 @@ def penalties(
     slope = np.empty((len(along), PER_SPAN * (along.shape[1] - 1) + 1))
     points = np.empty((*slope.shape, 2))
     sample_spans(along, across, knot_slope, SPAN_SHARES, points, slope)
-    arc = np.pad(np.linalg.norm(np.diff(points, axis=1), axis=-1).cumsum(axis=1), ((0, 0), (1, 0)))
+    steps, arc = np.diff(points, axis=1), np.zeros_like(slope)
+    np.linalg.norm(steps, axis=-1).cumsum(axis=1, out=arc[:, 1:])
     fibres = FibreSamples(along, across, knot_slope, points, slope, arc, pad, rules, margin, all_bends)
     gradient = Gradient(slope, along)
     values = {name: value for name, penalty in PENALTIES.items() if (value := penalty(fibres, gradient)) is not None}
     # each arc length is a sum over the steps before it
-    steps, later = np.diff(points, axis=1), gradient.arc[:, :0:-1].cumsum(axis=1)[:, ::-1, None]
+    later = gradient.arc[:, :0:-1].cumsum(axis=1)[:, ::-1, None]
     length = np.hypot(*np.moveaxis(steps, -1, 0))[..., None]
     pull = np.divide(later * steps, length, out=np.zeros_like(steps), where=length > 0)
     gradient.points[:, :-1] -= pull
