@@ -117,8 +117,8 @@ def _position_numbers(plan: "Plan", numbers: Sequence[BaseGeometry]) -> list[Bas
     floor, occupied = plan.cavity.difference(plan.feet).buffer(-clearance, join_style="mitre"), []
     shapely.prepare([*lines, floor])
     positioned: list[BaseGeometry | None] = []
-    ahead, aside = np.arange(0, reach, _NUMBER_STEP_MM), np.arange(-reach / 2, reach / 2, _NUMBER_STEP_MM)
-    depth, shift = (grid.ravel() for grid in np.meshgrid(ahead, aside))
+    depths, shifts = np.arange(0, reach, _NUMBER_STEP_MM), np.arange(-reach / 2, reach / 2, _NUMBER_STEP_MM)
+    depth, shift = (grid.ravel() for grid in np.meshgrid(depths, shifts))
     nearest_first = np.argsort(np.hypot(depth, shift), kind="stable")
     for number, line in zip(numbers, lines, strict=True):
         start, second = np.array(line.coords[:2])
