@@ -87,16 +87,14 @@ def check_plan(plan: Plan) -> list[Finding]:
 
 _SLENDER = 5.0  # ratio of height to width above which ridges may break
 _MAX_SLENDERNESS = 10.0  # ratio above which they cannot be printed
-_BEND_TURN = 2.5e-3  # turn between the points of a bend, rad
 _BEND_TOLERANCE = 1e-3  # relative, of bend radii, since leads bend as tightly as allowed
-_MAX_NAMES = 8  # more fibres are counted instead of named
 _PILLAR_LINES = 2  # minimum width of a stable pillar, in printed lines
 _STRAIN_SHARE = 0.5  # fraction of a fibre's maximum strain that bending may use; presses need the remainder
 
 
 def _list_fibres(noun: str, numbers: Sequence[int]) -> str:
     plural = noun if len(numbers) == 1 else f"{noun}s"
-    return f"{plural} {', '.join(map(str, numbers))}" if len(numbers) <= _MAX_NAMES else f"{len(numbers)} {plural}"
+    return f"{plural} {', '.join(map(str, numbers))}" if len(numbers) <= 8 else f"{len(numbers)} {plural}"
 
 
 def _points_in(polygons: Iterable[Any]) -> list[Position]:
@@ -284,7 +282,7 @@ def _check_fibre_bend(plan: Plan) -> Finding:
     A corner between a fibre and its lead counts as a bend; up to half a radian passes.
     """
     limit = plan.settings.min_bend_radius_mm
-    bends = [bend_radius(*path, limit / 2) for path in plan.trace(_BEND_TURN, limit / 2)] if limit else []
+    bends = [bend_radius(*path, limit / 2) for path in plan.trace(step=2.5e-3, past_mm=limit / 2)] if limit else []
     tight = [(fibre, *bend) for fibre, bend in enumerate(bends, 1) if bend[0] < limit * (1 - _BEND_TOLERANCE)]
     radius = min((radius for _, radius, _ in tight), default=limit)
     names = _list_fibres("fibre", [fibre for fibre, _, _ in tight])
