@@ -19,8 +19,13 @@ if TYPE_CHECKING:
 
 
 _RIG_SETTINGS = "padforge.sense.settings:RigSettings"
-_RIGS = "simulated, ur5, printer, hand, or an installed arm."
-rig_option = click.option("--rig", metavar="NAME", default="simulated", show_default=True, help=_RIGS)
+rig_option = click.option(
+    "--rig",
+    metavar="NAME",
+    default="simulated",
+    show_default=True,
+    help="simulated, ur5, printer, hand, or an installed arm.",
+)
 _warn = partial(common.echo, err=True)
 
 
