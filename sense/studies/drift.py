@@ -43,7 +43,7 @@ MEMBERS = 3  # networks whose errors are averaged: they differ by their first we
 HIDDEN, EPOCHS = 50, 200
 RIG = RigSettings(presses=1000)  # that records pads
 SIDE = 32  # presses along a side of the published serpentine on which idle shares are simulated
-SETTLED = 10  # readings from a command of the probe to the level, as published: 10, 30 and 50 of a cycle of 40
+SETTLED = 10  # readings from a command to the level, as published: 10, 30 and 50 with commands at 20 and 40
 EXCERPT_PRESSES = 5  # in the figure's excerpt of readings
 MAX_LEVELS = 400  # presses by which the figure shows the drift of a whole recording
 COLUMNS = 2  # recordings side by side whose errors are drawn
