@@ -77,7 +77,7 @@ def expected_errors(pad: Morphology, contact: Contact, search: SearchSettings, s
         errors.append([])
         for sets in masks:
             count, means = max(len(presses) // len(sets), MIN_PRESSES), []
-            for index, working in enumerate(sets):  # sets share presses only if there are too few of them
+            for index, working in enumerate(sets):  # presses are used again only if there are too few for all sets
                 rows = np.arange(index * count, (index + 1) * count) % len(presses)
                 estimates = bayes_positions(readings[rows], positions, scatter, working)
                 means.append(np.hypot(*(estimates - presses[rows]).T).mean())

@@ -211,20 +211,21 @@ def _zigzag(layout: Layout, rules: RulesSettings, knots: int, rng: np.random.Gen
     turns = max(1, min(knots // per_turn, int(extent / (4 * radius)) if radius > 0 else knots))
     fibres = []
     for axis, rows in enumerate(layout.families):
-        width, pitch, level = layout.extent[1 - axis], layout.extent[axis] / (turns + 1), layout.levels[rows, None]
-        shoulder = float(np.clip(0.8 * radius, 0.1 * pitch, 0.25 * pitch))
-        position = pitch * (np.arange(1, turns + 1) + 0.12 * rng.standard_normal(turns))
+        width, spacing, level = layout.extent[1 - axis], layout.extent[axis] / (turns + 1), layout.levels[rows, None]
+        shoulder = float(np.clip(0.8 * radius, 0.1 * spacing, 0.25 * spacing))  # distance from the turn along the fibre
+        # what the fibres of a family have in common: where they turn, to which side, and how far
+        position = spacing * (np.arange(1, turns + 1) + 0.12 * rng.standard_normal(turns))
         sign = np.where(np.arange(turns) % 2 == 0, 1, -1) * rng.choice([-1, 1])
         swing = 0.6 * sign * rng.uniform(0.5, 1.2, turns)
         aspect = min(1.0, layout.extent[axis] / width)  # fibres shorter than the pad is wide have less room to turn
         centre = width / 2 + (1 - 0.3 * aspect) * (level - width / 2)
-        peak = np.sort(centre + aspect * swing + 0.1 * rng.standard_normal((len(level), turns)), axis=0)
-        turn = np.sort(position + 0.02 * rng.standard_normal((len(level), turns)), axis=1)
-        path = np.concatenate([level, peak, level], axis=1)
-        drop = np.clip(0.12 * np.stack([peak - path[:, :-2], peak - path[:, 2:]]), -0.1, 0.1)
-        turn_knots = [(turn, peak)]
+        across = np.sort(centre + aspect * swing + 0.1 * rng.standard_normal((len(level), turns)), axis=0)
+        along = np.sort(position + 0.02 * rng.standard_normal((len(level), turns)), axis=1)
+        path = np.concatenate([level, across, level], axis=1)
+        drop = np.clip(0.12 * np.stack([across - path[:, :-2], across - path[:, 2:]]), -0.1, 0.1)
+        turn_knots = [(along, across)]
         if per_turn == KNOTS_PER_TURN:
-            turn_knots = [(turn - shoulder, peak - drop[0]), *turn_knots, (turn + shoulder, peak - drop[1])]
+            turn_knots = [(along - shoulder, across - drop[0]), *turn_knots, (along + shoulder, across - drop[1])]
         points = np.array(turn_knots).transpose(2, 3, 0, 1)  # (F, turns, knots of a turn, 2), along and across
         points = points.reshape(len(level), turns * len(turn_knots), 2)
         fibres.append(points if axis == 0 else points[..., ::-1])

@@ -19,13 +19,8 @@ if TYPE_CHECKING:
 
 
 _RIG_SETTINGS = "padforge.sense.settings:RigSettings"
-rig_option = click.option(
-    "--rig",
-    metavar="NAME",
-    default="simulated",
-    show_default=True,
-    help="simulated, ur5, printer, hand, or an installed arm.",
-)
+_RIGS = "simulated, ur5, printer, hand, or an installed arm."
+rig_option = click.option("--rig", metavar="NAME", default="simulated", show_default=True, help=_RIGS)
 _warn = partial(common.echo, err=True)
 
 
