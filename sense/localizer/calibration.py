@@ -19,9 +19,9 @@ from padforge.design import Contact, Morphology
 from padforge.design.objectives.fibre_loss import failure_subsets
 from padforge.sense.arrays import Array, Indices
 from padforge.sense.localizer.evaluation import (
+    CONVERGED_SHARE,
     PRIOR_PRESSES,
     RATIO_SHAPE,
-    TRAINED_OUT,
     Evaluation,
     conformal,
     distances,
@@ -282,8 +282,8 @@ def fit_model(
     true_measures = {name: values[calibration] for name, values in data.measures.items()}
     defaults = LocalizerSettings()
     is_default = all(getattr(options, name) == getattr(defaults, name) for name in ("members", "hidden", "layers"))
-    is_trained_out = trained_share * options.epochs >= TRAINED_OUT * defaults.epochs
-    is_usual = is_default and is_ensemble and n_timed and not data.measures and is_trained_out
+    is_converged = trained_share * options.epochs >= CONVERGED_SHARE * defaults.epochs
+    is_usual = is_default and is_ensemble and n_timed and not data.measures and is_converged
     n_trained = len(train) if is_usual else None
     levels = _n_levels(options, model.fibres)
     return calibrate_uncertainty(model, moments, true_mm, levels, true_measures, on_progress, n_trained)

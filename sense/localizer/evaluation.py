@@ -29,7 +29,7 @@ BUILT_PAD = "simulated, by default with the scatter of a built pad, which itself
 CELLS = 5  # cells along a side of the map of errors by position
 MOMENT_SETS = 3  # maximum sets of failed fibres of a size at each moment
 NO_MOMENTS: dict[str, Any] = {"by_moment": [], "focus": {}}
-TRAINED_OUT = 0.5  # share of the steps of a training after which errors are within 5 % of the final ones
+CONVERGED_SHARE = 0.5  # share of the steps of a training after which errors are within 5 % of the final ones
 PRIOR_PRESSES = 100  # weight of the experience with other pads in radii, in presses
 RATIO_SHAPE = 2.1
 """Shape of the gamma distribution of the ratio of distance to expected radius on other pads; it does not depend on the
@@ -431,8 +431,8 @@ def calibration_lines(document: Mapping[str, Any]) -> list[str]:
 def reserve_lines(document: Mapping[str, Any]) -> list[str]:
     """Return the reservations about a calibration, a line each: short training, radii of few presses, and doubts."""
     share, presses, lines = document.get("trained_share", 1.0), document.get("radii_presses", 0), []
-    if share < TRAINED_OUT:
-        lines.append(f"not trained out: {share:.0%} of the usual steps; errors fall with more time")
+    if share < CONVERGED_SHARE:
+        lines.append(f"not converged: {share:.0%} of the usual steps; errors fall with more time")
     if presses and (slack := 2 * math.sqrt(0.9 * 0.1 / presses)) > MAX_UNCERTAINTY:
         shares = f"{0.9 - slack:.0%} to {min(0.9 + slack, 1):.0%}"
         lines.append(f"radii rest on few presses: {shares} of further presses may lie in r90")
