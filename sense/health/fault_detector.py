@@ -347,13 +347,13 @@ class FaultDetector:
         presses = {COMMANDED: commanded, DETECTED: align_to_detected(readings, times_s, *commanded)}
         options = {"false_alarm_rate": self.false_alarm_rate, "provenance": dict(provenance or {})}
 
-        def fit(name: str) -> HealthModel:
+        def fit_model(name: str) -> HealthModel:
             down_command, up_command = (command[mask] for command in presses[name])
             rng = np.random.default_rng(self.seed)
             return fit_health_model(readings, recording.rate_hz, down_command, up_command, rng=rng, **options)
 
         with one_thread():
-            models = dict(run_tasks((name, partial(fit, name)) for name in presses))
+            models = dict(run_tasks((name, partial(fit_model, name)) for name in presses))
         self.model_, self.live_model_ = models[COMMANDED], models[DETECTED]
         return self
 

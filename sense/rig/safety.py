@@ -231,7 +231,7 @@ def retreat(arm: Arm, limits: Limits) -> None:
         max_depth_mm=max(limits.max_depth_mm, limits.contact_mm - z),
     )
     check_state(state, relaxed, clock.now())
-    # RETREAT_MM above the pad; above the present position too if the force is too high; in no case lower than that
+    # RETREAT_MM above the pad, and at least the present height, or RETREAT_MM above that if the force is too high
     clear_mm = max(limits.contact_mm, z if overloaded else z - RETREAT_MM) + RETREAT_MM
     up: Pose = (*state.pose[:2], min(clear_mm, limits.box_mm[2][1]), *state.pose[3:])
     if up[2] <= z:

@@ -239,7 +239,7 @@ def _describe(settings: Mapping[str, Any], idle: Rows) -> list[str]:
         f"Networks of {settings['hidden']} neurons localize presses from readings after {len(settings['filters'])} "
         f"filters, with {len(settings['compensations'])} kinds of drift compensation. Errors are means of "
         f"{settings['members']} networks, on presses never trained on: {share:g} % drawn at random, and the last "
-        f"{share:g} % of the recording, by which the drift has gone on."
+        f"{share:g} % of the recording, after further drift."
     ]
     if model := [row for row in idle if row["kind"] == "contact model"]:
         shares = _listed([f"{row['idle_percent']:.1f} % ({row['label']})" for row in model])

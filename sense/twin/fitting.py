@@ -261,5 +261,5 @@ def gain_wander(pad: AsBuiltPad, responses: Responses) -> float:
     y, x = (values[: blocks * WANDER_PRESSES].reshape(blocks, WANDER_PRESSES, -1) for values in (volts, expected))
     power = np.maximum((x**2).sum(axis=1), MIN_SCALE_V**2)
     gain = (x * y).sum(axis=1) / power
-    chance = ((y - gain[:, None] * x) ** 2 * x**2).sum(axis=1) / power**2
-    return float(np.clip(np.mean(gain.var(axis=0, ddof=1) - chance.mean(axis=0)), 0, 1) ** 0.5)
+    chance_var = ((y - gain[:, None] * x) ** 2 * x**2).sum(axis=1) / power**2
+    return float(np.clip(np.mean(gain.var(axis=0, ddof=1) - chance_var.mean(axis=0)), 0, 1) ** 0.5)
