@@ -22,7 +22,6 @@ if TYPE_CHECKING:
 
 SEARCH = "padforge.design.settings:SearchSettings"
 POLL_S = 0.2  # period of checking for Ctrl-C where the system does not wake a waiting thread, s
-MIN_SHOWN_MM = 5e-4  # smallest shift of a fibre's ends that `import` prints, mm
 morphology_argument = click.argument("morphology", type=click.Path(path_type=Path))
 twin_option = click.option(
     "--twin",
@@ -303,7 +302,7 @@ def import_(
     violations, knots = check_rules(result.pad, rules, pad_settings), result.pad.knots.shape[1] - 2
     lines = [f"import: {len(result.fibres)} fibres of {knots} knots -> {path}", f"  {result.placement}"]
     for number, fibre in enumerate(result.fibres, 1):
-        moved = f", ends moved by {fibre.end_shift_mm:.3f} mm" if fibre.end_shift_mm >= MIN_SHOWN_MM else ""
+        moved = f", ends moved by {fibre.end_shift_mm:.3f} mm" if fibre.end_shift_mm >= 5e-4 else ""
         lines.append(f"  fibre {number}: {fibre.name}, within {fibre.max_error_mm:.3f} mm{moved}")
     lines += [f"  broken: {violation}" for violation in violations] or ["  all rules hold"]
     document = {

@@ -28,7 +28,6 @@ from padforge.design.report import FORMAT, draw_plan
 from padforge.design.settings import Contact, PadSettings, RulesSettings, SearchSettings
 
 SIGNIFICANT = 0.05  # relative difference of expected errors from which trained networks agree which pad is better
-MAX_VIOLATIONS = 10  # violations that the summary lists
 
 
 def run_design(
@@ -154,7 +153,7 @@ def load_result(out: Path) -> SearchResult:
 
 def summary_lines(result: SearchResult, out: Path) -> list[str]:
     """Summarise a search in a few lines of text: expected errors beside those of straight fibres, and broken rules."""
-    violations = [f"  broken: {violation}" for violation in result.violations[:MAX_VIOLATIONS]]
+    violations = [f"  broken: {violation}" for violation in result.violations[:10]]
     remaining = len(result.violations) - len(violations)
     stopped = f" ({result.stopped}: the best so far)" if result.stopped else ""
     return [

@@ -100,9 +100,9 @@ class TwinReadings:
 
 @dataclass(frozen=True)
 class TwinPart:
-    """Part of a press, to which the fibres of the twin respond, without the residues of earlier presses it removes.
+    """Response of the fibres to one part of a press, without the residues of earlier presses that it removes.
 
-    Its fields are as of the twin.
+    The fields are as of `Twin`.
     """
 
     distance_mm: Array
@@ -187,11 +187,11 @@ class Twin:
         return _profile_contact(self.distance_mm, self.weight)
 
     def ignored_effects(self) -> str | None:
-        """Describe effects measured on this pad that are not those of any other pad; None if there are none."""
+        """Describe effects measured on this pad that do not hold for other pads; None if there are none."""
         effects = ["the dependence on the angle between fibre and press"] if self.angular_weight is not None else []
         stds = [np.log(np.maximum(row, 1e-3)).std() for row in self.sensitivity or () if row is not None]
         if stds and max(stds) > UNIFORM_SENSITIVITY_STD:
-            effects.append(f"where along its fibres the response is uneven ({np.mean(stds):.0%})")
+            effects.append(f"the uneven sensitivity along its fibres ({np.mean(stds):.0%})")
         return f"not carried over to another pad: {' and '.join(effects)}" if effects else None
 
     def as_built_stretch(self, positions_mm: ArrayLike, part: str | None = None) -> Array:
@@ -201,7 +201,7 @@ class Twin:
 
         Args:
             positions_mm: presses in the arm's frame; shape (Q, 2), mm.
-            part: a name in `parts`; the response, with what history adds to it on average, if None.
+            part: a name in `parts`; None for the whole response, with what history adds to it on average.
 
         Returns:
             Relative stretch; shape (Q, F); 0 for a fibre that no channel reads.

@@ -19,7 +19,6 @@ TOLERANCE_MM = 0.005  # maximum distance of a toolpath from its curve: a tenth o
 _FLAT_SHARE = 0.2  # fraction of the tolerance for flattening
 _SIMPLIFY_SHARE = 0.8  # fraction of the tolerance for simplification, which removes most points
 _MAX_TURN = 0.02  # between two samples of the heading, radians
-_STRAIGHT = 1e-6  # turn below which a segment is straight, radians
 _FEED_STEPS = 10  # feeds are rounded down to tenths of the maximum, which keeps programs readable
 _ROUNDING_MM = 1e-9
 
@@ -102,7 +101,7 @@ def _min_bend_radii(points: Array, headings: Array, positions: Array, diameter_m
     turns = np.interp(station + half, arc, turn) - np.interp(station - half, arc, turn)
     first, last = np.floor(corners[:-1] / half).astype(int), np.ceil(corners[1:] / half).astype(int)
     max_turns = np.maximum.reduceat(turns, np.column_stack([first, last + 1]).ravel())[::2]
-    return np.divide(2 * half, max_turns, out=np.full(len(max_turns), np.inf), where=max_turns > _STRAIGHT)
+    return np.divide(2 * half, max_turns, out=np.full(len(max_turns), np.inf), where=max_turns > 1e-6)
 
 
 def _compute_feeds(dispenser: DispenserSettings, radii_mm: Array, diameter_mm: float, max_strain: float) -> Array:

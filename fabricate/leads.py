@@ -1,8 +1,8 @@
 """Leads of fibres, from their ends to the edge of the silicone: straight on, or all to one side.
 
 A pad that is wired to one connector has both ends of every fibre on its lower edge. Horizontals turn down beside the
-pad, the lowest next to it. The upper ends of verticals turn to the left or to the right above the pad, half of them
-each, and go down outside of the horizontals. The leads are nested and do not cross: each is offset from its neighbour
+pad, the lowest next to it. The upper ends of verticals turn above the pad, half of them to the left and half to the
+right, and go down outside of the horizontals. The leads are nested and do not cross: each is offset from its neighbour
 by the distance between leads or by a pitch.
 """
 
@@ -132,31 +132,31 @@ def one_side_leads(ends_mm: Array, layout: Layout, spacing: tuple[float, float, 
     """Compute leads that all end on the lower edge from fibre ends (F, 2, 2), mm, and their `lead_spacing`."""
     (half_x, half_y), (horizontals, verticals) = (side / 2 for side in layout.size_mm), layout.counts
     border, gap, radius, edge = spacing
-    inner = half_x + border + radius  # x of the lowest horizontal's lead
-    y_min = -half_y - border
+    # 1. x of the lead of the lowest horizontal: beside the border, and beside the lower end of the last vertical
+    first_x, last_vertical_x = half_x + border + radius, half_x - layout.pitch_x_mm
     if verticals:
-        inner = max(inner, half_x - layout.pitch_x_mm + gap)
+        first_x = max(first_x, last_vertical_x + gap)
+    # 2. y of the edge, with room for the bend of the lowest horizontal
+    y_min = -half_y - border
     if horizontals:
         y_min = min(y_min, layout.pitch_y_mm - half_y - radius)
-    outer = inner + horizontals * gap  # x of the innermost vertical's lead
-    if not horizontals:
-        outer = max(half_x + border + gap, 0.0)
-    outer = max(outer, half_x - layout.pitch_x_mm + 2 * radius)
-    top = half_y + border + radius
+    # 3. x and y of the innermost lead that turns from an upper end: outside of the horizontals, with room for two bends
+    turned_x = first_x + horizontals * gap if horizontals else max(half_x + border + gap, 0.0)
+    turned_x, turned_y = max(turned_x, last_vertical_x + 2 * radius), half_y + border + radius
     pairs = []
     for fibre, (start, end) in enumerate(ends_mm):
         if layout.family(fibre):
             number = fibre - horizontals
             is_left = 2 * number < verticals
             offset = (number if is_left else verticals - 1 - number) * gap
-            corners = [(end[0], top + offset), ((-1 if is_left else 1) * (outer + offset), top + offset)]
+            corners = [(end[0], turned_y + offset), ((-1 if is_left else 1) * (turned_x + offset), turned_y + offset)]
             pairs.append((_down(start, [], y_min, radius), _down(end, corners, y_min, radius)))
         else:
-            x = inner + fibre * gap
+            x = first_x + fibre * gap
             pairs.append((_down(start, [(-x, start[1])], y_min, radius), _down(end, [(x, end[1])], y_min, radius)))
     max_rank = (verticals + 1) // 2 - 1
-    x_max = (outer + max_rank * gap if verticals else inner + (horizontals - 1) * gap) + edge
-    y_max = top + max_rank * gap + edge if verticals else half_y + border
+    x_max = (turned_x + max_rank * gap if verticals else first_x + (horizontals - 1) * gap) + edge
+    y_max = turned_y + max_rank * gap + edge if verticals else half_y + border
     return Leads(tuple(pairs), (-x_max, y_min, x_max, y_max))
 
 

@@ -36,11 +36,9 @@ No edge of the solid is shorter; and without a grid, outlines that almost coinci
 _CENTRE_SHARE = 0.2  # fraction of the tolerance for centre lines
 _ARC_SHARE = 0.2  # fraction of the tolerance for arcs
 _OUTLINE_SHARE = 0.6  # fraction for simplifying outlines, the largest since it determines the size of all files
-_NUMBER_DISTANCE = 5  # maximum distance of a number from its fibre's start, in heights
 _NUMBER_STEP_MM = 0.5  # grid of candidate positions for a number
 _NUMBER_TRIES = 50  # candidates that are tested together; most numbers fit at one of the first
 _AT_WALL_MM = 1e-3  # distance up to which a pillar touches a wall
-_MAX_WHITE = 0.7  # fraction of white in a family's palest tint; paler lines are hard to see in print
 
 
 def assign_layers(
@@ -108,17 +106,17 @@ def draw_number(number: int, height_mm: float, width_mm: float) -> BaseGeometry:
 def _position_numbers(plan: "Plan", numbers: Sequence[BaseGeometry]) -> list[BaseGeometry | None]:
     """Move each centred number to the nearest free position beside its fibre's start; None if there is none.
 
-    Candidates lie on a grid in the cavity, inwards from the start and half as far to either side of it. They are free
-    if clear of walls, pillars, ridges and other numbers.
+    Candidates lie on a grid in the cavity, inwards from the start and half as far to either side of it, up to a pitch
+    or five heights of a number. They are free if clear of walls, pillars, ridges and other numbers.
     """
     mould, lines = plan.settings.mould, plan.lines
     clearance = mould.ridge_width_mm / 2 + plan.heights_mm[-1] * plan.settings.ridge_slope + mould.min_silicone_mm
-    reach = min(plan.min_pitch_mm, _NUMBER_DISTANCE * mould.number_mm)
+    reach = min(plan.min_pitch_mm, 5 * mould.number_mm)
     floor, occupied = plan.cavity.difference(plan.feet).buffer(-clearance, join_style="mitre"), []
     shapely.prepare([*lines, floor])
     positioned: list[BaseGeometry | None] = []
-    ahead, aside = np.arange(0, reach, _NUMBER_STEP_MM), np.arange(-reach / 2, reach / 2, _NUMBER_STEP_MM)
-    depth, shift = (grid.ravel() for grid in np.meshgrid(ahead, aside))
+    depths, shifts = np.arange(0, reach, _NUMBER_STEP_MM), np.arange(-reach / 2, reach / 2, _NUMBER_STEP_MM)
+    depth, shift = (grid.ravel() for grid in np.meshgrid(depths, shifts))
     nearest_first = np.argsort(np.hypot(depth, shift), kind="stable")
     for number, line in zip(numbers, lines, strict=True):
         start, second = np.array(line.coords[:2])
@@ -529,7 +527,7 @@ def fibre_layers(plan: Plan) -> list[FibreLayer]:
     families = [plan.family(fibres[0]) for fibres in plan.layers]
     layers = []
     for index, family in enumerate(families):
-        white = _MAX_WHITE * families[index + 1 :].count(family) / families.count(family)
+        white = 0.7 * families[index + 1 :].count(family) / families.count(family)  # lines must not be too pale
         tint = bytes(round(value + white * (255 - value)) for value in bytes.fromhex(FAMILY_COLOURS[family][1:]))
         colour = f"#{tint.hex()}"
         layers.append(FibreLayer(family, index, plan.depths_mm[index], plan.layers[index], colour))

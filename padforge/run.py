@@ -43,7 +43,6 @@ _STAGE_SECTIONS = {
 EPOCHS = 90
 """Passes of the training through the presses unless `[localizer]` states them: half of the default of `padforge sense
 calibrate`, by which a simulated pad errs 0 to 3 % more, and a built one 2 to 5 %."""
-SEARCH_SHARE = 0.5  # maximum fraction of the time budget for the search
 RESERVE_S = 30.0  # reserved after the training for calibration of radii, errors, fault detection, figures and report
 FORMAT = "padforge-run/1"
 NAME = "run.json"
@@ -236,7 +235,7 @@ def run_stages(
 
     def search(record: "Callable[[SearchResult], None]") -> "SearchResult":
         with search_progress() as on_progress:
-            options = SearchOptions(on_progress, resume=run.resume, time_budget=run.remaining_s(SEARCH_SHARE))
+            options = SearchOptions(on_progress, resume=run.resume, time_budget=run.remaining_s(0.5))
             return run_design(spec, out, seed, None, options, None, record, _regenerated_files(), run.force)[1]
 
     def calibrate(_: object) -> dict[str, Any]:

@@ -79,7 +79,7 @@ def press_ambiguities(signals: Any, presses: Any, failed: Any) -> Any:
     """Compute sum_b w_ab |p_a - p_b| (Q, L) for each press a and each set of failed fibres, grid units.
 
     Signals (Q, F) are divided by twice their noise, presses (Q, 2) in grid units; `failed` (L, K) are the indices of
-    the failed fibres of each set, filled up with F. Pairs of no likelihood are skipped.
+    the failed fibres of each set, filled up with F. Pairs of negligible likelihood are skipped.
     """
     count, fibres = signals.shape
     sets, max_failures = failed.shape

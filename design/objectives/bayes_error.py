@@ -52,13 +52,13 @@ Mask = NDArray[np.bool_]
 class Positions(NamedTuple):
     """Positions that a press may have, each of which stands for a cell around it."""
 
-    places: Array  # the positions; shape (P, 2), grid units
+    centres: Array  # the positions; shape (P, 2), grid units
     log_prior: Array  # logarithms of the areas of the cells; shape (P,)
     responses: Array  # responses of the fibres; shape (P, F), full scales
     blur: Array  # variances of the responses within the cells; shape (P, F)
 
 
-@threadpool_limits.wrap(limits=1, user_api="blas")  # several threads wait for each other, and other work goes on
+@threadpool_limits.wrap(limits=1, user_api="blas")  # threads of BLAS wait for each other if cores are busy
 def expected_errors(pad: Morphology, contact: Contact, search: SearchSettings, size: PadSettings) -> list[float]:
     """Compute the expected errors with 0, 1, ... fibres failed, grid units, always with the same random numbers."""
     fibres, windows = len(pad.knots), evaluation_windows(size.sensed)
@@ -77,7 +77,7 @@ def expected_errors(pad: Morphology, contact: Contact, search: SearchSettings, s
         errors.append([])
         for sets in masks:
             count, means = max(len(presses) // len(sets), MIN_PRESSES), []
-            for index, working in enumerate(sets):  # sets share presses only if there are too few of them
+            for index, working in enumerate(sets):  # presses are used again only if there are too few for all sets
                 rows = np.arange(index * count, (index + 1) * count) % len(presses)
                 estimates = bayes_positions(readings[rows], positions, scatter, working)
                 means.append(np.hypot(*(estimates - presses[rows]).T).mean())
@@ -94,25 +94,25 @@ def possible_positions(
     grids = [_position_grid(pad, contact, near_low, near_high, STEP)]
     if (near_low > low).any() or (near_high < high).any():
         far = _position_grid(pad, contact, low, high, max(FAR_STEP, math.sqrt((high - low).prod() / MAX_FAR)))
-        is_far = ((far.places < near_low) | (far.places > near_high)).any(axis=1)
+        is_far = ((far.centres < near_low) | (far.centres > near_high)).any(axis=1)
         grids.append(Positions(*(values[is_far] for values in far)))
     positions = Positions(*map(np.concatenate, zip(*grids, strict=True)))
-    free = is_outside(positions.places, size)
-    places, log_prior, responses, blur = (values[free] for values in positions)
-    return Positions(places, log_prior, responses / scale, blur / scale**2)
+    free = is_outside(positions.centres, size)
+    centres, log_prior, responses, blur = (values[free] for values in positions)
+    return Positions(centres, log_prior, responses / scale, blur / scale**2)
 
 
 def _position_grid(pad: Morphology, contact: Contact, low: Array, high: Array, step: float) -> Positions:
     """Return the centres of cells of a rectangle, `step` or a little less apart, with relative stretches."""
     counts = np.maximum(np.ceil((high - low) / step).astype(int), 2)
     cell = (high - low) / counts
-    places = low + cell * (np.stack(np.meshgrid(*map(np.arange, counts), indexing="ij"), axis=-1) + 0.5)
-    responses = relative_stretch(pad, places.reshape(-1, 2), contact).reshape(*counts, -1)
+    centres = low + cell * (np.stack(np.meshgrid(*map(np.arange, counts), indexing="ij"), axis=-1) + 0.5)
+    responses = relative_stretch(pad, centres.reshape(-1, 2), contact).reshape(*counts, -1)
     differences = np.stack(np.gradient(responses, axis=(0, 1)))  # from cell to cell
     blur = (differences**2).sum(axis=0) / 12  # the variance of a uniform distribution over a cell
     n = counts.prod()
     return Positions(
-        places.reshape(n, 2), np.full(n, math.log(cell.prod())), responses.reshape(n, -1), blur.reshape(n, -1)
+        centres.reshape(n, 2), np.full(n, math.log(cell.prod())), responses.reshape(n, -1), blur.reshape(n, -1)
     )
 
 
@@ -149,16 +149,16 @@ def bayes_positions(readings: Array, positions: Positions, scatter: Scatter, wor
     # Single precision, operations in place on blocks that fit the cache, and a clipped exponent are for speed.
     quadratic = np.float32(np.vstack([-precision.T, 2 * precision.T * x.T, constant]) / 2)
     linear = np.float32(np.vstack([direction.T, -(direction * x).sum(axis=1)]) / math.sqrt(2))
-    places = np.float32(np.column_stack([positions.places, np.ones(len(x))]))
+    centres = np.float32(np.column_stack([positions.centres, np.ones(len(x))]))
     estimates = np.empty((len(z), 2))
     for first in range(0, len(z), BLOCK):
         rows = slice(first, first + BLOCK)
         block = np.float32(np.column_stack([z[rows], np.ones(len(z[rows]))]))
         log_posterior = np.hstack([block[:, :-1] ** 2, block]) @ quadratic
-        gain = block @ linear
-        log_posterior += np.square(gain, out=gain)
+        shared_term = block @ linear
+        log_posterior += np.square(shared_term, out=shared_term)
         log_posterior -= log_posterior.max(axis=1, keepdims=True)
         posterior = np.exp(np.maximum(log_posterior, MIN_EXPONENT, out=log_posterior), out=log_posterior)
-        sums = posterior @ places
+        sums = posterior @ centres
         estimates[rows] = sums[:, :2] / sums[:, 2:]
     return estimates

@@ -10,12 +10,12 @@ proportional to the response, a fraction `common` of whose variance is shared by
 For presses a, cells c of a grid between them and the set K of fibres that still work, the criterion is a weighted sum
 of two terms:
 
-    L_K = mean_a |alpha_a| / c_aa,           alpha = C p,    C = (k + r 1)^-1,    k_ab = exp(-|x_a - x_b|^2_K / 2 w^2),
+    L_K = mean_a |alpha_a| / G_aa,           alpha = G p,    G = (k + r I)^-1,    k_ab = exp(-|x_a - x_b|^2_K / 2 w^2),
     B_K = mean_c sqrt(trace F_c^-1),         F_c = J_c' S_c^-1 J_c + 12 / side^2,     J_c = dx / dp in c,
     criterion = 0.85 B_K + 0.47 L_K.
 
 L_K is the leave-one-out error of kernel ridge regression in closed form, with the kernel width w, the ridge r, the
-diagonal c_aa of C and the positions p relative to their centre. B_K is the Cramer-Rao bound with a prior over the
+diagonal G_aa of G and the positions p relative to their centre. B_K is the Cramer-Rao bound with a prior over the
 window, of that side, and the covariance S_c of the responses. The weights are fitted to errors of small trained
 networks. `docs/method.md` names sources and reasons.
 
@@ -242,42 +242,36 @@ def criterion(
     Returns:
         Errors (L,), grid units, and their gradients (L, F, Q + P), or (L, 0, Q + P) without `differentiate`.
     """
-    count, fibres = len(free), len(responses) if differentiate else 0
+    n_grid, fibres = len(free), len(responses) if differentiate else 0
     gradient = np.zeros((len(masks), fibres, len(positions)))
     # 1. the regression
-    rows = np.concatenate([np.flatnonzero(free), np.arange(count, len(positions))])
+    rows = np.concatenate([np.flatnonzero(free), np.arange(n_grid, len(positions))])
     factor = weights[:, None] / WIDTH
     scaled = np.float32(factor * responses[:, rows])
-    centred = np.float32(positions[rows] - positions[:count].mean(axis=0))
+    centred = np.float32(positions[rows] - positions[:n_grid].mean(axis=0))
     grad_scaled = np.empty((len(masks), fibres, len(rows)))
     regression = leave_one_out_errors(scaled, centred, masks, int(free.sum()), RIDGE, grad_scaled)
     gradient[:, :, rows] = REGRESSION_WEIGHT * factor[:fibres] * grad_scaled
     # 2. the bound, over cells of four free corners; between keep-outs there may be none
-    side = math.isqrt(count)
+    side = math.isqrt(n_grid)
     grid = free.reshape(side, side)
     row, column = np.nonzero(grid[:-1, :-1] & grid[:-1, 1:] & grid[1:, :-1] & grid[1:, 1:])
     if not len(row):
         return REGRESSION_WEIGHT * regression, gradient
-    grad_grid = np.empty((len(masks), fibres, count))
+    grad_grid = np.empty((len(masks), fibres, n_grid))
     cells, prior = row * side + column, 12 / (step * side) ** 2
     bound = error_bound(
-        np.ascontiguousarray(responses[:, :count]), step, cells, masks, tuple(scatter), prior, grad_grid
+        np.ascontiguousarray(responses[:, :n_grid]), step, cells, masks, tuple(scatter), prior, grad_grid
     )
-    gradient[:, :, :count] += BOUND_WEIGHT * grad_grid
+    gradient[:, :, :n_grid] += BOUND_WEIGHT * grad_grid
     return BOUND_WEIGHT * bound + REGRESSION_WEIGHT * regression, gradient
-
-
-def averages(masks: Array, levels: int) -> Array:
-    """Return the matrix (`levels`, L) that averages over the sets (L, F) of 0, 1, ... failed fibres, if any."""
-    has_size = (masks == 0).sum(axis=1) == np.arange(levels)[:, None]
-    return has_size / np.maximum(has_size.sum(axis=1, keepdims=True), 1)
 
 
 def relative_error(errors: Array, straight: Array, shares: tuple[float, ...]) -> tuple[float, Array]:
     """Return the power mean of the errors relative to those of straight fibres, and its gradient (C, K) by the errors.
 
-    The worst dominate in it. Errors (C, K) are by contact and number of failed fibres, of which `shares` are the
-    probabilities.
+    Errors (C, K) are by contact and by number of failed fibres; `shares` are the probabilities of these numbers. The
+    largest relative errors dominate the mean.
     """
     weights = np.array(shares[: errors.shape[1]])
     weights /= weights.sum() * len(errors)

@@ -171,12 +171,12 @@ def penalties(
     fibres = FibreSamples(along, across, knot_slope, points, slope, arc, pad, rules, margin, all_bends)
     gradient = Gradient(slope, along)
     values = {name: value for name, penalty in PENALTIES.items() if (value := penalty(fibres, gradient)) is not None}
-    # each arc length is a sum over the steps before it
-    later = gradient.arc[:, :0:-1].cumsum(axis=1)[:, ::-1, None]
+    # the arc length of a sample is the sum of the lengths of all steps before it
+    grad_length = gradient.arc[:, :0:-1].cumsum(axis=1)[:, ::-1, None]
     length = np.hypot(*np.moveaxis(steps, -1, 0))[..., None]
-    pull = np.divide(later * steps, length, out=np.zeros_like(steps), where=length > 0)
-    gradient.points[:, :-1] -= pull
-    gradient.points[:, 1:] += pull
+    grad_step = np.divide(grad_length * steps, length, out=np.zeros_like(steps), where=length > 0)
+    gradient.points[:, :-1] -= grad_step
+    gradient.points[:, 1:] += grad_step
     add_samples_gradient(
         along,
         across,

@@ -21,7 +21,7 @@ from padforge.design.settings import TRACK_WIDTH_MM, Layout, PadSettings, RulesS
 
 TOLERANCE_MM = 1e-3  # maximum deviation of the polylines by which curves are checked, mm
 FOLD_TOLERANCE = 1e-4
-"""The same for folds relative to the gap, if that is more: all pairs of points within a gap are compared."""
+"""The same for folds, as a share of the gap, if that is more: the check compares all pairs of points within a gap."""
 CACHE_SIZE = 256  # number of fibres whose bends and folds are cached: an editor changes one fibre at a time
 
 
@@ -64,9 +64,9 @@ def check_rules(pad: Morphology, rules: RulesSettings, size: PadSettings | None 
     - `max_crossings`: the number of points at which horizontals meet verticals, in the whole pad.
     - `min_crossing_angle_deg`: the angle, 0 to 90, between the tangents at which a horizontal meets a vertical; 0 if
       they share a stretch, and nearly 0 if they touch.
-    - `max_common_track_mm`: the length of a stretch of a horizontal of which all points are nearer than the width w of
-      a track, `TRACK_WIDTH_MM`, to one vertical, or of a vertical to one horizontal, whether they cross there or not;
-      2 w / sin(a) if they are straight and cross at the angle a.
+    - `max_common_track_mm`: the length of a stretch of a fibre all of which is nearer than the width w of a track,
+      `TRACK_WIDTH_MM`, to one fibre of the other family, whether or not they cross there; 2 w / sin(a) for straight
+      fibres that cross at the angle a.
     - `border_mm`: the distance of every fibre to the two sides of the pad along which it runs.
     - `keep_out_mm`: the distance of every fibre to the polygons `keep_out_mm` of `[pad]`; 0 in them.
     - `max_length_mm`: the arc length of a fibre.

@@ -2,8 +2,8 @@
 
 To add a term, write a function of a `ScoredPad` and add a row to TERMS; it then appears in `score`, in design.json and
 in the report (published terms only in `score` and in designs for a shape). For a search to minimise it as well, follow
-`sharpness`: a weight in `SearchSettings`, 0 by default, a term of `SearchProblem.objective`, and its gradient, of
-`sharpness_loss`, in `GradientSearch`.
+`sharpness`: a weight in `SearchSettings`, 0 by default, a term of `SearchProblem.comparison`, and value and gradient,
+as of `sharpness_loss`, in `GradientSearch`.
 
 To add a rule, see `padforge.design.objectives.rules`.
 """

@@ -18,9 +18,6 @@ from padforge.design.optimize.problem import SearchProblem
 from padforge.design.paths.curves import refine
 from padforge.design.published.objective import published_presses, published_terms
 
-LEVEL_STD = 1.0  # standard deviation of initial knots about the level of their fibre, grid units
-ORIGIN_STD = 0.3  # standard deviation of initial knots about those of an origin, grid units
-
 
 class GeneticSearch:
     """Minimise the published objective by generations of `search.population` pads.
@@ -124,7 +121,7 @@ class _FirstGeneration(FloatRandomSampling):
 
     Among uniformly random knots, fibres of a family are so often in the wrong order that most generations would be
     spent on sorting them (the C of formula (5)). Knots of the other half are scattered about those of the origin
-    (F, N, 2) or, without an origin, about the straight fibres.
+    (F, N, 2) by 0.3 grid units or, without an origin, about the straight fibres by 1.
     """
 
     def __init__(self, origin: Array | None) -> None:
@@ -140,9 +137,9 @@ class _FirstGeneration(FloatRandomSampling):
             level = problem.layout.levels[:, None]
             for family, rows in enumerate(problem.layout.families):
                 across = near[:, rows, :, 1 - family]
-                across[:] = random_state.normal(level[rows], LEVEL_STD, across.shape)
+                across[:] = random_state.normal(level[rows], 1.0, across.shape)
         else:
-            near[:] = random_state.normal(self.origin, ORIGIN_STD, near.shape)
+            near[:] = random_state.normal(self.origin, 0.3, near.shape)
             near[0] = self.origin
         return x
 

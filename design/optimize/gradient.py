@@ -12,7 +12,7 @@ import numpy as np
 
 from padforge.common.parallel import State
 from padforge.design.morphology import MARGIN, Array, Morphology, assemble_knots, split_axes
-from padforge.design.objectives import criterion as objective
+from padforge.design.objectives import criterion as criteria
 from padforge.design.objectives.fibre_loss import failure_shares, sample_failures
 from padforge.design.objectives.penalties import penalties
 from padforge.design.objectives.score import sharpness_loss
@@ -60,7 +60,7 @@ KNOTS_PER_TURN = 3
 
 
 class Parametrization:
-    """Unconstrained variables of a pad's fibres, from which its knots follow ascending, separate and off the border.
+    """Unconstrained variables of a pad's fibres: knots that follow from them always ascend and stay off the border.
 
     Coordinates along a fibre are cumulative sums of spans, each a floor plus a softmax share of the remaining length.
     Coordinates across it are sigmoids between the borders.
@@ -203,7 +203,7 @@ def _zigzag(layout: Layout, rules: RulesSettings, knots: int, rng: np.random.Gen
     """Draw random zigzags, in parallel within each family, so that fibres of a family do not cross.
 
     PCHIP has slope 0 at a turn. A turn of one knot bends the sharper the steeper its flanks are; one with a knot on
-    either shoulder keeps its radius however steep they are.
+    either shoulder, a little lower than its peak, keeps its radius however steep they are.
     """
     radius = rules.min_mean_bend_radius_mm / layout.unit_mm if rules.enforce else 0.0
     per_turn = KNOTS_PER_TURN if radius > 0 and knots >= 2 * KNOTS_PER_TURN else 1
@@ -211,20 +211,21 @@ def _zigzag(layout: Layout, rules: RulesSettings, knots: int, rng: np.random.Gen
     turns = max(1, min(knots // per_turn, int(extent / (4 * radius)) if radius > 0 else knots))
     fibres = []
     for axis, rows in enumerate(layout.families):
-        width, pitch, level = layout.extent[1 - axis], layout.extent[axis] / (turns + 1), layout.levels[rows, None]
-        shoulder = float(np.clip(0.8 * radius, 0.1 * pitch, 0.25 * pitch))
-        position = pitch * (np.arange(1, turns + 1) + 0.12 * rng.standard_normal(turns))
-        side = np.where(np.arange(turns) % 2 == 0, 1, -1) * rng.choice([-1, 1])
-        swing = 0.6 * side * rng.uniform(0.5, 1.2, turns)
+        width, spacing, level = layout.extent[1 - axis], layout.extent[axis] / (turns + 1), layout.levels[rows, None]
+        shoulder = float(np.clip(0.8 * radius, 0.1 * spacing, 0.25 * spacing))  # distance from the turn along the fibre
+        # what the fibres of a family have in common: where they turn, to which side, and how far
+        position = spacing * (np.arange(1, turns + 1) + 0.12 * rng.standard_normal(turns))
+        sign = np.where(np.arange(turns) % 2 == 0, 1, -1) * rng.choice([-1, 1])
+        swing = 0.6 * sign * rng.uniform(0.5, 1.2, turns)
         aspect = min(1.0, layout.extent[axis] / width)  # fibres shorter than the pad is wide have less room to turn
         centre = width / 2 + (1 - 0.3 * aspect) * (level - width / 2)
-        peak = np.sort(centre + aspect * swing + 0.1 * rng.standard_normal((len(level), turns)), axis=0)
-        turn = np.sort(position + 0.02 * rng.standard_normal((len(level), turns)), axis=1)
-        path = np.concatenate([level, peak, level], axis=1)
-        drop = np.clip(0.12 * np.stack([peak - path[:, :-2], peak - path[:, 2:]]), -0.1, 0.1)
-        turn_knots = [(turn, peak)]
+        across = np.sort(centre + aspect * swing + 0.1 * rng.standard_normal((len(level), turns)), axis=0)
+        along = np.sort(position + 0.02 * rng.standard_normal((len(level), turns)), axis=1)
+        path = np.concatenate([level, across, level], axis=1)
+        drop = np.clip(0.12 * np.stack([across - path[:, :-2], across - path[:, 2:]]), -0.1, 0.1)
+        turn_knots = [(along, across)]
         if per_turn == KNOTS_PER_TURN:
-            turn_knots = [(turn - shoulder, peak - drop[0]), *turn_knots, (turn + shoulder, peak - drop[1])]
+            turn_knots = [(along - shoulder, across - drop[0]), *turn_knots, (along + shoulder, across - drop[1])]
         points = np.array(turn_knots).transpose(2, 3, 0, 1)  # (F, turns, knots of a turn, 2), along and across
         points = points.reshape(len(level), turns * len(turn_knots), 2)
         fibres.append(points if axis == 0 else points[..., ::-1])
@@ -253,7 +254,7 @@ class GradientSearch:
             return
         pad, rules = problem.pad, problem.rules
         self.scales = [  # full scale of straight fibres under each contact
-            objective.straight_full_scale(pad.layout, contact, pad.sensed_mm) for contact in problem.contacts
+            criteria.straight_full_scale(pad.layout, contact, pad.sensed_mm) for contact in problem.contacts
         ]
         paths = initial_paths(pad, rules, problem.search.knots, problem.origin, start, self.rng)
         self.fibres = Parametrization.from_knots(paths, pad.layout, border_width(pad, rules))
@@ -391,25 +392,24 @@ class GradientSearch:
         straight_errors = self.problem.straight_errors
         # 1. a random window, all of the pad unless it is large, outside keep-outs; random failures
         while True:
-            window = objective.place_window(pad.sensed, self.rng.random(2))
-            presses = objective.window_presses(pad, window, objective.SEARCH_SIDE, self.rng)
+            window = criteria.place_window(pad.sensed, self.rng.random(2))
+            presses = criteria.window_presses(pad, window, criteria.SEARCH_SIDE, self.rng)
             if presses.free.any():
                 break
         masks = sample_failures(pad.layout.fibres, shares, self.rng)
+        n_failed = (masks == 0).sum(axis=1)  # one set of each number
         # 2. a random contact
-        relative_error, grad_means = objective.relative_error(self._mean_errors, straight_errors, shares)
+        relative_error, grad_means = criteria.relative_error(self._mean_errors, straight_errors, shares)
         probabilities = (grad_means * self._mean_errors).sum(axis=1) / relative_error
         drawn = int(self.rng.choice(len(probabilities), p=probabilities))
         contact, scale = self.problem.contacts[drawn], self.scales[drawn]
-        scatter = objective.scatter_of_full_scale(search.response_scatter.scaled(noise_factor), contact, scale)
-        # 3. the errors under it, by set of failed fibres, and their running means, by number of failed fibres
+        scatter = criteria.scatter_of_full_scale(search.response_scatter.scaled(noise_factor), contact, scale)
+        # 3. the errors under it, by number of failed fibres, and their running means
         errors, differentiate = self._errors(curves, presses, masks, contact, scale, scatter)
-        means_of_sets = objective.averages(masks, straight_errors.shape[1])
-        self._mean_errors[drawn] += MEAN_ERROR_RATE * (means_of_sets @ errors - self._mean_errors[drawn])
-        # 4. the relative error with these means, and its gradient: by the means, by the errors, by the curves
-        total, grad_means = objective.relative_error(self._mean_errors, straight_errors, shares)
-        grad_errors = grad_means[drawn] @ means_of_sets
-        gradient = differentiate(grad_errors) / probabilities[drawn]
+        self._mean_errors[drawn, n_failed] += MEAN_ERROR_RATE * (errors - self._mean_errors[drawn, n_failed])
+        # 4. the relative error with these means, and its gradient by the errors, then by the curves
+        total, grad_means = criteria.relative_error(self._mean_errors, straight_errors, shares)
+        gradient = differentiate(grad_means[drawn, n_failed]) / probabilities[drawn]
         # 5. the sharpness
         if (weight := search.sharpness) > 0:
             loss, grad_curves = sharpness_loss(curves, self.problem.contacts[0], pad)
@@ -419,27 +419,27 @@ class GradientSearch:
     def _errors(
         self,
         curves: FibreCurves,
-        presses: objective.PressWindow,
+        presses: criteria.PressWindow,
         masks: Array,
         contact: Contact,
         scale: float,
         scatter: Scatter,
     ) -> tuple[Array, Differentiate]:
-        """Return the criterion (L,) under a contact, and the function from a gradient by them to (3, F, n).
+        """Return the criterion (L,) under a contact, and its derivative: from gradients (L,) by it to (3, F, n).
 
         The response of a fibre is its relative stretch in full scales, signal / (scale * length).
         """
         length, grad_length = curves.lengths()
-        weights = objective.kernel_weights(self.problem.pad.layout)
+        weights = criteria.kernel_weights(self.problem.pad.layout)
         per_signal, positions = 1 / (scale * length[:, None]), presses.positions
         if len(presses.far):
             near, far = (
                 weights[:, None] * per_signal * curves.signals(x, contact)[0] for x in (presses.positions, presses.far)
             )
-            positions = presses.with_partners(objective.confusable(near, far, masks))
+            positions = presses.with_partners(criteria.confusable(near, far, masks))
         signals, differentiate_signals = curves.signals(positions, contact)
         responses = per_signal * signals
-        errors, error_gradients = objective.criterion(
+        errors, error_gradients = criteria.criterion(
             responses, positions, presses.step, presses.free, masks, scatter, weights
         )
 

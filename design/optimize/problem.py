@@ -55,12 +55,12 @@ class SearchProblem:
         """Criterion of straight fibres by contact and number of failed fibres; shape (C, K), grid units."""
         return self._criterion(Morphology.straight(self.pad.layout))
 
-    def objective(self, pad: Morphology) -> float:
-        """Return the value by which finished pads are compared, always on the same presses.
+    def comparison(self, pad: Morphology) -> float:
+        """Return the value by which finished pads are compared, the less the better, always on the same presses.
 
         It is the geometric mean of the errors relative to straight fibres, over all contacts and numbers of failed
-        fibres, plus the weighted sharpness under the main contact. A search descends a power mean, in which the worst
-        dominates. Of finished pads the worst is the case that straight fibres all but win, in which they hardly differ.
+        fibres, plus the weighted sharpness under the main contact. A start of the search descends a power mean instead,
+        which the worst case dominates; in their worst case finished pads hardly differ from straight fibres.
         """
         log_ratios = np.log(self._criterion(pad) / self.straight_errors)
         shares = failure_shares(self.search.max_failures)[: log_ratios.shape[1]]
@@ -91,7 +91,7 @@ def build_problem(
         InputError: settings that do not fit each other or the origin.
     """
     fibres = pad.layout.fibres
-    free_presses(pad)
+    free_presses(pad)  # raises if there are none
     if rules.enforce:
         check_fibre_ends(pad, rules)
         if pad.bent_radius_mm is not None and pad.bent_radius_mm < rules.min_mean_bend_radius_mm:
@@ -109,7 +109,7 @@ def build_problem(
                 f"{settings.knots} knots, allowed are {MAX_VALUES // 4}"
             )
     if not any(failure_shares(settings.max_failures)[:fibres]):
-        raise InputError(f"max_failures is {settings.max_failures}, allowed is what leaves some of the {fibres} fibres")
+        raise InputError(f"max_failures is {settings.max_failures}, allowed are weights of less than {fibres} failed")
     if origin is not None:
         knots = check_type("origin", origin, Morphology).knots.shape[1] - 2
         if origin.layout.counts != pad.layout.counts or origin.layout.spacing != pad.layout.spacing:

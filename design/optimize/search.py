@@ -91,7 +91,7 @@ class SearchResult:
         candidate: name of the candidate: "start 2", "genetic", "straight fibres", or "origin", the pad to start from.
         straight: expected errors and ambiguities of straight fibres on the same pad, by name, for comparison.
         enforced: whether rules were enforced.
-        history: {"run", "step", "objective"}; of "descent" means of 10 steps.
+        history: rows with "run", "step" and "objective"; by "descent", each is a geometric mean of 10 steps.
         seconds: wall time.
         stopped: why the search ended early: "interrupted", "out of time", or "" if it did not.
     """
@@ -153,7 +153,7 @@ def search(
             candidates.append(Candidate("origin", origin, problem))
         if problem.search.method != "genetic":  # the published method has no such candidate
             candidates.append(straight)
-        best = min(candidates, key=lambda c: (len(c.violations), c.objective))
+        best = min(candidates, key=lambda c: (len(c.violations), c.comparison))
         result = best.to_result(straight)
     history = [
         {"run": _name(problem, start), "step": int(step), "objective": value}
@@ -177,9 +177,9 @@ class Candidate:
         return self.problem.violations(self.pad)
 
     @cached_property
-    def objective(self) -> float:
-        """The value by which it is compared with others."""
-        return self.problem.objective(self.pad)
+    def comparison(self) -> float:
+        """The value by which the pad is compared with others."""
+        return self.problem.comparison(self.pad)
 
     @cached_property
     def scored(self) -> ScoredPad:
@@ -349,7 +349,7 @@ def settings_for_twin(spec: Spec, path: Path, pad: Morphology | None = None) -> 
 
 def _scatter_settings(twin: Twin, layout: Layout) -> dict[str, float]:
     """Return the scatter of a held press as keys of `[search]`, relative to the full scale of straight fibres."""
-    channels = [(abs(fibre.gain_v), fibre.noise_v) for fibre in twin.channels if fibre.gain_v]
+    channels = [(abs(channel.gain_v), channel.noise_v) for channel in twin.channels if channel.gain_v]
     if not channels:
         raise InputError("the twin has no channel that responds, so that its noise is unknown")
     gains_v, noises_v = np.array(channels).T
@@ -406,9 +406,10 @@ def search_for_twin(
 
 
 def choose(errors: Mapping[str, Array]) -> str:
-    """Return the pad of least mean log error among those within 3 % of the best reference at each number of failures.
+    """Return the pad of least mean log error among those within 3 % of the better reference at each number of failures.
 
-    If none is, the nearest counts. Errors are with 0, 1, ... fibres failed; references "default", "straight fibres".
+    If there is none, the limit is the least that a pad keeps. Errors are with 0, 1, ... fibres failed, by the name of
+    the pad; the references are "default" and "straight fibres".
     """
     references = [errors[name] for name in ("default", "straight fibres") if name in errors]
     ratios = {name: error / np.min(references or list(errors.values()), axis=0) for name, error in errors.items()}
@@ -419,7 +420,7 @@ def choose(errors: Mapping[str, Array]) -> str:
 
 
 def state_folders(keep_in: Path) -> dict[str, Path]:
-    """Return the folder of states of each search: siblings, since none may lie in another."""
+    """Return the folder of the states of each search; none may lie in another, so they are siblings."""
     return {name: keep_in.with_name(f"{keep_in.name}-{name}".replace(" ", "-")) for name in BUDGET_SHARES}
 
 

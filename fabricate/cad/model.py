@@ -63,7 +63,6 @@ first, *others = map(build123d.import_brep, sys.argv[2:])
 build123d.export_brep(first.fuse(*others), sys.argv[1])
 """
 """Program that writes the union of files to its first argument."""
-_WELL_SIDES = 512  # of the polygons to which arcs of the round wells are fitted
 _MIN_CIRCLE_CORNERS = 32  # of a polygon that stands for a circle
 MAX_DEVIATION = 2e-4  # maximum relative deviation of a ridge's volume from that of its mesh
 MAX_BODY_DEVIATION = 5e-4  # the same for other parts, such as a lid, whose round holes are polygons in the mesh
@@ -145,7 +144,7 @@ def _ridge_part(plan: Plan, fibre: int, printed: str) -> CadPart:
     """
     name, colour = plan.pad.layout.fibre_name(fibre), FAMILY_COLOURS[plan.family(fibre)]
     top = plan.outline([fibre], 0.0, FINE_MM)
-    top = top | mould.fibre_wells(plan, fibre, _WELL_SIDES) if printed == "conductive" else top
+    top = top | mould.fibre_wells(plan, fibre, sides=512) if printed == "conductive" else top
     prisms = mould.ridge_prisms(plan, [fibre], top, FINE_MM)
     volume_mm3 = build_mesh(Body(tuple(prisms))).volume()
     for fit_mm in FIT_TOLERANCES_MM:

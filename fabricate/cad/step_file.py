@@ -30,8 +30,6 @@ from OCP.XCAFApp import XCAFApp_Application
 from OCP.XCAFDoc import XCAFDoc_DocumentTool, XCAFDoc_ShapeTool
 from OCP.XSControl import XSControl_WorkSession
 
-_TIMESTAMP = "2000-01-01T00:00:00"  # a STEP file must have one; a constant makes its bytes reproducible
-
 
 def write_step(path: Path, shape: Compound | Solid) -> None:
     """Write a solid, or an assembly whose leaves are solids, with the names and colours of its parts."""
@@ -53,7 +51,7 @@ def write_step(path: Path, shape: Compound | Solid) -> None:
     writer.CleanDuplicateEntities()
     header = APIHeaderSection_MakeHeader(0)
     header.SetName(TCollection_HAsciiString(shape.label))
-    header.SetTimeStamp(TCollection_HAsciiString(_TIMESTAMP))
+    header.SetTimeStamp(TCollection_HAsciiString("2000-01-01T00:00:00"))  # a constant, for reproducible bytes
     header.SetOriginatingSystem(TCollection_HAsciiString("padforge"))
     header.Apply(writer.Model())
     if step.Write(str(path)) != IFSelect_ReturnStatus.IFSelect_RetDone:

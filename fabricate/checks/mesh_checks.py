@@ -65,8 +65,8 @@ def check_triangles(
 ) -> list[Finding]:
     """Run all checks of `check_mesh` on vertices (n, 3), mm, and triangles (m, 3), counter-clockwise from outside.
 
-    A mesh that `has_plan` was built from a plan, which is checked for widths faster and exactly, and by manifold3d,
-    which builds no surface that intersects itself.
+    A mesh that `has_plan` was built from it by manifold3d: it is tight and does not intersect itself, and `check_plan`
+    checks the widths of ridges and of silicone faster and exactly.
     """
     check_type("printer", printer, PrinterSettings)
     min_silicone_mm = check_float("min_silicone_mm", min_silicone_mm, 0, 10)

@@ -79,7 +79,7 @@ def check_plan(plan: Plan) -> list[Finding]:
         _check_folds(mould),
         _check_numbers(mould),
     ]
-    findings += _check_believed_layer(plan)
+    findings += _check_assumed_layer(plan)
     if plan.settings.pad.keep_out_mm:
         findings += _check_keep_outs(plan)
     return findings + _check_fibre_strain(plan)
@@ -87,16 +87,14 @@ def check_plan(plan: Plan) -> list[Finding]:
 
 _SLENDER = 5.0  # ratio of height to width above which ridges may break
 _MAX_SLENDERNESS = 10.0  # ratio above which they cannot be printed
-_BEND_TURN = 2.5e-3  # turn between the points of a bend, rad
 _BEND_TOLERANCE = 1e-3  # relative, of bend radii, since leads bend as tightly as allowed
-_MAX_NAMES = 8  # more fibres are counted instead of named
 _PILLAR_LINES = 2  # minimum width of a stable pillar, in printed lines
 _STRAIN_SHARE = 0.5  # fraction of a fibre's maximum strain that bending may use; presses need the remainder
 
 
 def _list_fibres(noun: str, numbers: Sequence[int]) -> str:
     plural = noun if len(numbers) == 1 else f"{noun}s"
-    return f"{plural} {', '.join(map(str, numbers))}" if len(numbers) <= _MAX_NAMES else f"{len(numbers)} {plural}"
+    return f"{plural} {', '.join(map(str, numbers))}" if len(numbers) <= 8 else f"{len(numbers)} {plural}"
 
 
 def _points_in(polygons: Iterable[Any]) -> list[Position]:
@@ -205,15 +203,13 @@ def _check_silicone_wall(plan: Plan) -> Finding:
     ]
     patches = [find_thin_patches(silicone, limit, plan.cavity) for silicone in silicones]
     positions = _points_in(chain(*patches))
-    low, high, regions = limit, pitch, [plan.cavity] * len(silicones)
+    low, high, searched = limit, pitch, [(silicone, plan.cavity) for silicone in silicones]  # areas, and where in them
     if positions:  # the minimum width is in one of the patches: search their surroundings only
-        low, high, regions = 0.0, limit, [shapely.union_all(thin) for thin in patches if len(thin)]
-        silicones = [silicone for silicone, thin in zip(silicones, patches, strict=True) if len(thin)]
-        silicones = [overlap(area, region.buffer(2 * limit)) for area, region in zip(silicones, regions, strict=True)]
+        thin = [(area, shapely.union_all(parts)) for area, parts in zip(silicones, patches, strict=True) if len(parts)]
+        low, high, searched = 0.0, limit, [(overlap(area, patch.buffer(2 * limit)), patch) for area, patch in thin]
     while high - low > max(0.01, 0.02 * low):
         middle = (low + high) / 2
-        pairs = zip(silicones, regions, strict=True)
-        is_thin = any(len(find_thin_patches(silicone, middle, region)) for silicone, region in pairs)
+        is_thin = any(len(find_thin_patches(area, middle, within)) for area, within in searched)
         low, high = (low, middle) if is_thin else (middle, high)
     message = f"the thinnest silicone between tracks of one depth is {high:.2f} mm"
     return check_result("silicone_wall", grade(low, limit) if positions else "pass", high, limit, message, positions)
@@ -250,7 +246,7 @@ def _check_cover(plan: Plan) -> Finding:
     return Finding("cover", status, cover, COVER_MM, message)
 
 
-def _check_believed_layer(plan: Plan) -> Iterator[Finding]:
+def _check_assumed_layer(plan: Plan) -> Iterator[Finding]:
     """Check the thickness of the pad and the depths of its fibres against those assumed by its design.
 
     The pressed face may be either one, but the same for all fibres.
@@ -261,19 +257,19 @@ def _check_believed_layer(plan: Plan) -> Iterator[Finding]:
     thickness, assumed = plan.thickness_mm, contact.thickness_mm
     tolerance = CAST_SHARE * assumed
     fits = abs(thickness - assumed) <= tolerance
-    message = f"silicone is {thickness:.4g} mm thick, the design believes {assumed:.4g}"
+    message = f"silicone is {thickness:.4g} mm thick, the design assumes {assumed:.4g}"
     yield Finding("silicone_thickness", "pass" if fits else "warn", thickness, assumed, message)
 
     radius = plan.settings.fibre.material.diameter_mm / 2
-    depths = np.array([plan.depths_mm[layer] - radius for layer in plan.layer_indices])
+    from_tracks = np.array([plan.depths_mm[layer] - radius for layer in plan.layer_indices])
     expected = np.repeat(contact.fibre_depths_mm, plan.pad.layout.counts)
-    depths = min(depths, thickness - depths, key=lambda face: float(np.abs(face - expected).max()))
+    depths = min(from_tracks, thickness - from_tracks, key=lambda depths: float(np.abs(depths - expected).max()))
     errors = np.abs(depths - expected)
     families = [rows for rows in plan.pad.layout.families if len(errors[rows])]
     worst = [rows.start + int(errors[rows].argmax()) for rows in families]
     measured, limits = depths[worst].tolist(), expected[worst].tolist()
     parts = [
-        f"{FAMILIES[plan.family(fibre)]} fibres lie {depth:.3g} mm deep, the design believes {limit:.3g}"
+        f"{FAMILIES[plan.family(fibre)]} fibres lie {depth:.3g} mm deep, the design assumes {limit:.3g}"
         for fibre, depth, limit in zip(worst, measured, limits, strict=True)
     ]
     fits = errors.max() <= tolerance
@@ -286,7 +282,7 @@ def _check_fibre_bend(plan: Plan) -> Finding:
     A corner between a fibre and its lead counts as a bend; up to half a radian passes.
     """
     limit = plan.settings.min_bend_radius_mm
-    bends = [bend_radius(*path, limit / 2) for path in plan.trace(_BEND_TURN, limit / 2)] if limit else []
+    bends = [bend_radius(*path, limit / 2) for path in plan.trace(step=2.5e-3, past_mm=limit / 2)] if limit else []
     tight = [(fibre, *bend) for fibre, bend in enumerate(bends, 1) if bend[0] < limit * (1 - _BEND_TOLERANCE)]
     radius = min((radius for _, radius, _ in tight), default=limit)
     names = _list_fibres("fibre", [fibre for fibre, _, _ in tight])
@@ -307,7 +303,7 @@ def _check_folds(plan: Plan) -> Finding:
     for fibre, (spans, slopes, line) in enumerate(curves):
         half = mould.ridge_width_mm / 2 + plan.heights_mm[plan.layer_indices[fibre]] * plan.settings.ridge_slope
         points, headings = trace_curve(spans, slopes, 0.05)  # maximum turn between points, rad
-        axes = slice(None, None, -1 if plan.family(fibre) else 1)  # along and across the fibre's axis
+        axes = slice(None, None, -1 if plan.family(fibre) else 1)  # order of coordinates: along the fibre, then across
         positions, walls = _find_tight_bends(pad.to_mm(points)[:, axes], headings, half)
         cuts = half - shapely.distance(shapely.LineString(pad.to_mm(line)), shapely.points(walls[:, axes]))
         folds += list(positions[cuts > mould.tolerance_mm][:, axes])
@@ -359,8 +355,9 @@ def _check_keep_outs(plan: Plan) -> Iterator[Finding]:
     thin, weak = (find_thin_patches(mould.pillars, lines * line, region) for lines in (1, _PILLAR_LINES))
     status: Status = "fail" if len(thin) else "warn" if len(weak) else "pass"
     positions = _points_in(thin if len(thin) else weak)
-    subject, limit = ("pillars are" if positions else "no pillar is"), (line if len(thin) else _PILLAR_LINES * line)
-    message = f"{subject} thinner than {limit:g} mm, the least that prints"
+    subject = "pillars are" if positions else "no pillar is"
+    limit, capability = (line, "prints") if len(thin) else (_PILLAR_LINES * line, "is stable")
+    message = f"{subject} thinner than {limit:g} mm, the least that {capability}"
     yield check_result("pillars", status, len(positions), 0, message, positions)
 
     pieces = sorted(shapely.get_parts(plan.silicone), key=lambda piece: piece.area)
@@ -376,7 +373,7 @@ def compute_bending_strains(plan: Plan) -> list[tuple[float, float, Position]]:
     thickness t with an inner radius R has the radius R + t / 2. At a distance z outside of it, lengths along x grow by
     the factor 1 + z / (R + t / 2), and lengths along y are constant. To first order, the strain of an element at an
     angle a to x is cos(a)^2 z / (R + t / 2). The axis of a fibre is half a diameter above the bottom of its track.
-    Returned for each layer, shallowest first, are depth, strain, negative if compressive, and its place.
+    For each layer, the shallowest first, depth, strain (negative if compressive) and its position are returned.
     """
     radius = plan.settings.pad.bent_radius_mm
     if radius is None:

@@ -27,8 +27,8 @@ _NEEDLE_MM = 1e-3  # the normal of a triangle of less height is unreliable becau
 class TriangleMesh:
     """Triangle mesh; derived quantities are computed on first use."""
 
-    vertices: Array  # different ones; shape (n, 3), mm
-    triangles: Numbers  # vertex indices, three different ones in each row; shape (m, 3)
+    vertices: Array  # all different; shape (n, 3), mm
+    triangles: Numbers  # indices of three different vertices in each row; shape (m, 3)
 
     @classmethod
     def weld(cls, vertices: ArrayLike, triangles: ArrayLike) -> "TriangleMesh":
@@ -37,7 +37,7 @@ class TriangleMesh:
         Equal vertices are merged, and triangles with two equal corners dropped.
         """
         points = np.asarray(vertices, np.float64) + 0.0  # turns -0 into 0
-        unique, index = np.unique(points[:, ::-1], axis=0, return_inverse=True)
+        unique, index = np.unique(points[:, ::-1], axis=0, return_inverse=True)  # ordered by z first
         corners = index.ravel()[np.asarray(triangles, np.int64)]
         return cls(unique[:, ::-1], corners[(corners != np.roll(corners, 1, axis=1)).all(axis=1)])
 
@@ -72,7 +72,7 @@ class TriangleMesh:
 
     @cached_property
     def signed_volumes(self) -> Array:
-        """Signed volumes (m,), mm³, of the tetrahedra to the centre of the bounds; a closed shell has their sum."""
+        """Signed volumes (m,), mm³, of the tetrahedra to the centre of the bounds; a closed shell's is their sum."""
         return ((self.corners[:, 0] - self.bounds.sum(axis=0) / 2) * self._crosses).sum(axis=1) / 6
 
     @cached_property
@@ -135,9 +135,9 @@ class TriangleMesh:
 
 _FLAT_MM = 1e-3  # rise of a face below which it is horizontal, and difference of heights below which they are equal
 _SLOT_MM = 2.0  # width of a gap in a wall below which the wall counts as closed
-SPECK_MM2 = 0.01  # smaller areas are corners and the width of a line, not walls or faces
+SPECK_MM2 = 0.01  # smaller areas are corners or nearly lines, not walls or faces
 _LINE_MM = 0.01  # narrower strips lie between two approximations of a curve, and are not walls
-_TIP = 2.0  # length, in limits, within which an area that narrows to a point is a corner, such as strips at 29 degrees
+_TIP = 2.0  # maximum length of a corner, which is no wall, in limits: that between strips that cross at 29 degrees
 _PRECISION = 0.02  # relative precision of widths, unless `_LINE_MM` is more
 
 
@@ -171,7 +171,7 @@ class Slab:
 
 
 def build_slabs(mesh: TriangleMesh, layer_mm: float) -> list[Slab]:
-    """Cut a solid at its largest horizontal faces, and halve tall slabs until there are enough; from below.
+    """Cut a solid at its largest horizontal faces, halve tall slabs until there are enough, and return them from below.
 
     Slabs of less than half a printed layer are dropped, if others remain, since they are not printed.
     """
@@ -185,10 +185,10 @@ def build_slabs(mesh: TriangleMesh, layer_mm: float) -> list[Slab]:
     spans = [span for span in pairwise(cuts) if span[1] - span[0] > layer_mm / 2] or [(low, high)]
     while len(spans) < 8:
         tallest = max(range(len(spans)), key=lambda i: spans[i][1] - spans[i][0])
-        low, high = spans[tallest]
-        spans[tallest : tallest + 1] = [(low, (low + high) / 2), ((low + high) / 2, high)]
+        bottom, top = spans[tallest]
+        spans[tallest : tallest + 1] = [(bottom, (bottom + top) / 2), ((bottom + top) / 2, top)]
     base = cut_solid(mesh.solid, sum(spans[0]) / 2)
-    return [Slab(low, high, mesh.solid, base) for low, high in spans]
+    return [Slab(bottom, top, mesh.solid, base) for bottom, top in spans]
 
 
 def cut_solid(solid: Any, z: float) -> BaseGeometry:
@@ -243,7 +243,7 @@ def find_thin_patches(area: BaseGeometry, width: float, within: BaseGeometry) ->
 
 
 def _find_thin_walls(area: BaseGeometry, width: float, tip: float) -> Shapes:
-    """Return the patches narrower than `width`, except tips, which are up to `tip` long with one contact to others."""
+    """Return the patches narrower than `width`, except tips: up to `tip` long, with one contact to the wider area."""
     opened = _open(area, width)
     cores = shapely.get_parts(shapely.buffer(_drop_specks(without(area, opened)), -_LINE_MM, join_style="mitre"))
     patches = _drop_specks(np.asarray(shapely.buffer(cores, _LINE_MM, join_style="mitre")))

@@ -30,8 +30,6 @@ UNFINISHED = ".unfinished-"  # prefix of the names of temporary files and folder
 LOCK = ".lock"  # name of the file that locks a folder
 MAX_BYTES = 2**28  # size limit of a file; only recordings may be larger
 
-_MORPHOLOGY = "padforge-morphology/"  # prefix of the format of pads; none depends on the pad it derives from
-
 
 @contextmanager
 def reraise_as_input_error(path: Path) -> Iterator[None]:
@@ -299,8 +297,8 @@ def find_dependents(path: Path, remade: Collection[str] = ()) -> list[str]:
         digest, origin = None, dict[str, Any]()
         if not source.is_dir():  # of a recording, a folder, documents hold another digest
             digest, origin = sha256(source), _as_dict(_read_dict(source).get("provenance"))
-        for name, document in documents.items():
-            is_pad = str(document.get("format")).startswith(_MORPHOLOGY)
+        for name, document in documents.items():  # a pad does not depend on that which it derives from
+            is_pad = str(document.get("format")).startswith("padforge-morphology/")
             if name not in dependents and not is_pad and _is_made_from(document, source.name, digest, origin):
                 dependents.add(name)
                 sources.append(path.parent / name)

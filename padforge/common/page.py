@@ -26,7 +26,6 @@ def read_resource(package: str, name: str) -> str:
 TEMPLATES = "padforge.common.templates"
 _TYPES = {".png": "image/png", ".svg": "image/svg+xml"}
 _NUMBER = re.compile(r"[-+]?\d[\d.]*(e[-+]?\d+)?( ?%| mm| ml| g)?")  # right-aligned in a table
-_RESULTS = ("pass", "warn", "fail")  # cells with these words are coloured
 
 
 @dataclass(frozen=True)
@@ -97,7 +96,7 @@ def table(
     kinds = [_column_style(column) for column in zip(*cells, strict=True)] or [""] * len(header)
     body = [
         [
-            (text, text if text in _RESULTS else kind, (shades or {}).get((i, j)))
+            (text, text if text in ("pass", "warn", "fail") else kind, (shades or {}).get((i, j)))
             for j, (text, kind) in enumerate(zip(row, kinds, strict=True))
         ]
         for i, row in enumerate(cells)

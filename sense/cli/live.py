@@ -21,7 +21,6 @@ if TYPE_CHECKING:
     from padforge.sense.rig.streams import ReadingStream
 
 PORT = 8321
-RERUN_VIEWER = "rerun+http://127.0.0.1:9876/proxy"  # default address of a viewer
 BAR = 12  # maximum length of a fibre's bar on a terminal, to either side, characters
 
 
@@ -39,7 +38,7 @@ BAR = 12  # maximum length of a fibre's bar on a terminal, to either side, chara
     "--rerun",
     metavar="[TARGET]",
     is_flag=False,
-    flag_value=RERUN_VIEWER,
+    flag_value="rerun+http://127.0.0.1:9876/proxy",
     help="Send to the viewer Rerun: the one here, one by its address rerun+http://..., or into a file .rrd.",
 )
 @click.option(

@@ -74,7 +74,7 @@ def calibrate(
 
     A time budget is that of the training. On top come radii and errors, which may take as long as a training, and what
     --without leaves out: health most of all. A budget in which nothing can be learnt is refused, and a line says when
-    the localizer is not trained out.
+    the localizer is not converged.
     """
     from padforge.common.files import locked_folder
     from padforge.design.morphology import Morphology

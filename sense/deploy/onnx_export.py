@@ -43,7 +43,6 @@ from padforge.sense.recording.frames import frame_rate_hz, framed
 from padforge.sense.recording.recording import Recording
 
 FORMAT = "padforge-onnx/1"
-OPSET = 18  # version of the operators: ONNX 1.13, 2022
 MAX_DIFFERENCE_MM = 1e-4  # maximum difference between the positions of a graph and of its localizer
 N_TRIALS, TRIAL_READINGS = 64, 40  # synthetic presses that test a graph without a recording, and readings a press
 INPUTS = {
@@ -228,7 +227,7 @@ def _build_graph(model: LocalizerModel, digest: str) -> onnx.ModelProto:
             input_names=list(INPUTS),
             output_names=names,
             dynamic_axes=axes,
-            opset_version=OPSET,
+            opset_version=18,  # ONNX 1.13, 2022
             do_constant_folding=False,  # which would double the size
             dynamo=False,  # the other exporter needs onnxscript
         )

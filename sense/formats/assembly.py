@@ -35,7 +35,6 @@ MEASURES = {"depth": "depths_mm", "reached": "reached_mm", "force": "forces_n"}
 MAX_GAP = 3  # readings without a position that are bridged within a press
 MAX_JITTER_MM = 0.5  # change of a position, measured by an arm or camera within a press, from one reading to the next
 MAX_NOISE_SHARE = 0.1  # size of a negative force relative to the largest one: the offset of a load cell
-MAX_UNTIMED_SHARE = 0.05  # fraction of readings that are left out since they have no time
 MAX_LATE_SHARE = 0.01  # fraction of readings that are left out since their times go back
 WRAPS_S = (2**32 / 1e6, 2**32 / 1e3, 2**16 / 1e3, 2**16 / 1e6, 86400.0, 43200.0)
 """Periods of the clocks of boards: counters of us and ms with 32 and 16 bits, and times of day."""
@@ -207,7 +206,7 @@ def _repair_times(
     rows = np.flatnonzero(~np.isnan(times_s))
     if n_untimed := int(is_reading.sum()) - len(rows):
         notes.append(f"{name_rows(np.flatnonzero(is_reading & np.isnan(times_s)))} left out: no time")
-        if n_untimed > max(3, MAX_UNTIMED_SHARE * len(times_s)):
+        if n_untimed > max(3, 0.05 * len(times_s)):
             raise InputError(f"time is missing in {n_untimed} of {int(is_reading.sum())} readings, expected it in each")
     times = times_s[rows]
     steps = np.diff(times)

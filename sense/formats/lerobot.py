@@ -27,7 +27,6 @@ if TYPE_CHECKING:
 VERSION = "v3.0"
 TASK = "Press the pad."
 FILE_MB, CHUNK_FILES = 100, 1000  # size of a data file, and number of files in a folder: the format's defaults
-MAX_RATE_ERROR = 0.05  # maximum relative error of rounding a rate to a whole number, which the format requires
 _FILE = "chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 _QUANTILES = (0.01, 0.1, 0.5, 0.9, 0.99)
 _Column = NDArray[Any]
@@ -73,8 +72,8 @@ def export_lerobot(recording: Recording, path: Path, localization: "Localization
 
 
 def _frame_rate(recording: Recording) -> float:
-    integer = max(round(recording.rate_hz), 1)
-    return integer if abs(integer / recording.rate_hz - 1) <= MAX_RATE_ERROR else recording.rate_hz
+    integer = max(round(recording.rate_hz), 1)  # required by the format
+    return integer if abs(integer / recording.rate_hz - 1) <= 0.05 else recording.rate_hz
 
 
 def _build_columns(

@@ -19,7 +19,6 @@ from padforge.sense.localizer.scaler import ScaledFeatures
 from padforge.sense.recording.frames import framed
 from padforge.sense.recording.recording import Recording
 
-REST_MARGIN = 0.25  # margin about the range of baselines in calibration, as a share of that range
 # Standard deviations of the logarithm of a gain on an unchanged pad
 FIBRE_DRIFT = 0.045  # within minutes, of a fibre of the published pad
 COMMON_DRIFT = 0.03  # within minutes, of its six fibres together
@@ -76,14 +75,16 @@ def _rest_shifts(health: HealthModel, recording: Recording, fibre_mask: Mask) ->
     rests, shifts = rest_levels(recording), []
     for fibre, (low, high) in zip(health.living.tolist(), health.rest_range_v.T.tolist(), strict=True):
         levels = rests[fibre_mask[:, fibre] & np.isfinite(rests[:, fibre]), fibre]
-        margin = REST_MARGIN * (high - low)
+        margin = 0.25 * (high - low)
         usual = low - margin, high + margin
         if len(levels) and not usual[0] <= (median := float(np.median(levels))) <= usual[1]:
             shifts.append(DomainShift("rest", (fibre,), median, usual))
     return shifts
 
 
-def _gain_shifts(localizer: LocalizerModel, training: int, recording: Recording, fibre_mask: Mask) -> list[DomainShift]:
+def _gain_shifts(
+    localizer: LocalizerModel, n_training: int, recording: Recording, fibre_mask: Mask
+) -> list[DomainShift]:
     """Compare responses with those expected at the predicted positions: of all fibres together, or else of each.
 
     Each fibre is compared at positions that the others predict, so that its own fault does not bias them.
@@ -93,7 +94,7 @@ def _gain_shifts(localizer: LocalizerModel, training: int, recording: Recording,
     presses = replace(presses[rows], fibre_mask=presses.fibre_mask[rows] & fibre_mask[rows])
     fibres = tuple(range(localizer.fibres))
     energy, expected = _compare(localizer, presses)
-    training_std = TRAINING_STD / sqrt(training)
+    training_std = TRAINING_STD / sqrt(n_training)
     common = _gain_shift(fibres, energy.sum(axis=1), expected.sum(axis=1), hypot(COMMON_DRIFT, training_std))
     if common or len(fibres) == 1:
         return [common] if common else []

@@ -36,7 +36,6 @@ MAX_MISSING = 20  # successive presses with too few readings, see `MIN_PRESENT`,
 WINDOW = 64  # recent presses that are evaluated again to identify a faulty fibre
 MAX_SUSPECTS = 4  # maximum number of fibres that are compared to identify it
 MAX_SCORE = 99.0  # score of a certain fault
-FLOATING = 30.0  # noise, as a multiple of the median, that only an open input picks up
 
 TEXTS = {
     "stuck": "reads one value",
@@ -162,13 +161,15 @@ class FaultMonitor:
         return faults
 
     def _report(self, fault: FibreFault) -> list[FibreFault]:
-        """Return a fault, with a misfit when it makes one; nothing for a response once the model does not fit."""
+        """Return what to report of a fault: also a misfit that it makes, or nothing of a response after a misfit."""
         if fault.kind not in RESPONSE_FAULTS:
             return [fault]
         was_misfit = self._is_misfit
         self._response_faults.append(fault)
-        if was_misfit or not self._is_misfit:
-            return [] if was_misfit else [fault]
+        if was_misfit:
+            return []
+        if not self._is_misfit:
+            return [fault]
         since, score = (min(getattr(each, name) for each in self._response_faults) for name in ("since", "score"))
         return [fault, FibreFault(self.n_presses, since, tuple(sorted(self._suspected)), "misfit", score)]
 
@@ -181,7 +182,7 @@ class FaultMonitor:
         return [FibreFault(self.n_presses, since, (fibre,), "missing", MAX_SCORE) for fibre in fibres]
 
     def _neg_log_p(self, failed: Mask) -> Array:
-        """(L, H) of the present sums; minus infinity for failed fibres."""
+        """Return `ExceedanceModel.neg_log_p` (L, H) of the present sums; minus infinity for failed fibres."""
         neg_log_p = self.model.exceedance.neg_log_p(self._height, int(failed.sum()))
         return np.where(failed[:, None], -np.inf, neg_log_p)
 
@@ -191,7 +192,7 @@ class FaultMonitor:
         self._height = cusum_update(self._height, llr_continuing, llr_onset)
 
     def _predict(self, records: Sequence[_PressRecord], failed: Mask) -> tuple[Array, Array, Array, Array]:
-        """Traces, targets, and means and deviations predicted without the failed fibres; shape (Q, L, ...) each."""
+        """Return traces, targets, and means and deviations predicted without failed fibres; shape (Q, L, ...) each."""
         traces, inputs, targets, _, is_warm = (np.stack(part) for part in zip(*records, strict=True))
         mean, std = predict_fibres(self.model.weights, inputs, ~failed & np.isfinite(traces).all(axis=2))
         # A rest has no level to be compared with before some presses have defined one.
@@ -216,7 +217,7 @@ class FaultMonitor:
         A faulty fibre disturbs the predictions for the others. So every suspect is tested again by the fibres that are
         not suspected; the faulty one still stands out.
         """
-        # 1. The fibres with the largest sums are suspects above half the threshold; replays begin at their first onset.
+        # 1. Of the largest sums, those above half the threshold are suspect; replays begin at their first onset.
         neg_log_p, onset = self._neg_log_p(self._failed), self._onset
         largest, threshold = neg_log_p.max(axis=1), self.model.threshold
         ranked = np.argsort(-largest, kind="stable")[: min(MAX_SUSPECTS, int((~self._failed).sum()))]
@@ -251,7 +252,7 @@ class FaultMonitor:
         return FibreFault(self.n_presses, since, tuple(self.model.living[list(fibres)].tolist()), kind, score)
 
     def _inverted(self, first: int) -> Iterator[_WiringFault]:
-        """Yield the likelihood of each fibre being inverted: it disturbs predictions for the others, not its own."""
+        """Yield the evidence that each fibre is inverted: that disturbs predictions for the others, not its own."""
         _, targets, mean, std = self._predict(self._records_since(first), self._failed)
         log_likelihood = self.model.likelihoods.log_likelihood_healthy
         difference = log_likelihood(-targets, mean, std) - log_likelihood(targets, mean, std)
@@ -260,7 +261,7 @@ class FaultMonitor:
             yield _WiringFault("inverted", (fibre,), float(llrs[fibre]))
 
     def _swapped(self, pairs: Sequence[tuple[int, int]], first: int) -> Iterator[_WiringFault]:
-        """Yield the likelihood of each pair being swapped."""
+        """Yield the evidence that each pair is swapped."""
         records = self._records_since(first)
         pca, likelihoods = self.model.pca, self.model.likelihoods
         for pair in pairs:
@@ -288,17 +289,17 @@ class FaultMonitor:
         rests = np.array([record.trace[fibre, :REST].mean() for record in records])
         last = self._recent[-1].trace[fibre]
         low, high = self.model.rest_range_v[:, fibre]
-        is_outside = not 2 * low - high <= last[:REST].mean() <= 2 * high - low
+        is_outside = not 2 * low - high <= last[:REST].mean() <= 2 * high - low  # by more than the width of the range
         if np.ptp(last) == 0:
             return "open" if is_outside else "stuck"
-        if is_outside and estimate_noise(last) > FLOATING * self.model.likelihoods.noise_v[fibre]:
-            return "open"
+        if is_outside and estimate_noise(last) > 30 * self.model.likelihoods.noise_v[fibre]:
+            return "open"  # no other input picks up so much noise
         name = HYPOTHESES[hypothesis]
         if not name.startswith("offset"):
             return name
         offsets = rests - records[0].level[fibre]
         ramp = np.arange(1.0, len(offsets) + 1)
-        ramp *= (ramp @ offsets) / (ramp @ ramp)
+        ramp *= (ramp @ offsets) / (ramp @ ramp)  # least squares
         return "drifting" if ((offsets - ramp) ** 2).sum() < ((offsets - offsets.mean()) ** 2).sum() else "offset"
 
 
@@ -346,13 +347,13 @@ class FaultDetector:
         presses = {COMMANDED: commanded, DETECTED: align_to_detected(readings, times_s, *commanded)}
         options = {"false_alarm_rate": self.false_alarm_rate, "provenance": dict(provenance or {})}
 
-        def fit(name: str) -> HealthModel:
+        def fit_model(name: str) -> HealthModel:
             down_command, up_command = (command[mask] for command in presses[name])
             rng = np.random.default_rng(self.seed)
             return fit_health_model(readings, recording.rate_hz, down_command, up_command, rng=rng, **options)
 
         with one_thread():
-            models = dict(run_tasks((name, partial(fit, name)) for name in presses))
+            models = dict(run_tasks((name, partial(fit_model, name)) for name in presses))
         self.model_, self.live_model_ = models[COMMANDED], models[DETECTED]
         return self
 

@@ -25,18 +25,13 @@ MAX_LLR = 6.0  # largest contribution of one press, so that an accident in a sin
 MAX_STEP_LLR = 12.0  # the same of a step within a trace; below the threshold until the rest has shifted as well
 STEPS = np.arange(3, TRACE - 2)  # readings of a trace where a step is tested; nearer to an end it may be a spike
 LIBRARY = 64  # other presses that an inconsistent response is compared with
-# Calibrations of predicted deviations that are tried.
-STD_SCALES = np.geomspace(0.5, 2.0, 9)
-STD_FLOORS = np.array([0.0, 0.02, 0.05, 0.1, 0.2, 0.4, 0.8])
-MIN_INNOVATION = 1e-3  # least standard deviation of the innovation of a rest, since it is divided by
 MAX_HEIGHT = 1e5  # a height that no sum reaches
 MIN_PEAKS = 30  # minimum number of highest peaks that a tail is fitted to
-MAX_PEAKS = 300  # the same at most; between both, the highest tenth of all peaks
+MAX_PEAKS = 300  # maximum of the same; between the two, it is the highest tenth of all peaks
 MEDIAN_T, FAR_T = 0.7267, 6.869  # median and 0.999 quantile of |Student's t| with `T_DEGREES` degrees of freedom
 MEDIAN_NORMAL = 0.6745  # median of |standard normal|
 QUIET = 10  # last readings of the hold and of the release that show the noise alone
 MIN_RELATIVE_NOISE = 1e-3  # noise of a fibre that reads without any, relative to its response
-MIN_LOG_NOISE_STD = 0.1  # minimum deviation of the logarithm of a fibre's noise
 LOG_STEP_DENSITY = -4.0  # logarithm of the density of a step of any size, up to some hundred deviations
 _CHUNK = 64  # presses that are compared with the library at once
 
@@ -84,11 +79,11 @@ class FaultLikelihoods:
             library_std=calibrated[library, :, :COMPONENTS],
             noise_v=noise_v,
             log_noise_mean=log_noise_mean,
-            log_noise_std=np.maximum(log_noise_std, MIN_LOG_NOISE_STD),
+            log_noise_std=np.maximum(log_noise_std, 0.1),
             constant_share=((np.ptp(traces, axis=-1) == 0).sum(axis=0) + 1) / (len(traces) + 2),
             step_filters=fit_step_filters(traces, noise_v),
             rest_autocorr=autocorr,
-            innovation_std=np.maximum(innovation_std, MIN_INNOVATION),
+            innovation_std=np.maximum(innovation_std, 1e-3),  # it is divided by
         )
 
     def log_likelihood_healthy(self, targets: Array, mean: Array, std: Array) -> Array:
@@ -156,7 +151,8 @@ def _calibrate_std(residual: Array, std: Array) -> tuple[Array, Array]:
 
     A network trained on few presses is overconfident where it should be least certain; the floor corrects that.
     """
-    choices = [(scale, floor) for scale in STD_SCALES for floor in STD_FLOORS]
+    floors = (0.0, 0.02, 0.05, 0.1, 0.2, 0.4, 0.8)
+    choices = [(scale, floor) for scale in np.geomspace(0.5, 2.0, 9) for floor in floors]
     fits = np.stack([_log_t(residual, 0.0, np.hypot(scale * std, floor)).sum(axis=0) for scale, floor in choices])
     best = np.array(choices)[fits.argmax(axis=0)]
     return best[..., 0], best[..., 1]
@@ -168,7 +164,7 @@ def _previous(values: Array) -> Array:
 
 
 def estimate_noise(traces: Array) -> Array:
-    """Estimate the noise (...), V, of traces (..., TRACE): mean step in quiet parts, but for the largest quarter."""
+    """Estimate the noise (...), V, of traces (..., TRACE): mean step in quiet parts, without the largest quarter."""
     quiet = (slice(0, REST), slice(REST + HELD - QUIET, REST + HELD), slice(TRACE - QUIET, TRACE))
     steps = np.sort(np.concatenate([np.abs(np.diff(traces[..., part], axis=-1)) for part in quiet], axis=-1), axis=-1)
     return steps[..., : steps.shape[-1] * 3 // 4].mean(axis=-1)
@@ -227,8 +223,8 @@ class ExceedanceModel:
 
         Those of several sets of failed fibres follow one another; the sums run on from one to the next.
 
-        The slope is the mean excess of the highest tenth of the peaks, at least 1, that of exact likelihoods (A. Wald).
-        The level is so high that the highest peak occurs at least once in Q presses.
+        The slope is the mean excess of the highest tenth of the peaks, but at least 1, which exact likelihoods have
+        (A. Wald). The level is so high that the model expects the highest peak at least once in Q presses.
         """
         levels, slopes = zip(*[_fit_tail(*each) for each in llrs], strict=True)
         return cls(np.stack(levels), np.stack(slopes))

@@ -84,7 +84,7 @@ class HealthModel(HealthDocument):
             InputError: the folder cannot be written.
         """
         document = _DOCUMENT.dump_python(self, warnings=False)
-        parts = {name: part for name, part in vars(self).items() if name not in document}
+        parts = {key: part for key, part in vars(self).items() if key not in document}
         files_of(folder, name).write(FORMAT, document, parts)
 
     @classmethod

@@ -20,9 +20,8 @@ from padforge.sense.localizer.response_model import grid_positions, interpolate_
 COMPONENTS = 6  # linear discriminants of a fibre
 LINEARIZED = 2  # cells of the response table along a side of a cell of the linearization
 COARSENING = 3  # cells of the response table along a side of a cell of the posterior grid
-SCATTER_WIDTH = 4.0  # standard deviation of the averages of the scatter, in distances between presses
+SCATTER_WIDTH = 4.0  # standard deviation of the weights by which scatter is averaged, in distances between presses
 SCATTER_PRIOR_COUNT = 10.0  # weight of the scatter of the whole pad in these averages, in presses
-MIN_VARIANCE = 1e-4  # of scaled features, which are about 1
 PRIOR_WEIGHT = 0.05  # of the grid posterior in the Gauss-Newton steps; small, since both use the same features
 GAUSS_NEWTON_STEPS = 2
 MAX_STEP = 0.2  # maximum Gauss-Newton step, in units of the scaled position
@@ -145,7 +144,7 @@ class BayesianLocalizer:
         )
 
     def _grid_posterior(self, z: Any, mask: Any, xp: Any) -> tuple[Any, Any, Any]:
-        """Mean (Q, 2), variances (Q, 2) and correlation (Q,) of the posterior on the grid."""
+        """Return mean (Q, 2), variances (Q, 2) and correlation (Q,) of the posterior on the grid."""
         first, second = (indices.tolist() for indices in np.triu_indices(z.shape[2]))
         monomials = xp.concat([z[:, :, first] * z[:, :, second], z, xp.ones_like(z[:, :, :1])], axis=2)
         coefficients = self.log_likelihood_coefficients
@@ -214,7 +213,7 @@ def fit_projection(
 def _fit_lda(expected: Array, residual: Array, components: int) -> Array:
     """Return whitened linear discriminants (F, D), from responses at positions (P, F) and residuals (Q, F)."""
     size = residual.shape[1]
-    scatter = residual.T @ residual / max(len(residual), 1) + MIN_VARIANCE * np.eye(size)
+    scatter = residual.T @ residual / max(len(residual), 1) + 1e-4 * np.eye(size)  # features are about 1
     whitening = np.linalg.inv(np.linalg.cholesky(scatter)).T
     between = (expected - expected.mean(axis=0)) @ whitening
     _, directions = np.linalg.eigh(between.T @ between)
@@ -261,10 +260,10 @@ def local_scatter(centres: Array, positions: Array, residual: Array, fibre_mask:
 
 
 def _log_likelihood_coefficients(expected: Array, precision: Array) -> Array:
-    """Coefficients (D (D + 3) / 2 + 1, P) of a normal log density with mean (P, D) and precision (P, D, D)."""
+    """Return the coefficients (D (D + 3) / 2 + 1, P) of a normal log density of mean (P, D), precision (P, D, D)."""
     first, second = np.triu_indices(expected.shape[1])
     quadratic = -precision[:, first, second] * np.where(first == second, 0.5, 1.0)
     linear = np.einsum("pij,pj->pi", precision, expected)
     constant = 0.5 * (np.linalg.slogdet(precision)[1] - (linear * expected).sum(axis=1))
     coefficients = np.column_stack([quadratic, linear, constant]).T
-    return coefficients - coefficients.mean(axis=1, keepdims=True)  # common to all positions, and it would cost digits
+    return coefficients - coefficients.mean(axis=1, keepdims=True)  # the mean cancels, and would cost digits

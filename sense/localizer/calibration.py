@@ -19,9 +19,9 @@ from padforge.design import Contact, Morphology
 from padforge.design.objectives.fibre_loss import failure_subsets
 from padforge.sense.arrays import Array, Indices
 from padforge.sense.localizer.evaluation import (
+    CONVERGED_SHARE,
     PRIOR_PRESSES,
     RATIO_SHAPE,
-    TRAINED_OUT,
     Evaluation,
     conformal,
     distances,
@@ -57,7 +57,6 @@ MAX_TIME_BUDGET_S = 1e9
 MIN_DEPTH_RANGE_MM = 0.2  # range of the central 90 % of depths, at or below which depth does not vary
 PRIOR_COUNT = 2  # weight of the expected error of a member in the calibration of its scale, in presses
 SCALE_SUBSETS = 6  # maximum sets of failed fibres of a size for the calibration of scales
-SIZE_KEYS = "members", "hidden", "layers"
 CONTRADICTION = 2.5  # standard errors by which calibration presses may differ from the experience with other pads
 INTERVAL_SUBSETS = 32  # maximum sets of failed fibres of a size for the calibration of intervals
 MOMENT_SUBSETS = 4  # the same where there are several moments
@@ -282,9 +281,9 @@ def fit_model(
     true_mm = data.positions_mm[calibration]
     true_measures = {name: values[calibration] for name, values in data.measures.items()}
     defaults = LocalizerSettings()
-    is_default = all(getattr(options, name) == getattr(defaults, name) for name in SIZE_KEYS)
-    is_trained_out = trained_share * options.epochs >= TRAINED_OUT * defaults.epochs
-    is_usual = is_default and is_ensemble and n_timed and not data.measures and is_trained_out
+    is_default = all(getattr(options, name) == getattr(defaults, name) for name in ("members", "hidden", "layers"))
+    is_converged = trained_share * options.epochs >= CONVERGED_SHARE * defaults.epochs
+    is_usual = is_default and is_ensemble and n_timed and not data.measures and is_converged
     n_trained = len(train) if is_usual else None
     levels = _n_levels(options, model.fibres)
     return calibrate_uncertainty(model, moments, true_mm, levels, true_measures, on_progress, n_trained)

@@ -29,13 +29,13 @@ BUILT_PAD = "simulated, by default with the scatter of a built pad, which itself
 CELLS = 5  # cells along a side of the map of errors by position
 MOMENT_SETS = 3  # maximum sets of failed fibres of a size at each moment
 NO_MOMENTS: dict[str, Any] = {"by_moment": [], "focus": {}}
-TRAINED_OUT = 0.5  # share of the steps of a training from which on errors are within 5 % of those of a complete one
+CONVERGED_SHARE = 0.5  # share of the steps of a training after which errors are within 5 % of the final ones
 PRIOR_PRESSES = 100  # weight of the experience with other pads in radii, in presses
 RATIO_SHAPE = 2.1
 """Shape of the gamma distribution of the ratio of distance to expected radius on other pads; it does not depend on the
 pad, the moment or the failed fibres."""
 N_PRIOR = 200  # quantiles that represent this distribution
-UNSURE = 0.043  # uncertainty of the share within r90 above which it is reported
+MAX_UNCERTAINTY = 0.043  # uncertainty of the share within r90 above which it is reported
 MAX_RADII = 4.0
 """Maximum distance of the predicted from the stated position, in radii of 90 %: on the published recording it is up to
 2.5, and 5 or more if the sign of a coordinate is lost."""
@@ -190,7 +190,7 @@ def find_doubts(
         lines.append(f"{within_r90:.0%} of {n_presses} presses lie within r90: is it the recording of this pad?")
     elif is_misplaced.any():
         named = doubts.name_presses(recording, is_misplaced)
-        lines.append(f"more than {MAX_RADII:g} r90 from where the fibres say: {named}")
+        lines.append(f"stated more than {MAX_RADII:g} r90 from where they are predicted: {named}")
     return lines
 
 
@@ -237,7 +237,7 @@ def errors_by_moment(
 ) -> dict[str, Any]:
     """Return the errors of presses at `MOMENTS`, while they are read, for up to `MOMENT_SETS` sets of failed fibres.
 
-    They are "by_moment": rows of `error_row`, with "since" touch or lift, "readings" since then, and "time_s"; and
+    Returned are "by_moment": rows of `error_row`, with "since" touch or lift, "readings" since then, and "time_s"; and
     "focus": the press of the median error, with "press", "pressed_mm", and "moments" of "since", "time_s",
     "predicted_mm" and "r90_mm". Both are empty for a localizer without moments.
     """
@@ -298,20 +298,20 @@ def error_row(
         "within_r50": float((errors <= np.stack([each.r50_mm for each in predictions])).mean()),
         "within_r90": float((errors <= np.stack([each.r90_mm for each in predictions])).mean()),
     }
-    for name, (errors, r90) in _measure_errors(predictions, measures).items():
+    for name, (measure_errors, r90) in _measure_errors(predictions, measures).items():
         kind, unit = name.rsplit("_", 1)
-        measured = np.isfinite(errors[0])
+        measured = np.isfinite(measure_errors[0])
         if measured.any():
             row |= {
-                f"{kind}_mean_{unit}": float(errors[:, measured].mean()),
-                f"{kind}_p95_{unit}": float(np.percentile(errors[:, measured], 95)),
-                f"{kind}_within_r90": float((errors <= r90)[:, measured].mean()),
+                f"{kind}_mean_{unit}": float(measure_errors[:, measured].mean()),
+                f"{kind}_p95_{unit}": float(np.percentile(measure_errors[:, measured], 95)),
+                f"{kind}_within_r90": float((measure_errors <= r90)[:, measured].mean()),
             }
     return row
 
 
 def _measure_errors(predictions: Sequence[Localization], measures: Measures | None) -> dict[str, tuple[Array, Array]]:
-    """(sets, Q) errors of each predicted measure, NaN where the true value is unknown, and their r90."""
+    """Return the errors (sets, Q) of each predicted measure, NaN where the true value is unknown, and their r90."""
     errors = {}
     for name in predictions[0].measures:
         estimates = [each.measures[name] for each in predictions]
@@ -321,7 +321,7 @@ def _measure_errors(predictions: Sequence[Localization], measures: Measures | No
 
 
 def distances(predicted_mm: Array, pressed_mm: Array) -> Array:
-    """Return the (Q,) distances of (Q, 2) positions."""
+    """Return the distances (Q,) of predicted from pressed positions (Q, 2)."""
     return np.hypot(*(predicted_mm - pressed_mm).T)
 
 
@@ -331,12 +331,13 @@ def conformal(
     measures: Measures | None = None,
     prior_ratio: float | None = None,
 ) -> Array:
-    """Return factors with which standard deviations, radii and r90 of measures hold on presses, as in `error_row`.
+    """Return the factors on standard deviations, radii and r90 of measures with which these hold on presses.
 
     Radii are split conformal (Lei et al. 2018, Distribution-free predictive inference for regression): quantiles of
     distance over radius on presses that were not used before, one rank higher than the share, which is more cautious
     after few presses. With a `prior_ratio`, the mean ratio of distance to radius on other pads, a gamma distribution
-    about it counts as PRIOR_PRESSES further presses, since quantiles of few presses vary much.
+    about it counts as PRIOR_PRESSES further presses, since quantiles of few presses vary much. The other arguments are
+    as in `error_row`.
 
     Returns:
         Factors (3 + T,) on the standard deviation, the radii of 50 and 90 %, and the r90 of T measures (1 if no true
@@ -428,13 +429,13 @@ def calibration_lines(document: Mapping[str, Any]) -> list[str]:
 
 
 def reserve_lines(document: Mapping[str, Any]) -> list[str]:
-    """Say in lines with what reserve a calibration document is to be read: training, radii, and what is doubtful."""
+    """Return the reservations about a calibration, a line each: short training, radii of few presses, and doubts."""
     share, presses, lines = document.get("trained_share", 1.0), document.get("radii_presses", 0), []
-    if share < TRAINED_OUT:
-        lines.append(f"not trained out: {share:.0%} of the usual steps; errors fall with more time")
-    if presses and (slack := 2 * math.sqrt(0.9 * 0.1 / presses)) > UNSURE:
-        many = f"{0.9 - slack:.0%} to {min(0.9 + slack, 1):.0%}"
-        lines.append(f"radii rest on few presses: of many others {many} may lie in r90")
+    if share < CONVERGED_SHARE:
+        lines.append(f"not converged: {share:.0%} of the usual steps; errors fall with more time")
+    if presses and (slack := 2 * math.sqrt(0.9 * 0.1 / presses)) > MAX_UNCERTAINTY:
+        shares = f"{0.9 - slack:.0%} to {min(0.9 + slack, 1):.0%}"
+        lines.append(f"radii rest on few presses: {shares} of further presses may lie in r90")
     return [*lines, *(f"doubtful: {doubt}" for doubt in document.get("doubts", ()))]
 
 

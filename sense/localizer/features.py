@@ -92,7 +92,7 @@ def features_without_moments(windows: Array, fibre_mask: Mask) -> PressFeatures:
 
 
 def valid_fibres(readings: Array, down_command: Indices, up_command: Indices, until: Indices) -> Mask:
-    """Return (Q, C) which fibres have enough readings in a press, from the rest before it to `until` (Q,)."""
+    """Return a mask (Q, C) of fibres with enough readings in a press, from the rest before it to `until` (Q,)."""
     first, ends = np.maximum(down_command + REST[0], 0), np.minimum(until, up_command + RELEASE_WINDOWS[-1][1])
     counts = np.vstack([np.zeros((1, readings.shape[1])), np.cumsum(~np.isnan(readings), axis=0)])
     return counts[ends] - counts[first] >= MIN_PRESENT * (ends - first)[:, None]
@@ -191,6 +191,6 @@ def _running_medians(readings: Array, down_command: Indices, up_command: Indices
 
 
 def _gather(readings: Any, origin: Any, window: Window, low: Any, high: Any, xp: Any) -> Any:
-    """Return the readings (Q, W, C) in `origin` + window, clipped to low <= index < high, at most their number."""
+    """Return the readings (Q, W, C) at `origin` + window, these indices clipped to low <= index < high <= R."""
     index = xp.maximum(origin[:, None] + xp.arange(*window), low[:, None])
     return readings[xp.minimum(index, high[:, None] - 1)]

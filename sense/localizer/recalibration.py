@@ -6,7 +6,6 @@ these presses.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from itertools import count
 from types import MappingProxyType
 from typing import Any
 
@@ -40,8 +39,6 @@ DIFF_STEP = 0.02  # step of finite differences, in prior standard deviations; sm
 MIN_PRESSES = 10  # new presses needed; fewer can neither change much nor show an improvement
 MAX_PRESSES = 500  # new presses used at most; the time of a fit grows with their cube, and more gain nothing
 FOLDS = 5
-MIN_CORRECTION_GAIN = 2.0  # minimum gain of a correction, which is coarse, in standard errors
-MIN_REFIT_GAIN = 0.0  # the same of refitting: any gain, since it grows with more presses
 MAX_EXPONENT = 0.5  # largest p in error ~ presses ** -p; a mean of independent errors has it
 SUBSETS = 16  # maximum sets of failed fibres of a size
 Predictions = Sequence[Sequence[Localization]]  # by number and by set of failed fibres
@@ -126,12 +123,7 @@ def recalibrate(
     samples = features, positions_mm, measures
     validation, halves = (CrossValidation(samples, n_folds, subsets) for n_folds in (FOLDS, 2))
     before = validation.predict([model] * FOLDS)
-    # correction, folds, two halves, final fit
-    steps, total = count(1), FOLDS + 4 if model.method == "ensemble" else 1
-
-    def step() -> None:
-        on_progress(next(steps), total, "")
-
+    total = FOLDS + 4 if model.method == "ensemble" else 1  # correction, folds, two halves, final fit
     folds, after, changed, change = [model] * FOLDS, before, model, None
     candidates = [validation.candidate(None, before, before)]
 
@@ -139,9 +131,9 @@ def recalibrate(
     predictions = validation.predict(validation.adapt(folds, fit_correction))
     candidates.append(validation.candidate("corrected", before, predictions))
     gain, standard_error = validation.gain(before, predictions)
-    if gain > MIN_CORRECTION_GAIN * standard_error:
+    if gain > 2 * standard_error:  # a correction is coarse
         changed, after, change = fit_correction(model, *samples), predictions, "corrected"
-    step()
+    on_progress(1, total, "")
 
     # 2. Response
     new_fibres, twice_as_many_mm = [], None
@@ -151,16 +143,16 @@ def recalibrate(
             plan = plan_prior(pad, stated_contact(recording), model.scaler.origin_mm, model.scaler.scale_mm)
 
         def refit_last(old: LocalizerModel, *training: Any) -> LocalizerModel:
-            refitted = refit(old, *training, plan=plan, seed=seed, only_last=True)[0]
-            step()
-            return refitted
+            return refit(old, *training, plan=plan, seed=seed, only_last=True)[0]
 
-        predictions = validation.predict(validation.adapt(folds, refit_last))
+        adapted = validation.adapt(folds, refit_last, lambda fold: on_progress(2 + fold, total, ""))
+        predictions = validation.predict(adapted)
         candidates.append(validation.candidate("refitted", before, predictions))
-        gain, standard_error = validation.gain(after, predictions)
-        if gain > MIN_REFIT_GAIN * standard_error:
-            half = halves.predict(halves.adapt([model] * 2, refit_last))
-            twice_as_many_mm = _extrapolate(validation.mean_error(predictions), halves.mean_error(half))
+        gain, _ = validation.gain(after, predictions)
+        if gain > 0:  # any gain counts, since it grows with more presses
+            adapted = halves.adapt([model] * 2, refit_last, lambda half: on_progress(2 + FOLDS + half, total, ""))
+            half_error_mm = halves.mean_error(halves.predict(adapted))
+            twice_as_many_mm = _extrapolate(validation.mean_error(predictions), half_error_mm)
             changed, is_new = refit(model, *samples, plan=plan, seed=seed)
             after, change, new_fibres = predictions, "refitted", np.flatnonzero(is_new).tolist()
     on_progress(total, total, "")
@@ -168,9 +160,9 @@ def recalibrate(
     # 3. Radii
     gain, standard_error = validation.gain(before, after)
     widened = validation.widening(after)
-    made_by = provenance("padforge sense recalibrate", seed, packages=("torch", "safetensors"))
+    origin = provenance("padforge sense recalibrate", seed, packages=("torch", "safetensors"))
     inputs = {"recording": recording.digest, "localizer": dict(model.provenance)}
-    made_by |= {"inputs": inputs, "recording_kind": recording.source.get("kind")}
+    origin |= {"inputs": inputs, "recording_kind": recording.source.get("kind")}
     result = Recalibration(
         presses=len(rows),
         change=change,
@@ -182,14 +174,14 @@ def recalibrate(
         gain_mm=gain,
         standard_error_mm=standard_error,
         widened=widened.tolist(),
-        provenance=made_by,
+        provenance=origin,
     )
     changed = replace(
         changed,
         interval_factors=np.minimum(changed.interval_factors * widened, 1e6),
         single_press=changed.single_press if change == "refitted" else changed.calibrate_tests(recording, rows),
         recalibrated_by=(*model.recalibrated_by, recording.digest),
-        provenance=made_by,
+        provenance=origin,
     )
     return changed, result
 
@@ -339,14 +331,17 @@ class CrossValidation:
         self.presses = presses
         self._folds, self._subsets = np.array_split(np.arange(len(presses[1])), n_folds), subsets
 
-    def adapt(self, models: Sequence[LocalizerModel], change: Change) -> list[LocalizerModel]:
-        """Change each model, one per fold, by the presses outside its fold."""
+    def adapt(
+        self, models: Sequence[LocalizerModel], change: Change, on_fold: Callable[[int], None] = lambda fold: None
+    ) -> list[LocalizerModel]:
+        """Change each model, one per fold, by the presses outside its fold; `on_fold` is called after each."""
         features, positions_mm, measures = self.presses
         changed = []
-        for model, fold in zip(models, self._folds, strict=True):
+        for number, (model, fold) in enumerate(zip(models, self._folds, strict=True)):
             rows = np.setdiff1d(np.arange(len(positions_mm)), fold)
             training = {name: values[rows] for name, values in measures.items()}
             changed.append(change(model, features[rows], positions_mm[rows], training))
+            on_fold(number)
         return changed
 
     def predict(self, models: Sequence[LocalizerModel]) -> Predictions:
@@ -395,7 +390,7 @@ class CrossValidation:
 def recalibration_lines(result: Recalibration) -> list[str]:
     """Format a recalibration: the error of each candidate, a table of the one that was kept, and a conclusion."""
     names = {None: "as it was", "corrected": "corrected by gains and pose", "refitted": "response fitted again"}
-    lines = [f"{result.presses} new presses, each predicted by what was changed without it; error in mm"]
+    lines = [f"{result.presses} new presses, each predicted by a localizer adapted without it; error in mm"]
     for each in result.candidates:
         error = f" ± {each['standard_error_mm']:.2f}" if each["change"] else ""
         mark = "  <- kept" if each["change"] == result.change else ""

@@ -20,7 +20,6 @@ from padforge.sense.localizer.response_model import ResponseModel, interpolate_g
 from padforge.sense.localizer.response_process import ResponseFit, ResponsePrior, fit_response
 
 MAX_INPUT = 1e4  # scaled features are clipped to it; no press exceeds it
-MAX_LEVERAGE = 0.9  # limits the leave-one-out residual of an isolated press to ten times its residual
 
 
 def array_field(low: float, high: float) -> tuple[PlainValidator, PlainSerializer]:
@@ -245,6 +244,6 @@ def leave_one_out_residuals(presses: TrainingPresses, table: Floats, leverage: A
     expected = relative_depth[:, None, None] * interpolate_grid(table, positions)
     if leverage is None:
         leverage = leverages(positions, relative_depth)[:, None]
-    leverage = np.minimum(leverage, MAX_LEVERAGE)[:, :, None]
+    leverage = np.minimum(leverage, 0.9)[:, :, None]  # residuals of isolated presses grow tenfold at most
     residual = (presses.inputs - expected) / np.where(table.any(axis=(0, 1)), 1 - leverage, 1.0)
     return replace(presses, inputs=(expected + residual).astype(np.float32))

@@ -44,8 +44,6 @@ MIN_MISFIT = 1.35  # with all fibres
 MIN_MISFIT_LEFT_OUT = 0.4  # without the fibres that fit worst
 MIN_PRESSES = 25  # with fewer presses a pad is not tested
 MAX_PRESSES = 300  # presses of a pad that are used at most
-MIN_DET = 1e-3  # minimum determinant of the Gram matrix of two responses, relative to the product of their norms
-MIN_RELATIVE_MISFIT = 1e-6  # minimum misfit per component, since its logarithm is taken
 MIN_STD = 0.1  # minimum standard deviation of logarithms of misfits, which few presses underestimate
 OTHER_PAD = (
     "these presses are unlike those of the calibration: another pad, or one cast again; radii do not hold; recalibrate"
@@ -183,7 +181,7 @@ class SinglePressTest:
         best = misfit.argmin(axis=1)
         misfit, growth = (np.take_along_axis(part, best[:, None], axis=1)[:, 0] for part in (misfit, growth))
         n_terms = np.maximum(COMPONENTS * masks.sum(axis=2), 1)
-        return _Fit(np.log(np.maximum(misfit / n_terms, MIN_RELATIVE_MISFIT)), misfit, best, growth)
+        return _Fit(np.log(np.maximum(misfit / n_terms, 1e-6)), misfit, best, growth)
 
     def _root_likelihood_ratio(self, inputs: Floats, fibre_mask: Mask) -> Array:
         """Return the root (Q,) of twice the log-likelihood ratio of two presses over one.
@@ -198,7 +196,7 @@ class SinglePressTest:
             measured = (z[press, valid, None] @ whitening).ravel()
             gram, moment = expected @ expected.T, expected @ measured
             norm = np.diag(gram)[:, None] * np.diag(gram)
-            det = np.maximum(norm - gram**2, MIN_DET * norm)  # the two responses may be nearly the same
+            det = np.maximum(norm - gram**2, 1e-3 * norm)  # the two responses may be nearly the same
             first = (np.diag(gram) * moment[:, None] - gram * moment) / np.maximum(det, 1e-9)  # strengths of both
             second = first.T
             is_pair = self._is_apart & (first > MIN_SHARE * second) & (second > MIN_SHARE * first)

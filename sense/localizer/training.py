@@ -363,7 +363,6 @@ class Training:
 
 
 RETRAINING_STEPS = 150  # from a similar response; with 400, networks err no less and are overconfident
-RETRAINING_RATE = 1e-3
 RETRAINING_SPREAD = 1.4
 """Factor on `AUGMENTATION`, since presses are few; without it an unchanged pad errs a tenth more."""
 
@@ -392,7 +391,7 @@ def retrain(
         The retrained networks and residual network.
     """
     n_timed = presses.complete.shape[1]
-    options = LocalizerSettings(max_failures=max_failures, learning_rate=RETRAINING_RATE)
+    options = LocalizerSettings(max_failures=max_failures, learning_rate=1e-3)
     starts = [(name, weights, PHASES[n_timed][name], ()) for name, weights in networks.items()]
     if residual_network:
         starts += [(RESIDUAL, residual_network, RESIDUAL_PHASE if n_timed else PHASES[0]["press"], bayes)]

@@ -13,11 +13,7 @@ from padforge.sense.arrays import Array
 from padforge.sense.recording.recording import Recording
 
 FRAME_S = 0.075  # length of a frame
-AS_READ = 0.9, 1.1  # readings per frame, low and high, between which each reading is a frame
 MIN_PRESENT = 0.25  # minimum fraction of a frame with readings of a fibre; otherwise the fibre is missing in it
-# Intervals between readings count as at most the larger of these two, so that a computer's sleep makes no frames.
-MAX_PAUSE_S = 1.0
-MAX_PAUSE = 3.0  # in intervals of the rate
 
 
 def framed(recording: Recording) -> Recording:
@@ -80,8 +76,11 @@ class FrameStream:
 
 
 def _excess_s(intervals_s: Array, rate_hz: float) -> Array:
-    """Return the excess of intervals (n,) between readings over the maximum pause; shape (n,), s."""
-    return np.maximum(intervals_s - max(MAX_PAUSE_S, MAX_PAUSE / rate_hz), 0.0)
+    """Return the excess of intervals (n,) between readings over 1 s, or over 3 usual ones if these are longer; (n,), s.
+
+    A pause counts as no longer than that, so that a computer's sleep makes no frames.
+    """
+    return np.maximum(intervals_s - max(1.0, 3.0 / rate_hz), 0.0)
 
 
 def frame_rate_hz(rate_hz: float) -> float:
@@ -91,8 +90,7 @@ def frame_rate_hz(rate_hz: float) -> float:
 
 def is_as_read(rate_hz: float) -> bool:
     """Return whether each reading at a rate is a frame."""
-    low, high = AS_READ
-    return low <= rate_hz * FRAME_S <= high
+    return 0.9 <= rate_hz * FRAME_S <= 1.1
 
 
 def reading_edges(times_s: Array) -> Array:

@@ -49,7 +49,6 @@ _ARRAYS |= dict.fromkeys(("down_command", "up_command"), np.int64)
 FIBRE_NAMES = "fibre_names"  # key in the source of a recording: names of its fibres in the imported file
 NOTE = "note"  # key in the source of a recording: what was omitted in the import, or filled in
 PRESSES_DETECTED = {"presses": "detected"}  # entry of the source of a recording whose presses were detected
-_MIN_READINGS = 100  # fewer may be a table with a line for each press
 _MEASURES = {"depths_mm": (MAX_MM, "mm"), "reached_mm": (MAX_MM, "mm"), "forces_n": (MAX_N, "N")}
 
 
@@ -347,7 +346,7 @@ def detect_commands(readings: Array, times_s: Array, source: Mapping[str, Any]) 
     presses = detect_presses(readings, times_s)
     if len(presses.touched) == 0:
         what = "no position or number tells of one, and none is detected in the readings"
-        hint = "; a line for each press is no recording" if len(readings) < _MIN_READINGS else ""
+        hint = "; a line for each press is no recording" if len(readings) < 100 else ""
         raise InputError(f"has no press: {what}{hint}")
     return estimate_commands(presses, times_s)
 

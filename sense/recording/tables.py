@@ -31,8 +31,6 @@ FALLBACK = "cp1252"  # encoding of text that is not UTF-8: that of Windows in we
 _TRUTH = {"true": 1.0, "false": 0.0, "yes": 1.0, "no": 0.0, "on": 1.0, "off": 0.0}
 _BYTE_ORDER_MARKS = {codecs.BOM_UTF8: "utf-8-sig", codecs.BOM_UTF16_LE: "utf-16", codecs.BOM_UTF16_BE: "utf-16"}
 _N_SAMPLED = 400  # lines from which the dialect is detected
-_MAX_BAD_SHARE = 0.05  # fraction of omitted lines or cells; more indicate a wrong dialect
-_MIN_BAD = 3  # omitted lines or cells that are always allowed
 _MAX_NAMED = 5
 _MONITOR = re.compile(r"^(\d{1,2}:\d\d:\d\d(?:[.,]\d+)?) -> ?")  # time stamps of the Arduino IDE's monitor
 _GARBAGE = re.compile("^[\x00-\x08\x0e-\x1f\x7f-\xff\ufffd]*[\x00-\x08\x0e-\x1f\xfe\xff\ufffd]")  # sent while booting
@@ -161,7 +159,7 @@ class Table:
 
     def _report(self, words: dict[int, dict[int, str]], torn: list[tuple[int, int]], n_headers: int, last: int) -> None:
         """Add notes on what was omitted; raise InputError if it is too much."""
-        limit = max(_MIN_BAD, _MAX_BAD_SHARE * len(self._lines))
+        limit = max(3, 0.05 * len(self._lines))  # more indicate a wrong dialect
         if len(torn) > limit:
             line, n_values = torn[0]
             raise InputError(f"{self.path}: line {line} has {n_values} values, expected {len(self.names)}")

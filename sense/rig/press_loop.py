@@ -67,7 +67,7 @@ class DiskThread(ThreadPoolExecutor):
 
 
 class Interrupts:
-    """A context that passes the first signal to end to its previous handler, and ignores further ones.
+    """A context that hands the first signal that asks the program to end to its previous handler, and ignores others.
 
     An exception raised by a signal handler is lost if it occurs in a callback of C code or in a finalizer; `check`
     raises it again. Only the main thread receives signals; in another thread this context does nothing.
@@ -116,7 +116,7 @@ class PressLoop:
     def __init__(self, arm: Arm, board: Board, recorder: Recorder, rig: RigSettings, *, dry: bool = False) -> None:
         self._arm, self._board, self._recorder, self._rig, self._dry = arm, board, recorder, rig, dry
         self._frame, self._limits = RobotFrame.from_settings(rig), Limits.from_settings(rig)
-        self._half_s = rig.half_cycle_s
+        self._half_cycle_s = rig.half_cycle_s
         self._averager = Averager(rig.samples_per_reading, recorder.fibres)
         self._recent: deque[float] = deque(maxlen=4096)  # times of the latest readings
         self._disk, self._n_readings = DiskThread(), recorder.n_readings
@@ -132,9 +132,9 @@ class PressLoop:
     ) -> None:
         """Make every press of the plan that the recorder does not have.
 
-        `on_progress` is called after every press, once it is on the disk, and `planner` before every press with the
-        plan and the press; it returns the plan, or one with the presses from that one on moved. After a RigFault
-        the arm stands still, and completed presses are on the disk.
+        `on_progress` is called after every press, once it is on the disk. `planner` is called before every press with
+        the plan and the number of the press, and returns the plan, or another one in which this and later presses are
+        moved. After a RigFault the arm stands still, and completed presses are on the disk.
         """
         check_plan(plan, self._rig)
         check_start_state(self._arm.state(), self._limits)
@@ -148,7 +148,7 @@ class PressLoop:
                         plan = changed
                     self._await_disk(self._press(press, plan.positions_mm[press], float(plan.depths_mm[press])))
                     on_progress(len(self._recorder.done), len(plan), "")
-            self._record_until(clock.now() + self._half_s)  # the release after the last press
+            self._record_until(clock.now() + self._half_cycle_s)  # the release after the last press
             self._await_disk(self._disk.submit(self._recorder.sync))
 
     def _start_clock(self) -> None:
@@ -164,7 +164,7 @@ class PressLoop:
         start_s = clock.now()
         self._move(above, self._rig.travel_mm_s)
         self._await_still()
-        self._record_until(start_s + self._half_s)
+        self._record_until(start_s + self._half_cycle_s)
         # 2. Down; the journal on the disk lists the press while it is held for half a cycle.
         down_s = clock.now()
         target = self._frame.pose(position_mm, -self._rig.clearance_mm / 2 if self._dry else depth_mm)
@@ -174,7 +174,7 @@ class PressLoop:
         self._disk.submit(self._recorder.sync)
         self._await_still()
         self._forces_n.clear()
-        self._record_until(down_s + self._half_s)
+        self._record_until(down_s + self._half_cycle_s)
         reached: dict[str, Any] = {}
         if self._forces_n:
             reached["force_n"] = float(np.median(np.abs(self._forces_n)))
@@ -242,7 +242,8 @@ class PressLoop:
         forces_n = states[:, STATE_COLUMNS.index("force_n")]
         self._forces_n += forces_n[~np.isnan(forces_n)].tolist()
         if len(states):
-            self._disk.submit(self._recorder.append_states, states - np.eye(1, states.shape[1]) * self._zero_s)
+            offset = np.where(np.array(STATE_COLUMNS) == "time_s", self._zero_s, 0.0)
+            self._disk.submit(self._recorder.append_states, states - offset)
 
     def _count_after(self, time_s: float) -> int:
         """Count the recent readings that were taken after a time."""

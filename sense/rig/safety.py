@@ -73,8 +73,8 @@ class Limits:
             if not -math.inf < low < high < math.inf:
                 raise ValueError(f"box_mm: {axis} from {low} to {high}; expected two finite numbers, ascending")
         for name in ("max_depth_mm", "max_speed_mm_s", "max_acceleration_mm_s2", "max_force_n", "deadline_s"):
-            value = getattr(self, name)
-            if not (0 < value < math.inf if value is not None else name == "max_force_n"):
+            value, may_be_none = getattr(self, name), name == "max_force_n"
+            if not (may_be_none if value is None else 0 < value < math.inf):
                 raise ValueError(f"{name} is {value}; expected a finite number above 0")
         if self.contact_mm is not None and not math.isfinite(self.contact_mm):
             raise ValueError(f"contact_mm is {self.contact_mm}; expected a finite number or None")
@@ -231,6 +231,7 @@ def retreat(arm: Arm, limits: Limits) -> None:
         max_depth_mm=max(limits.max_depth_mm, limits.contact_mm - z),
     )
     check_state(state, relaxed, clock.now())
+    # RETREAT_MM above the pad, and at least the present height, or RETREAT_MM above that if the force is too high
     clear_mm = max(limits.contact_mm, z if overloaded else z - RETREAT_MM) + RETREAT_MM
     up: Pose = (*state.pose[:2], min(clear_mm, limits.box_mm[2][1]), *state.pose[3:])
     if up[2] <= z:
@@ -238,7 +239,7 @@ def retreat(arm: Arm, limits: Limits) -> None:
     speed_mm_s = min(RETREAT_MM_S, limits.max_speed_mm_s)
     check_target(up, speed_mm_s, limits.max_acceleration_mm_s2, relaxed)
     arm.move(up, speed_mm_s, limits.max_acceleration_mm_s2)
-    on_wait = _falling_force_check(arm, force_n, max_n) if overloaded and max_n else lambda: None
+    on_wait = _FallingForceCheck(arm, force_n, max_n) if overloaded and max_n else lambda: None
     check_state(wait_until_still(arm, relaxed, on_wait), limits, clock.now())
 
 
@@ -257,21 +258,21 @@ def _await_state(arm: Arm) -> ArmState:
         clock.sleep(POLL_S)
 
 
-def _falling_force_check(arm: Arm, first_n: float, max_n: float) -> Callable[[], None]:
-    """Return a check, to be called repeatedly, that raises RigFault("force") unless the force on the tool falls."""
-    start_s, min_n = clock.now(), first_n
+class _FallingForceCheck:
+    """A check, to be called repeatedly, that raises RigFault("force") unless the force on the tool falls."""
 
-    def check() -> None:
-        nonlocal min_n
-        force_n = arm.state().total_force_n or 0.0
-        min_n = min(min_n, force_n)
+    def __init__(self, arm: Arm, first_n: float, max_n: float) -> None:
+        self._arm, self._first_n, self._max_n = arm, first_n, max_n
+        self._start_s, self._min_n = clock.now(), first_n
+
+    def __call__(self) -> None:
+        force_n = self._arm.state().total_force_n or 0.0
+        self._min_n = min(self._min_n, force_n)
         # The allowed force falls linearly from the first one to the limit, and is at most MAX_RISE_N above the minimum.
-        remaining = min((start_s + FALL_END_S - clock.now()) / (FALL_END_S - FALL_START_S), 1.0)
-        line_n = max_n + (first_n + MAX_RISE_N - max_n) * remaining
-        if not force_n <= max(max_n, min(min_n + MAX_RISE_N, line_n)):
+        remaining = min((self._start_s + FALL_END_S - clock.now()) / (FALL_END_S - FALL_START_S), 1.0)
+        line_n = self._max_n + (self._first_n + MAX_RISE_N - self._max_n) * remaining
+        if not force_n <= max(self._max_n, min(self._min_n + MAX_RISE_N, line_n)):
             raise RigFault("force", f"the force does not fall, it is {force_n:.1f} N", "free the tool by hand")
-
-    return check
 
 
 def _refuse(problem: str, allowed: str) -> NoReturn:

@@ -68,23 +68,27 @@ PAD = np.dtype(
 
 BLOCK_S = 0.03  # length of a block; a probe takes a tenth of a second to sink in
 FADE_S, SLOPE_S, NOISE_S = 2.5, 1.0, 10.0  # times in which a slope fades, a slope is learnt, and noise is learnt
-GAP_S, GIVE_UP_S = 1.0, 1.0  # a fibre missing for longer is reset; a longer run without agreement is grown noise
-WARM_UP_BLOCKS, ROUGH_BLOCKS = 8, 8  # blocks before the first change; noise of n blocks is widened by ROUGH_BLOCKS / n
+GAP_S = 1.0  # a fibre that is missing for longer is reset
+GIVE_UP_S = 1.0  # a run that lasts longer without agreement is noise that has grown
+WARM_UP_BLOCKS = 8  # blocks before the first change
+ROUGH_BLOCKS = 8  # noise learnt from n blocks is widened by ROUGH_BLOCKS / n
 LEVEL_ERROR, SLOPE_ERROR = 0.05, 0.4  # errors of level, and of slope per s, relative to a step that silicone settles to
 MAX_INNOVATION, MAX_GROWTH = 2.5, 3.0  # limits of the influence of a block on level, and on noise, standard deviations
 MIN_SHARE, MIN_V = 0.01, 1e-7  # least noise, relative to a typical press, and in V (smaller steps are rounding)
 MIN_CORRELATION = 0.25  # correlation of successive innovations above which a level is modelled as a random walk
 MEAN_TO_STD = math.sqrt(math.pi / 2)  # standard deviation over mean absolute value of a normal distribution
-STALL_S, SETTLED = 0.5, 0.1  # a change ends if it does not grow for STALL_S, or by less than SETTLED of it in a block
+STALL_S = 0.5  # a change that does not grow for longer has ended
+SETTLED = 0.1  # a change that grows by a smaller share of itself in a block has ended
 RELEASE_S = 1.0  # a step in the direction of a release, within this time after one, belongs to it
 MAX_STEP = 20.0  # limit of a whitened step, so that a broken fibre does not outweigh the others
 CLEAR_STEP = 5.0  # whitened step above which a fibre adds to the typical press in V
-MIN_PRESSES, MIN_AGREEMENT = 3, 0.5  # minimum touches, and their minimum agreement, for a use of their direction
+MIN_PRESSES, MIN_AGREEMENT = 3, 0.5  # touches, and their agreement, from which on their direction is used
 TOUCH_RATE, LEVEL_RATE = 0.05, 0.15  # weights of the newest touch and level in their running means
-MIN_FURTHER = -0.1  # minimum projection on the step of a press of what is not a part of its release
+MIN_FURTHER = -0.1  # projection on the step of a press below which a change belongs to its release
 FURTHER = 2  # event: a pad that is pressed is pressed further
 INVERTED, MIN_INVERTED = 1.2, 0.4
-"""Rests are presses if rest levels scatter more than these shares of levels under presses, and of a typical press."""
+"""Rests and presses are confused if rest levels scatter more than INVERTED times as the levels under presses, and more
+than MIN_INVERTED times the size of a typical press."""
 
 
 class State(IntEnum):
@@ -419,20 +423,20 @@ def classify_change(fibres: Any, pad: Any, time_s: float, settled: bool, events:
     has_direction = pad.n_presses >= MIN_PRESSES and pad.agreement > MIN_AGREEMENT
     agreement = _agreement(fibres) if has_direction else 1.0
     projection = _projection(fibres, fibres.press_step)  # -1 if the step of the press is taken back
-    ratio = _size(fibres, fibres.residual, MAX_STEP) / _size(fibres, fibres.press_step, MAX_STEP)
-    if pad.state == State.REST and time_s - pad.released_s < RELEASE_S and projection < -0.5 * math.sqrt(ratio):
+    size_ratio = _size(fibres, fibres.residual, MAX_STEP) / _size(fibres, fibres.press_step, MAX_STEP)
+    if pad.state == State.REST and time_s - pad.released_s < RELEASE_S and projection < -0.5 * math.sqrt(size_ratio):
         pad.change = Change.SETTLING
     elif pad.state == State.REST and agreement >= 0:
         pad.change = Change.TOUCH
         count = emit(events, count, True, pad.run_first)
-    elif pad.state == State.PRESSED and (projection < -0.5 or (agreement < 0 and ratio > 0.25)):
+    elif pad.state == State.PRESSED and (projection < -0.5 or (agreement < 0 and size_ratio > 0.25)):
         pad.change = Change.RELEASE
         count = emit(events, count, False, pad.run_first)
     elif pad.state == State.PRESSED and pad.change == Change.UNKNOWN and agreement > 0 and projection > MIN_FURTHER:
         pad.change = Change.FURTHER
         count = emit(events, count, FURTHER, pad.run_first)
     elif pad.state == State.UNCLEAR and settled:
-        was_touch = agreement < 0 or (-2 < projection < -0.5 and ratio < 4)
+        was_touch = agreement < 0 or (-2 < projection < -0.5 and size_ratio < 4)
         count = emit(events, count, True, pad.unclear_first if was_touch else pad.run_first)
         if was_touch:
             count = emit(events, count, False, pad.run_first)

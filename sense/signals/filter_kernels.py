@@ -2,8 +2,8 @@
 
 Total variation denoising is solved by dynamic programming (N. Johnson, J. Comput. Graph. Stat. 22, 2013; V. Kolmogorov,
 T. Pock, M. Rolinek, SIAM J. Imaging Sci. 9, 2016). The message of reading i is the least cost of all readings up to it
-as a function of x_i. A reading adds its fidelity; the coupling to the next clips the derivative of the message to
-+-lam, and where it does so are the bounds that x_i is clipped to, given the next. The backward pass clips from the end.
+as a function of x_i. A reading adds its fidelity; the coupling to the next one clips the derivative of the message to
++-lam. The positions at which that begins are the bounds of x_i: the backward pass, from the end, clips x_{i+1} to them.
 """
 
 from typing import Any
@@ -52,9 +52,9 @@ GRAIN = 2.0**40  # heights are whole multiples of 1 / GRAIN, so that sums are ex
 def forward_pass_l1(readings: Any, lam: float, low: Any, high: Any) -> float:
     """Carry the message over readings (R,), with fidelity |y_i - x_i|; return the last value of the minimiser.
 
-    The derivative is a rising staircase, to which a reading adds a step of height 2; the steps left of it rise by 2 lam
-    in all, so that one is inserted in O(min(R, lam)). `lam` is rounded to 1 / GRAIN. Overwritten are the bounds (R,) of
-    x_i = clip(x_{i+1}, low, high), the middle where the minimum allows an interval.
+    The derivative is a rising staircase, to which a reading adds a step of height 2; clipped, it rises by 2 lam in all,
+    so that a step is inserted in O(min(R, lam)). `lam` is rounded to 1 / GRAIN. The bounds `low` and `high` (R,) of
+    x_i = clip(x_{i+1}, low, high) are overwritten; where the minimum allows an interval, they are its middle.
     """
     lam = max(np.rint(lam * GRAIN), 1.0) / GRAIN
     positions, heights = np.empty(len(readings)), np.empty(len(readings))
@@ -110,7 +110,7 @@ POSITION, SUM, LAMS, COUNT = range(4)
 def _cut_l2(step: int, reading: float, lams: float, lam: float, knots: Any, k: int, stop: int) -> int:
     """Cut the derivative, with a reading added, at -lam (step 1, inwards from knot k) or at lam (-1); return the knot.
 
-    Before the reading it differed from the cut by `lams` lam. Knots up to `stop` are pooled if they are beyond the cut.
+    Without the reading, it differs from the cut by `lams` lam. Knots beyond the cut, up to `stop`, are pooled.
     """
     total, count = step * reading, float(step)
     position = (total + lams * lam) / count

@@ -14,7 +14,8 @@ from padforge.common.validation import InputError, check_int
 from padforge.sense.arrays import MAX_FIBRES, Array, Indices, check_stream, press_bounds
 from padforge.sense.signals.detector_kernels import FURTHER, Change, State, detect, initial_state
 
-P_REJECT, P_ACCEPT = 1e-3, 1e-9  # probabilities that white noise makes a block leave the levels, and makes a change
+P_REJECT = 1e-3  # probability that white noise makes a block leave the levels
+P_ACCEPT = 1e-9  # probability that white noise passes for a change
 TOUCH_DELAY_S, RELEASE_DELAY_S = 0.16, 0.08  # from a command to its first effect: means of the published recording
 MAX_LEAD = 2  # readings before its command at which a press may show: commands are noted a little late
 
@@ -121,7 +122,7 @@ def estimate_commands(presses: Presses, times_s: Array) -> tuple[Indices, Indice
 
 
 def first_readings(readings: Array, times_s: Array, down_command: Indices, up_command: Indices) -> Indices:
-    """Return the first readings (Q,) that show commanded presses; where none is detected, one that usually does."""
+    """Return the first readings (Q,) that show commanded presses; for one that is not detected, the usual reading."""
     touched = detect_presses(readings, times_s).touched
     usual = np.searchsorted(times_s, times_s[down_command] + TOUCH_DELAY_S)
     if len(touched):
@@ -131,7 +132,7 @@ def first_readings(readings: Array, times_s: Array, down_command: Indices, up_co
 
 
 def _nearest(touched: Indices, down_command: Indices) -> Indices:
-    """Return the index (Q,) of the first detected press that may be each commanded one."""
+    """Return for each commanded press the index (Q,) of the first detected one that may be it."""
     return np.minimum(np.searchsorted(touched, down_command - MAX_LEAD), len(touched) - 1)
 
 

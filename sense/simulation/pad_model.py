@@ -33,7 +33,6 @@ DRIFT_S = 600.0  # correlation time of the drift
 SURFACE_MM, SURFACE_WAVES = 10.0, 8  # length over which the height of a pad changes, and number of waves in it
 MAX_LAG = 32  # number of earlier presses whose residues count
 RETURNED = 0.4  # fraction of a removed residue that returns when the press ends
-MIN_DEPTH_MM = 1e-3  # minimum depth for which a contact is solved
 REST_V = (1.7, 2.1)  # range of the voltages at rest; the divider is matched to half the supply only roughly
 
 
@@ -64,7 +63,7 @@ def resistance_changes(
     """
     changes = np.zeros((4, len(positions_mm), len(pad.paths.knots)))
     if contact.model == "layer":
-        deepest = Contact(**contact.model_dump() | {"depth_mm": float(depths_mm.max(initial=MIN_DEPTH_MM))})
+        deepest = Contact(**contact.model_dump() | {"depth_mm": float(depths_mm.max(initial=1e-3))})
         for rows, weight, pressed in depth_terms(depths_mm, deepest):
             stretch = pad.stretch(positions_mm[rows], press_contacts(pressed, rig))
             changes[:, rows] += GAUGE_FACTOR * weight[:, None] * np.stack(stretch)

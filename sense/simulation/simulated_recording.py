@@ -39,10 +39,8 @@ from padforge.sense.simulation.pad_model import DRIFT_S, FULL_DEPTH_MM, Cycle, r
 
 MIN_SINGULAR = 0.3  # relative singular value; both sides of a pad that is turned by over 28 degrees count as equal
 JITTER = 0.1  # standard deviation of the interval between readings over its mean
-MIN_SENSITIVITY = 1e-3  # lower limit of the sensitivity of a piece of a fibre, before its logarithm is taken
 MIN_PRESSES = 100  # minimum number of presses for a measurement of noise, drift and hysteresis
 REST_S = 0.7  # time before a press in which fibres rest
-DECAY_S = np.geomspace(1.0, 100.0, 41)  # time constants of hysteresis that are tried
 
 
 @dataclass(frozen=True)
@@ -171,7 +169,7 @@ def measured_rig(twin: Twin, rig: RigSettings) -> RigSettings:
 
 def _log_sensitivities(part: Twin | TwinPart) -> Array | None:
     """Return the logarithms of the sensitivities along all fibres, each of zero mean; None if all are uniform."""
-    rows = [np.log(np.maximum(row, MIN_SENSITIVITY)) for row in part.sensitivity or () if row is not None]
+    rows = [np.log(np.maximum(row, 1e-3)) for row in part.sensitivity or () if row is not None]
     return np.concatenate([row - row.mean() for row in rows]) if rows else None
 
 
@@ -283,7 +281,7 @@ def _fit_variogram(baseline: Array, interval_s: float) -> tuple[float, float]:
     lags = np.unique(np.geomspace(1, len(baseline) // 2, 24).astype(int))
     variogram = np.array([((baseline[lag:] - baseline[:-lag]) ** 2).mean() / 2 for lag in lags])
     fits: list[tuple[float, float, float]] = []
-    for decay_s in DECAY_S.tolist():
+    for decay_s in np.geomspace(1.0, 100.0, 41).tolist():  # time constants of hysteresis
         models = 1 - np.exp(-lags[:, None] * interval_s / np.array([decay_s, DRIFT_S]))
         (_, drift), error = nnls(models / np.maximum(variogram, MIN_SCALE_V**2)[:, None], np.ones(len(lags)))
         fits.append((float(error), decay_s, float(np.sqrt(drift))))

@@ -43,7 +43,7 @@ MEMBERS = 3  # networks whose errors are averaged: they differ by their first we
 HIDDEN, EPOCHS = 50, 200
 RIG = RigSettings(presses=1000)  # that records pads
 SIDE = 32  # presses along a side of the published serpentine on which idle shares are simulated
-SETTLED = 10  # readings from a command of the probe to the level, as published: 10, 30 and 50 of a cycle of 40
+SETTLED = 10  # readings from a command to the level, as published: 10, 30 and 50 with commands at 20 and 40
 EXCERPT_PRESSES = 5  # in the figure's excerpt of readings
 MAX_LEVELS = 400  # presses by which the figure shows the drift of a whole recording
 COLUMNS = 2  # recordings side by side whose errors are drawn
@@ -239,7 +239,7 @@ def _describe(settings: Mapping[str, Any], idle: Rows) -> list[str]:
         f"Networks of {settings['hidden']} neurons localize presses from readings after {len(settings['filters'])} "
         f"filters, with {len(settings['compensations'])} kinds of drift compensation. Errors are means of "
         f"{settings['members']} networks, on presses never trained on: {share:g} % drawn at random, and the last "
-        f"{share:g} % of the recording, by which the drift has gone on."
+        f"{share:g} % of the recording, after further drift."
     ]
     if model := [row for row in idle if row["kind"] == "contact model"]:
         shares = _listed([f"{row['idle_percent']:.1f} % ({row['label']})" for row in model])

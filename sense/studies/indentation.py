@@ -181,8 +181,8 @@ def _describe_force(contact: Contact, settings: Mapping[str, Any]) -> list[str]:
         f"{settings['test']} others."
     )
     columns = (
-        "Errors are those of position, depth and force; of the position too where the depth is an input, and where all "
-        f"presses are {MIDDLE * contact.depth_mm:g} mm deep; and those of guessing the middle depth."
+        "Errors are those of position, depth and force; of the position also if the depth is an input, and if all "
+        f"presses are {MIDDLE * contact.depth_mm:g} mm deep; and of depth and force by guessing the middle depth."
     )
     caution = (
         f"Depth and force are related by the mechanics of a linear elastic layer of reduced modulus "
@@ -227,7 +227,7 @@ def _draw_force(document: Mapping[str, Any]) -> Figure:
 def shape_study(
     pads: Mapping[str, Morphology], *, contact: Contact | None = None, sizes: Sizes = SHAPE_SIZES, seed: int = 0
 ) -> Study:
-    """Classify the object: tools of unknown depth, and footprints of unknown size, the position unknown too.
+    """Classify objects at unknown positions: tools at unknown depths, and footprints of unknown sizes.
 
     Tools have the radius and depths of the contact, `Contact()` if None, and press its layer. Footprints are polygons
     of one orientation under the published contact.
@@ -348,8 +348,8 @@ def _describe_shape(contact: Contact, settings: Mapping[str, Any]) -> list[str]:
         f"is taken, were trained on {settings['presses']} presses of a set and tested on {settings['test']} others."
     )
     columns = (
-        "The majority is what always naming the most frequent shape gives. Errors of the position are also those of "
-        "networks with the shape as an input."
+        "The majority is the accuracy of always naming the most frequent shape. Errors of the position are given for "
+        "networks without and with the shape as an input."
     )
     return [model, columns]
 

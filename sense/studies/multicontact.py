@@ -41,7 +41,7 @@ MAX_CONTACTS = 3  # at once, where they are counted
 NOISE_COUNTS = 1.0
 """Noise of the readings by which contacts are counted, in counts of a 12-bit converter; positions are without it."""
 BINS = 16  # groups of equally many pairs, by the distance of the two contacts
-COUNTING = "number of contacts"  # in the column of the method, in rows that are not of pairs
+COUNTING = "number of contacts"  # method of the rows in which contacts are counted
 
 
 class PairTargets(NamedTuple):
@@ -214,7 +214,7 @@ def _describe(settings: Mapping[str, Any], responses: str) -> str:
         "others. An error is the mean distance of both contacts, in the order of the two that makes it less. Fixed "
         "labels are the published method: contacts are learnt in the order they were drawn in. Sorted: by x. Free: in "
         "the order that the network comes nearest to. Moments: the midpoint and the products of half the difference. "
-        "The midpoint error is that of the midpoint of the two for both; the resolution is the distance from which on "
+        "The midpoint error is that of predicting their midpoint for both, the resolution the distance from which on "
         f"the error is less than a quarter of it. Of up to {settings['max_contacts']} contacts, the number is read "
         f"with noise of {settings['noise_counts']:g} of {ADC_STEPS} counts; the majority is the share of the most "
         "frequent one."

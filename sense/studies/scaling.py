@@ -27,8 +27,8 @@ from padforge.sense.arrays import Array
 from padforge.sense.studies.press_model import PUBLISHED_PRESSES, PressModel
 from padforge.sense.studies.study import Study, StudyResult, Task, describe_pads, draw_error_map, label_axes
 
-TILES, MAX_GRID = (1, 2, 4, 8, 16, 32), 256
-"""Tiles along a side, which are 4 to 128 fibres of the published pads, and most fibres of a family."""
+TILES = (1, 2, 4, 8, 16, 32)  # tiles along a side, which are 4 to 128 fibres of the published pads
+MAX_GRID = 256  # maximum number of fibres of a family
 PUBLISHED, SPREAD, SHARED = "published", "spread", "shared"
 METHODS = (PUBLISHED, SPREAD, SHARED)
 HIDDEN = 70
@@ -59,7 +59,7 @@ def scaling_study(
     smallest = math.lcm(*(pad.grid for pad in pads.values()))
     grids = grids or [grid for tiles in TILES if (grid := tiles * smallest) <= MAX_GRID]
     if not grids:
-        raise InputError(f"pads tile surfaces from {smallest} fibres on alone, allowed are {MAX_GRID}")
+        raise InputError(f"the smallest surface that all pads tile has a grid of {smallest}, allowed is {MAX_GRID}")
     for label, pad in pads.items():
         for grid in grids:
             if grid % pad.grid:

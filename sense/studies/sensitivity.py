@@ -60,7 +60,7 @@ _OBJECTS = {
 
 
 def sensitivity_study(pads: Mapping[str, Morphology], *, contact: Contact | None = None, seed: int = 0) -> Study:
-    """Compare errors by object that presses, of networks trained with that object or with another one.
+    """Compare errors of networks for the object that they were trained with, and for other objects.
 
     The objects differ in tool radius and depth about those of the contact, if it is a layer, as `Contact()` is; in
     place of a shape they are the published ones.
@@ -109,7 +109,7 @@ def _name(contact: Contact) -> str:
 def _evaluate(pad: Morphology, stated: Contact, trained: Contact, objects: list[Contact], seed: int) -> State:
     """Compute mean errors (MEMBERS, objects), grid units, of networks trained with one object.
 
-    The noise of a layer's responses is the same whatever presses.
+    The noise floor of a layer's responses does not depend on the object.
     """
     rng = np.random.default_rng([5, seed])
     rngs, noise_rng = rng.spawn(MEMBERS), rng.spawn(1)[0]

@@ -56,7 +56,12 @@ def strokes_study(
 def _follow_strokes(
     pad: Morphology, contact: Contact, rig: RigSettings, n_strokes: int, options: LocalizerSettings
 ) -> State:
-    """Return the errors (speeds, N, T), mm, at each reading of strokes, whether they are within r90, and of the end."""
+    """Follow strokes by a localizer; errors are in mm.
+
+    Returns:
+        "errors" (speeds, readings, strokes) at each reading; "within", whether they are within r90; and "lifted"
+        (speeds, strokes), the errors of the last positions by all readings up to the release and after it.
+    """
     recording = simulate(pad, rig, contact)
     model = fit_recording(recording, np.arange(rig.presses), options, np.random.default_rng(rig.seed))
     errors, within, final_errors = [], [], []
@@ -109,7 +114,7 @@ def _conclude(labels: list[str], rig: RigSettings, states: list[State]) -> Study
         f"Strokes in straight lines, as long as a press of {rig.readings_per_press // 2} readings, followed at every "
         "reading by a localizer that was trained on single presses of the same simulated pad. Errors are means over "
         "readings after the first fifth of a stroke; ratio is to those of a finger at rest; lifted_mm is the error of "
-        "where it was at last, once it has lifted.",
+        "its last position, once it has lifted.",
     ]
     return StudyResult(rows, text, {"curves": curves, "rate_hz": rig.rate_hz, "speeds_mm_s": list(SPEEDS_MM_S)})
 

@@ -29,7 +29,9 @@ from padforge.sense.simulation.pad_model import ADC_STEPS
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-NAMED = re.compile(r"(square|(optimised)|(random|optimised|genetic)-([1-9]\d?))(?:@([1-9]\d{0,2}))?")
+NAMED = re.compile(
+    r"(?:(?P<plain>square|optimised)|(?P<kind>random|optimised|genetic)-(?P<knots>[1-9]\d?))(?:@(?P<grid>[1-9]\d{0,2}))?"
+)
 """Pads without a file: straight fibres, random ones of N knots, and those of a search; their grid after an @."""
 
 
@@ -190,20 +192,20 @@ def _load_pad(name: str, seed: int, layout: Layout) -> tuple[str, Morphology]:
             f"{name}: no such file, and none of square, optimised, random-N, optimised-N, genetic-N (N from 1 to 99 "
             "knots; 64 where they are searched for)"
         )
-    kind = named[2] or named[3]
-    if named[5]:
-        layout = Layout.create(int(named[5]), layout.pitch_mm)
-    if kind is None:
+    kind, knots = named["plain"] or named["kind"], named["knots"]
+    if named["grid"]:
+        layout = Layout.create(int(named["grid"]), layout.pitch_mm)
+    if kind == "square":
         return name, Morphology.straight(layout)
     if kind == "random":
-        return name, Morphology.random(layout, int(named[4]), seed)
+        return name, Morphology.random(layout, int(knots), seed)
     from padforge.design.optimize.search import search
     from padforge.design.settings import PUBLISHED_CONTACT, PUBLISHED_SEARCH, SearchSettings
 
     # under the published contact: by descent from a single start, or genetic as published
     pad = PUBLISHED_PAD.for_layout(layout)
     method = "genetic" if kind == "genetic" else "descent"
-    overrides = {"starts": 1, "seed": seed, "method": method} | ({"knots": int(named[4])} if named[4] else {})
+    overrides = {"starts": 1, "seed": seed, "method": method} | ({"knots": int(knots)} if knots else {})
     settings = validate(SearchSettings, PUBLISHED_SEARCH.model_dump() | overrides, f"{method} search")
     return name, search(pad, PUBLISHED_CONTACT, settings).morphology
 

@@ -24,7 +24,6 @@ from padforge.sense.twin.responses import Responses
 
 EPSILON = 1e-6  # squared distance below which the direction to the press is undefined, squared grid units
 N_ELEMENTS, N_COARSE = 160, 48  # elements of a fibre, and of one where wirings are compared
-FLAT_TOLERANCE = 1e-3  # tolerance of the polyline that elements lie on, grid units
 N_SPLINES = 12  # splines of a profile
 SPLINE_STEP = 0.48
 """Distance of these splines, as a share of the standard deviation of the Gaussian profile that fits best. Strains of a
@@ -86,7 +85,7 @@ def channel_response(
     signal, by_profile, by_position = np.zeros(presses), np.zeros((presses, 2, splines)), np.zeros((presses, 2))
     by_offset = np.zeros((presses, 2, lateral_offset.shape[1]))
     by_sensitivity = np.zeros((presses, log_sensitivity.shape[1]))
-    (offset, offset_first, offset_basis), near = evaluate_along_fibre(lateral_offset, elements), np.empty((2, 4))
+    (offset, offset_first, offset_basis), spline = evaluate_along_fibre(lateral_offset, elements), np.empty((2, 4))
     log_gain, gain_first, gain_basis = evaluate_along_fibre(log_sensitivity, elements)
     for i in range(elements):
         at_x, at_y = path[i, 0] + offset[0, 0, i], path[i, 1] + offset[0, 1, i]
@@ -104,16 +103,16 @@ def channel_response(
             along = x * tx + y * ty
             cos_2phi = 2 * along * along / (square + EPSILON) - 1
             piece = int(distance / step)
-            spline_weights(distance / step - piece, near)
+            spline_weights(distance / step - piece, spline)
             weight, slope, angular = 0.0, 0.0, 0.0
             for j in range(4):
                 k = abs(piece + j - 1)  # mirrored at 0
                 if k < splines:
-                    weight += near[0, j] * (profile[0, k] + cos_2phi * profile[1, k])
-                    slope += near[1, j] * (profile[0, k] + cos_2phi * profile[1, k])
-                    angular += near[0, j] * profile[1, k]
-                    by_profile[q, 0, k] += weighted_length * near[0, j]
-                    by_profile[q, 1, k] += weighted_length * near[0, j] * cos_2phi
+                    weight += spline[0, j] * (profile[0, k] + cos_2phi * profile[1, k])
+                    slope += spline[1, j] * (profile[0, k] + cos_2phi * profile[1, k])
+                    angular += spline[0, j] * profile[1, k]
+                    by_profile[q, 0, k] += weighted_length * spline[0, j]
+                    by_profile[q, 1, k] += weighted_length * spline[0, j] * cos_2phi
             signal[q] += weighted_length * weight
             radial = weighted_length * slope / (step * max(distance, 1e-9))
             twist = weighted_length * angular * 4 * along / (square + EPSILON)
@@ -145,7 +144,7 @@ class PadPlan:
     def from_morphology(cls, pad: Morphology, elements: int = N_ELEMENTS) -> "PadPlan":
         """Cut the fibres of a morphology into elements."""
         ends = []
-        for line in flatten(pad, FLAT_TOLERANCE):
+        for line in flatten(pad, 1e-3):  # grid units
             arc = np.append(0.0, np.hypot(*np.diff(line, axis=0).T).cumsum())
             along = np.linspace(0, arc[-1], elements + 1)
             ends.append(np.column_stack([np.interp(along, arc, line[:, axis]) for axis in range(2)]))
@@ -304,6 +303,7 @@ class AsBuiltPad:
         # 3. the transform rotates about the middle of the pad, step 1 about its corner
         values, middle = self.values.copy(), np.array(self.plan.layout.extent) / 2
         values[0] += turn
+        # middle @ rotation - middle
         centring = middle[0] * (rotation.sum(axis=0) - 1) + (middle[1] - middle[0]) * (rotation[1] - [0, 1])
         values[1:3] = values[1:3] @ rotation + self.plan.layout.unit_mm * (centring + shift)
         rows = values[N_SHARED:].reshape(-1, N_CHANNEL)

@@ -26,7 +26,7 @@ from padforge.sense.twin.responses import Responses
 PRIOR_STD = np.append(TRANSFORM_STD, [0.3, 0.5])
 """Prior standard deviations: those of the transform, of log `scale` (from the stated one) and of the share."""
 STEPS = np.array([0.01, 0.3, 0.3, 0.01, 0.02, 0.02])
-"""Steps of the finite differences: with shorter ones the edge of the strains, which elements are long for, is noise."""
+"""Steps of the finite differences: shorter ones give noise, as elements are long for the edge of the strains."""
 BOUNDS = (math.log(0.1), 0.0), (math.log(10.0), 1.0)  # least and largest log `scale` and share, as in `[contact]`
 TOLERANCE = 1e-4  # relative change of the objective at which a fit has converged
 MAX_EVALUATIONS = 20
@@ -49,8 +49,9 @@ def fit_contact(
 ) -> ContactFit:
     """Fit a contact to a pad whose fibres stay where they are, and whose profiles and gains do not count.
 
-    Of a contact that is no layer but a profile, `scale` alone is fitted. `noise_v` (C,) is the standard deviation of
-    the residuals, inflated where neighbouring ones are correlated; `explained` is measured on the held-out responses.
+    The transform is fitted too. Of a contact that is no layer but a profile, `scale` is fitted and no shares. `noise_v`
+    (C,) is the standard deviation of the residuals, inflated where neighbouring ones are correlated; `explained` is
+    measured on the held-out responses.
     """
     total, signals = contact.squeeze + contact.stretch, _Signals(pad, contact)
     start = np.array([*pad.values[:4], math.log(contact.scale), contact.stretch / total])
@@ -62,7 +63,8 @@ def fit_contact(
         return np.append(x, start[len(x) :])
 
     def residuals(x: Array) -> Array:
-        gains, rests_v = _fit_gains(predictors := signals(complete(x), training.positions_mm), training)
+        predictors = signals(complete(x), training.positions_mm)
+        gains, rests_v = _fit_gains(predictors, training)
         misfit = np.where(training.valid, (training.volts - rests_v - gains * predictors) / noise_v, 0.0)
         return np.append(misfit, ((complete(x) - mean) / PRIOR_STD)[free])
 
@@ -90,7 +92,7 @@ def fit_contact(
         squeeze=total * (1 - share),
         stretch=total * share,
         scale_std=float(scale * std[4]),
-        shares_std=float(total * std[5:].sum()),
+        shares_std=float(total * std[5:].sum()),  # 0 of a profile
         explained=float(held_out.explained_variance(predicted).mean()),
     )
 

@@ -17,20 +17,22 @@ shrunk until it fits."""
 MAX_OFFSET_MM, MAX_OFFSET = 3.0, 0.5
 """Largest rms lateral offset of a fibre, in mm and in grid units, whichever is less. Fibres are laid to a millimetre or
 two, and beyond half a pitch the plan of another fibre is nearer."""
-SAME_PLAN_MM, LAID_MM = 1.0, 1.2
-"""Two wirings are the same if all fibres lie within the second rms lateral offset of their plan, as laid fibres do, and
-the planned fibres within the first rms distance of each other. Straight fibres have one plan for the pad as it is and
-turned over, which no press tells apart. But fibres that are not straight fit a straight plan eight ways alike, too."""
+SAME_PLAN_MM = 1.0
+"""Rms distance of the planned paths up to which two wirings count as one: no press tells a pad of straight fibres from
+the same pad turned over."""
+LAID_MM = 1.2
+"""Rms lateral offset from the plan, as fibres are laid, up to which this holds: fibres that are in truth not straight
+fit the plan of straight ones in eight ways alike."""
 
 
 def find_doubts(result: Identification) -> list[str]:
     """Return what makes an identification doubtful, each in a line; channels and fibres count from 1."""
-    unfit = list(_channels_that_do_not_fit(result))
+    unfit = list(_channel_doubts(result))
     lines = [line for _, line in unfit]
     channels = {channel for channel, _ in unfit}
     if 2 * len(channels) >= len(result.live):
         lines.insert(0, f"{len(channels)} of {len(result.live)} channels do not fit: is it the recording of this pad?")
-    return [*_pad_that_does_not_fit(result), *lines, *_other_wirings(result)]
+    return [*_pad_doubts(result), *lines, *_wiring_doubts(result)]
 
 
 def offset_mm(offset: Array, within: Mask) -> float:
@@ -38,7 +40,7 @@ def offset_mm(offset: Array, within: Mask) -> float:
     return float(np.sqrt((offset[within] ** 2).mean())) if within.any() else 0.0
 
 
-def _pad_that_does_not_fit(result: Identification) -> Iterator[str]:
+def _pad_doubts(result: Identification) -> Iterator[str]:
     explained, smooth = (float(shares.mean()) for shares in (result.explained, result.explained_smooth))
     if explained < smooth - MAX_UNEXPLAINED_MEAN:
         yield (
@@ -54,7 +56,7 @@ def _pad_that_does_not_fit(result: Identification) -> Iterator[str]:
         )
 
 
-def _channels_that_do_not_fit(result: Identification) -> Iterator[tuple[int, str]]:
+def _channel_doubts(result: Identification) -> Iterator[tuple[int, str]]:
     allowed_mm = min(MAX_OFFSET_MM, MAX_OFFSET * result.pad.unit_mm)
     explained = zip(result.explained.tolist(), result.explained_smooth.tolist(), strict=True)
     for row, ((by_fibre, smooth), (offset, _, within)) in enumerate(
@@ -75,7 +77,7 @@ def _channels_that_do_not_fit(result: Identification) -> Iterator[tuple[int, str
             )
 
 
-def _other_wirings(result: Identification) -> Iterator[str]:
+def _wiring_doubts(result: Identification) -> Iterator[str]:
     built = result.fit.pad
     planned_mm = planned_paths_mm(built.plan, built.transform, built.fibres)
 

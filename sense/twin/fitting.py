@@ -209,8 +209,8 @@ class _Objective:
     def _curve_std(self, covariance: Array, part: slice, precision: Array) -> float:
         """Return the standard deviation of the curves of all channels, with their uncertainty."""
         curves = self.pad.channel_values[:, part]
-        blocks = [covariance[np.ix_(rows, rows)] for c in range(len(curves)) for rows in [channel_indices(c)[part]]]
-        uncertainty = sum(np.trace(precision @ block) for block in blocks)
+        indices = [channel_indices(c)[part] for c in range(len(curves))]
+        uncertainty = sum(np.trace(precision @ covariance[np.ix_(rows, rows)]) for rows in indices)
         return float(np.sqrt((np.einsum("cj,jk,ck->", curves, precision, curves) + uncertainty) / curves.size))
 
 
@@ -218,8 +218,8 @@ def estimate_scatter(pad: AsBuiltPad, responses: Responses, noise_v: Array) -> T
     """Estimate the part of the scatter of responses that grows with them.
 
     Half the squared difference of the residuals of two neighbouring presses is their variance, since a smooth function
-    of the position cancels: floor^2 + share^2 x^2 for responses x, a straight line over x^2. If channels have a part of
-    it in common, products of their differences are common share^2 x_c x_c'. Too few presses give constant noise.
+    of the position cancels. It is floor^2 + share^2 x^2 for responses x, a straight line over x^2. Half the product of
+    such differences of two channels is common share^2 x_c x_c'. With too few presses, the scatter is a constant noise.
     `noise_v` (C,) is the standard deviation of each channel's total scatter.
     """
     valid = np.flatnonzero(responses.valid.all(axis=1))
@@ -231,23 +231,23 @@ def estimate_scatter(pad: AsBuiltPad, responses: Responses, noise_v: Array) -> T
     difference = (residual[first] - residual[second]) / noise_v
     response = (responses.volts[first] + responses.volts[second]) / 2 / noise_v
     variance = difference**2 / 2
-    floor, share = 1.0, 0.0
+    floor_var, share_var = 1.0, 0.0
     for _ in range(10):  # reweighted: the variance of one pair scatters by about itself
-        weight = 1 / (floor + share * response.ravel() ** 2).clip(1e-3)
+        weight = 1 / (floor_var + share_var * response.ravel() ** 2).clip(1e-3)
         design_matrix = np.column_stack([np.ones(response.size), response.ravel() ** 2])
-        (floor, share), _ = nnls(weight[:, None] * design_matrix, weight * variance.ravel())
+        (floor_var, share_var), _ = nnls(weight[:, None] * design_matrix, weight * variance.ravel())
     # scale the sum to the variance of the noise, from which it differs if variances do not grow with squares
-    total = floor + share * float(np.mean(response**2))
-    floor, share = (part / total if total > 0 else part for part in (floor, share))
-    above = np.triu_indices(response.shape[1], 1)
-    scale = 1 / (floor + share * response**2).clip(1e-3)
+    total = floor_var + share_var * float(np.mean(response**2))
+    floor_var, share_var = (part / total if total > 0 else part for part in (floor_var, share_var))
+    first, second = np.triu_indices(response.shape[1], 1)  # pairs of channels
+    scale = 1 / (floor_var + share_var * response**2).clip(1e-3)
     response_products, difference_products = (
-        np.einsum("qc,qd->qcd", values * scale**0.5, values * scale**0.5)[:, above[0], above[1]]
+        np.einsum("qc,qd->qcd", values * scale**0.5, values * scale**0.5)[:, first, second]
         for values in (response, difference / np.sqrt(2))
     )
-    squared = share * (response_products**2).sum()
+    squared = share_var * (response_products**2).sum()
     common = float((response_products * difference_products).sum() / squared) if squared > 0 else 0.0
-    share, floor = (float(np.sqrt(min(part, 1.0))) for part in (share, floor))
+    share, floor = (float(np.sqrt(min(part, 1.0))) for part in (share_var, floor_var))
     return TwinScatter(share, float(np.clip(common, 0, 0.99)), floor)
 
 
@@ -261,5 +261,5 @@ def gain_wander(pad: AsBuiltPad, responses: Responses) -> float:
     y, x = (values[: blocks * WANDER_PRESSES].reshape(blocks, WANDER_PRESSES, -1) for values in (volts, expected))
     power = np.maximum((x**2).sum(axis=1), MIN_SCALE_V**2)
     gain = (x * y).sum(axis=1) / power
-    chance = ((y - gain[:, None] * x) ** 2 * x**2).sum(axis=1) / power**2
-    return float(np.clip(np.mean(gain.var(axis=0, ddof=1) - chance.mean(axis=0)), 0, 1) ** 0.5)
+    chance_var = ((y - gain[:, None] * x) ** 2 * x**2).sum(axis=1) / power**2
+    return float(np.clip(np.mean(gain.var(axis=0, ddof=1) - chance_var.mean(axis=0)), 0, 1) ** 0.5)

@@ -31,7 +31,7 @@ from padforge.sense.twin.responses import (
 )
 from padforge.sense.twin.wiring import Wiring, as_stated, find_wirings, images
 
-PROFILE_POINTS, MIN_WEIGHT = 13, 0.01  # points of the sensitivity profile of a twin, and the least weight that counts
+PROFILE_POINTS = 13  # points of the sensitivity profile of a twin
 MIN_PRESSES = 60
 MIN_SIDE = 0.5
 """Least width and height of what was pressed, as a share of the rectangle half a pitch beyond the outermost fibres."""
@@ -41,10 +41,10 @@ N_CANDIDATES, N_COMPARED = 4, 250
 """Wirings that are fitted beside the images of the best, and presses by which they are compared: residuals are
 correlated over about half a grid unit, so that more presses would count the same evidence twice."""
 LOG_ODDS_IN_ORDER, LOG_ODDS_POSE = 15.0, 4.0
-"""Prior log odds of channels in the order of the plan, and of a pad that lay as planned. A belief of one half in the
-stated one of 6! wirings and of 8 poses has log odds of 7 and 2; they are doubled, as the evidence of presses, whose
-residuals are correlated, counts double. Their sum is less than MIN_LOG_ODDS, so that a wiring that fits as well as the
-stated one is an alternative."""
+"""Prior log odds of channels in the order of the plan, and of a pad that lay as planned. With a probability of 1/2,
+the stated one of 6! wirings and of 8 poses has log odds of 7 and 2 over any other. They are doubled, as the evidence of
+presses counts double, since residuals are correlated. Their sum is less than MIN_LOG_ODDS, so that a wiring that fits
+as well as the stated one is an alternative."""
 N_CONTACT = 400  # presses that a contact is fitted to: the residuals of more are correlated
 FIRST_PRIORS = Priors(lateral_offset_mm=1.0, log_sensitivity=0.2)
 MIN_LOG_BAYES_FACTOR = 10.0  # from which on a channel is live
@@ -61,9 +61,9 @@ class MeasuredContact:
     """Fits of the stated contact to the presses on a pad."""
 
     stated: Contact  # a layer, pressed as deep as the recording says if it does
-    as_built: ContactFit  # of the fibres as built, whose paths another profile was fitted with
-    on_plan: ContactFit  # of fibres that lie as planned
-    gaussian_on_plan: ContactFit  # the same of a Gaussian profile, of which only the width is fitted
+    as_built: ContactFit  # to the fibres as built, whose paths were fitted together with another profile
+    on_plan: ContactFit  # to fibres that lie as planned
+    gaussian_on_plan: ContactFit  # to the same, of a Gaussian profile, of which the width is fitted
 
     @property
     def best(self) -> ContactFit:
@@ -117,7 +117,8 @@ class Identification:
         paths_mm: list[Array | None] = [None] * len(self.pad.knots)
         channels = [TwinChannel(c, None, 0.0, float(noise_v), 0.0) for c, noise_v in enumerate(self.noise_v)]
         for row, channel in enumerate(self.live.tolist()):
-            fibre, path = built.fibres[row], built.path(row)[0]
+            fibre, path = built.fibres[row], built.path(row)[0]  # middles of elements
+            # the ends of the elements, in the middle between these middles, and extrapolated at both ends of the fibre
             line = [1.5 * path[:1] - 0.5 * path[1:2], (path[1:] + path[:-1]) / 2, 1.5 * path[-1:] - 0.5 * path[-2:-1]]
             paths_mm[fibre] = self.pad.to_mm(np.vstack(line))
             gain_v, explained = float(response.gains_v[channel]), float(self.explained[row])
@@ -151,7 +152,7 @@ class Identification:
             gains_v[channel] = built.channel_values[row, 0] * sensitivity.mean() * fibre_lengths[fibre]
         # the profile, up to where its weights are negligible
         fine = np.linspace(0, built.max_distance, 400)
-        end = fine[np.flatnonzero(np.abs(built.profile(fine)).max(axis=0) > MIN_WEIGHT)[-1]]
+        end = fine[np.flatnonzero(np.abs(built.profile(fine)).max(axis=0) > 0.01)[-1]]
         distance = np.linspace(0, min(end * (1 + 1 / PROFILE_POINTS), built.max_distance), PROFILE_POINTS)
         weights = built.profile(distance)
         weights[:, -1] = 0.0
@@ -247,7 +248,7 @@ def identify_pad(
     held = parts["held"].pad if parts else fit.pad
     noise_v[live] = estimate_noise(held.residuals(pressed), pad.unit_mm)
     scatter = estimate_scatter(held, pressed, noise_v[live])
-    if readings:  # whose wander of gains `share` includes
+    if readings:  # `share` includes the wander of gains, which they state
         scatter = replace(scatter, share=float(np.sqrt(max(scatter.share**2 - readings.gain_wander**2, 0))))
     smooth = np.column_stack([gps[channel].predict(held_out.positions_mm / pad.unit_mm) for channel in live])
     likeliest_on_plan = max((candidate.on_plan for candidate in candidates), key=lambda one: one.log_evidence)
@@ -284,11 +285,12 @@ def _check_positions(positions_mm: Array, pad: Morphology) -> None:
         )
     spans = np.subtract(*np.quantile(positions_mm, [0.95, 0.05], axis=0))
     low, high = np.array(sensed_rectangle(pad.layout))
-    least = MIN_SIDE * pad.unit_mm * (high - low)
-    if (spans < least).any() and (spans < least[::-1]).any():  # the pad may have lain a quarter turned
-        width, height = least.tolist()
-        allowed = f"{width:.0f} mm both ways" if width == height else f"{width:.0f} x {height:.0f} mm"
-        raise InputError(f"the presses lie within {spans[0]:.0f} x {spans[1]:.0f} mm, allowed is what spans {allowed}")
+    min_spans = MIN_SIDE * pad.unit_mm * (high - low)
+    if (spans < min_spans).any() and (spans < min_spans[::-1]).any():  # the pad may have lain a quarter turned
+        width, height = min_spans.tolist()
+        raise InputError(
+            f"the presses lie within {spans[0]:.0f} x {spans[1]:.0f} mm, allowed from {width:.0f} x {height:.0f} mm on"
+        )
 
 
 @dataclass(frozen=True)
@@ -343,7 +345,7 @@ def _fit_candidates(
         wirings.append(as_stated(live, training, plan.layout.unit_mm))
     best = add(wirings)
     best = add(images(replace(best.wiring, transform=best.fit.pad.transform), plan.layout))
-    for key, candidate in candidates.items():  # which of them is best is decided by where they converge
+    for key, candidate in candidates.items():  # which of the best is the most probable shows when they have converged
         if candidate.log_posterior > best.log_posterior - 2 * MIN_LOG_ODDS:
             refit = fit_as_built(candidate.fit.pad, compared, candidate.fit.priors)
             candidates[key] = max(candidate, replace(candidate, fit=refit), key=lambda each: each.log_posterior)
@@ -357,7 +359,7 @@ def _fit_candidates(
 
 
 def _fit_all(pad: AsBuiltPad, training: Responses, on_progress: OnProgress) -> AsBuiltFit:
-    """Fit a pad to all presses, with an angular term if a sixth of them, held back, ask for one."""
+    """Fit a pad to all presses, with an angular term if it improves predictions of a sixth that is held back."""
     rows = np.arange(len(training))
     part, validation = training.select(rows[rows % 6 != 0]), training.select(rows[rows % 6 == 0])
     rough = fit_as_built(pad, part, FIRST_PRIORS, _noise_inflation(pad, part))
@@ -374,7 +376,7 @@ def _fit_all(pad: AsBuiltPad, training: Responses, on_progress: OnProgress) -> A
 
 
 def _noise_inflation(pad: AsBuiltPad, responses: Responses) -> Array:
-    """Return factors (C,) on the noise with which smooth residuals count as N_COMPARED presses would."""
+    """Return factors (C,) on the noise by which smooth residuals weigh no more than those of N_COMPARED presses."""
     residuals = pad.residuals(responses)
     noise_var = estimate_noise(residuals, pad.plan.layout.unit_mm) ** 2
     systematic_var = np.maximum(residuals.variance - noise_var, 0)
@@ -392,7 +394,7 @@ def _measure_contact(
 ) -> MeasuredContact | None:
     """Fit a layer to a pad as built, and for comparison to the pad as planned, as well as a Gaussian.
 
-    The layer is pressed as deep as the recording says, if it does. None of a thinner layer, or another contact.
+    The layer is pressed as deep as the recording says, if it does. Return None if it is thinner, or no layer.
     """
     depths_mm = recording.actual_depths_mm[recording.has_position]
     depths_mm = depths_mm[depths_mm > 0]

@@ -31,13 +31,13 @@ from padforge.sense.simulation.pad_model import (
 )
 from padforge.sense.twin.responses import Responses, near_pairs, normalize
 
-N_ROUNDS = 3  # times that parts and removed residues are estimated in turn
 HELD = 0.9  # share of the held response from which on a window shows it
-DELAYS = 5  # delays over their range that the windows are averaged over
+DELAYS = 5  # delays, evenly over their range, that kernels are averaged over
 BOUNDS = {"memory": (0.0, 1.0), "memory_mm": (1.0, 30.0), "hysteresis_s": (2.0, 100.0)}
 """Bounds of the settings of `[rig]` that are fitted to pairs of presses."""
 SINGLE = 5  # windows of the touch that are one reading long
-N_SEARCHED, MAX_EVALUATIONS = 1500, 40  # presses of that fit, the last ones, and its evaluations in each round
+N_SEARCHED = 1500  # last presses, to which these settings are fitted
+MAX_EVALUATIONS = 40  # of that fit in each round
 
 
 @dataclass(frozen=True)
@@ -63,10 +63,11 @@ def split_presses(recording: Recording, training: Mask, hysteresis_s: float) -> 
         return interpolate_grid(smooth_maps(positions[training], windows[training], valid[training]), positions)
 
     rig = RigSettings(hysteresis_s=hysteresis_s, memory=0.7, memory_mm=9.0)  # where the fit of the memory starts
+    # kernels 0 to 3 are those of the parts, kernel 4 that of the residues that the press removes
     kernels, replaced, parts = part_kernels(cycle, rig), np.zeros(valid.shape), np.empty((4, *valid.shape))
     is_held = kernels[0] >= min(HELD, kernels[0].max())
     pressed = timed[:, :, is_held].mean(axis=2)
-    for _ in range(N_ROUNDS):
+    for _ in range(3):
         windows = timed - replaced[:, :, None] * kernels[4]
         residual = (windows - smoothed(windows))[training]
         for c in range(valid.shape[1]):

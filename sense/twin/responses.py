@@ -63,9 +63,10 @@ def select_one_depth(recording: Recording) -> Recording:
     ordered = np.sort(depths_mm[depths_mm > 0])[::-1]
     if not len(ordered):
         return recording
+    # the presses within the tolerance of each depth are counted; of equally common ones, the deepest responds most
     last = np.searchsorted(-ordered, -(1 - DEPTH_TOLERANCE) * ordered, "right")
     first = np.searchsorted(-ordered, -(1 + DEPTH_TOLERANCE) * ordered, "left")
-    common = ordered[np.argmax(last - first)]  # of equally common depths the largest, which has the largest responses
+    common = ordered[np.argmax(last - first)]
     is_common = np.abs(depths_mm - common) <= DEPTH_TOLERANCE * common
     return replace(recording, presses_mm=np.where(is_common[:, None], recording.presses_mm, np.nan))
 

@@ -24,7 +24,7 @@ SHIFTS = (-0.8, -0.4, 0.0, 0.4, 0.8)  # shifts that are tried along each axis, g
 N_REFINED = 24  # transforms of the grid that are refined
 FIRST_STEPS = np.array([0.06, 0.25, 0.25, 0.03, 0.15])
 """First steps of the refinement: turn (rad), shift (grid units), scale, and logarithm of the profile's width."""
-STEP_COST = 0.002  # cost of a change by one such step in all, in shares of the variance explained
+STEP_COST = 0.002  # cost of a change of all parameters by one such step, in shares of the variance explained
 
 
 @dataclass(frozen=True)
@@ -40,8 +40,8 @@ class Wiring:
 class _Scorer:
     """Finds the best wiring for a plan transform, by correlation with responses under a Gaussian profile.
 
-    A transform is scored by the mean over channels of squared correlations of one sign, each channel assigned to
-    another fibre.
+    A transform is scored by the mean over channels of squared correlations of one sign, each channel assigned to a
+    fibre of its own.
     """
 
     def __init__(self, plan: PadPlan, responses: Responses, rng: np.random.Generator) -> None:
@@ -126,9 +126,10 @@ def images(wiring: Wiring, layout: Layout) -> list[Wiring]:
 
     These are the wirings of the pad mirrored, rotated by 180 degrees, or by 90 if it is square.
     """
-    middles_mm = (layout.levels - np.repeat(layout.extent[::-1], layout.counts) / 2) * layout.unit_mm
-    families = np.repeat([0, 1], layout.counts)
-    middles_mm = middles_mm[:, None] * np.array([[0.0, 1.0], [1.0, 0.0]])[families]
+    # A fibre is mapped to the one whose middle is nearest, in the other family after a quarter turn.
+    families, across = np.repeat([0, 1], layout.counts), np.array([[0.0, 1.0], [1.0, 0.0]])
+    levels_mm = (layout.levels - np.repeat(layout.extent[::-1], layout.counts) / 2) * layout.unit_mm
+    middles_mm = levels_mm[:, None] * across[families]
     out = []
     for mirrored, quarter in product((False, True), range(0, 4, 1 if layout.is_square else 2)):
         symmetry, old = PlanTransform(mirrored, 90.0 * quarter), wiring.transform

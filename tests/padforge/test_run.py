@@ -205,7 +205,7 @@ def test_time_budget_covers_all_stages(tmp_path: Path, brief: None, monkeypatch:
     assert "(out of time: the best so far)" in ended.out
     assert len(given) == 1
     assert 0 < given[0] < 7
-    assert "not trained out" in ended.out
+    assert "not converged" in ended.out
     again = called(*words, "--resume", cwd=tmp_path)
     assert f"earlier run: {ALL}" in again.err, again
 

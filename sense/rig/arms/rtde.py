@@ -18,7 +18,6 @@ VARIABLES = (
     *("timestamp", "actual_TCP_pose", "actual_TCP_speed", "actual_TCP_force"),
     *("robot_mode", "runtime_state", "safety_status_bits"),
 )
-FORCE_SERIES = 5  # first major version of PolyScope whose arms have a force sensor at the tool
 MAX_CLOCK_SKEW = 2e-4  # relative rate difference between the controller's clock and the host's
 POLL_S = 5e-4  # interval of polls for a new state; a state lasts 2 or 8 ms
 
@@ -94,7 +93,7 @@ class RtdeReader:
         """Connect to a controller of a major version of PolyScope; RuntimeError if none is there."""
         import rtde_receive
 
-        self._has_sensor = major >= FORCE_SERIES
+        self._has_sensor = major >= 5  # arms of this and later versions have a force sensor at the tool
         self.rate_hz = 500 if self._has_sensor else 125  # one state per control cycle
         self._receive: Any = rtde_receive.RTDEReceiveInterface(host, float(self.rate_hz), list(VARIABLES))
         self._clock = HostClock()

@@ -43,8 +43,8 @@ def test_positions_cover_the_pressed_area_once_and_no_keep_out():
     possible = possible_positions(pad, PUBLISHED_CONTACT, size, window, 1.0)
     area = np.ptp(np.array(size.sensed), axis=0).prod() - 40**2 / pad.unit_mm**2
     assert np.exp(possible.log_prior).sum() == pytest.approx(area, rel=0.1)
-    assert not (abs(pad.to_mm(possible.places) + 20) < 20).all(axis=1).any()
-    near = ((possible.places > window[0]) & (possible.places < window[1])).all(axis=1)
+    assert not (abs(pad.to_mm(possible.centres) + 20) < 20).all(axis=1).any()
+    near = ((possible.centres > window[0]) & (possible.centres < window[1])).all(axis=1)
     assert np.ptp(possible.log_prior[near]) == pytest.approx(0)
 
 
@@ -52,7 +52,7 @@ def test_huge_pads_are_sampled():
     size = PadSettings(grid=96)
     pad = Morphology.straight(size.layout)
     possible = possible_positions(pad, PUBLISHED_CONTACT, size, evaluation_windows(size.sensed)[0], 1.0)
-    assert len(possible.places) < module.MAX_FAR + 5000
+    assert len(possible.centres) < module.MAX_FAR + 5000
 
 
 @pytest.mark.parametrize("scatter", [Scatter(0.2), Scatter(0.02, 0.3, 0.5)])

@@ -11,7 +11,6 @@ from padforge.design.objectives.criterion import (
     REGRESSION_WEIGHT,
     RIDGE,
     WIDTH,
-    averages,
     confusable,
     criterion,
     evaluation_windows,
@@ -114,12 +113,12 @@ def test_expected_error_gradient_matches_finite_differences(scatter):
     signals = np.concatenate([random_responses(), far], axis=1)
     places = np.concatenate([PLACES, np.full((5, 2), 9.0)])
     kept, shares = np.array([[1.0, 1, 1], [1, 0, 1]]), (0.6, 0.4)
-    of_sets, straight = averages(kept, 2), np.array([[0.31, 0.48]])  # both sets count
+    straight = np.array([[0.31, 0.48]])
 
     def joint(signals):
         errors, by_signals = criterion(signals, places, STEPS, FREE, kept, scatter, np.ones(3))
-        value, by_means = relative_error((of_sets @ errors)[None], straight, shares)
-        return value, np.tensordot(by_means[0] @ of_sets, by_signals, axes=1)
+        value, by_means = relative_error(errors[None], straight, shares)
+        return value, np.tensordot(by_means[0], by_signals, axes=1)
 
     way, steps = np.random.default_rng(6).standard_normal(signals.shape), 1e-3 * np.array([-2, -1, 1, 2])
     slope = np.array([1, -8, 8, -1]) / 12e-3 @ [joint(signals + step * way)[0] for step in steps]

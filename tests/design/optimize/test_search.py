@@ -196,11 +196,11 @@ def test_search_for_twin_hands_back_what_locates_best_and_can_be_built_if_any_ca
 
 
 @pytest.mark.parametrize("fibres", [(1, 0), (1, 1), (2, 2)])
-def test_objective_of_straight_fibres_is_1(fibres):
+def test_comparison_of_straight_fibres_is_1(fibres):
     """Also where fewer fibres can fail than are designed for."""
     pad = PadSettings(horizontals=fibres[0], verticals=fibres[1])
     problem = build_problem(pad, Contact(), SearchSettings(), FREE)
-    assert problem.objective(Morphology.straight(fibres)) == pytest.approx(1)
+    assert problem.comparison(Morphology.straight(fibres)) == pytest.approx(1)
 
 
 def test_pads_are_compared_by_a_geometric_mean_and_weighted_terms():
@@ -212,8 +212,8 @@ def test_pads_are_compared_by_a_geometric_mean_and_weighted_terms():
         for fibres in (curved, Morphology.straight(2))
     )
     log_ratios = np.log(curved_errors / straight_errors) @ [0.75, 0.25]
-    objective = build_problem(pad, Contact(), search, FREE).objective(curved)
-    assert objective == pytest.approx(np.exp(log_ratios.mean()))
+    comparison = build_problem(pad, Contact(), search, FREE).comparison(curved)
+    assert comparison == pytest.approx(np.exp(log_ratios.mean()))
     smooth = build_problem(pad, Contact(), search.model_copy(update={"sharpness": 2.0}), FREE)
     sharpness = ScoredPad(curved, Contact(), search, FREE, pad).terms(["sharpness"])["sharpness"]
-    assert smooth.objective(curved) == pytest.approx(objective + 2 * sharpness)
+    assert smooth.comparison(curved) == pytest.approx(comparison + 2 * sharpness)

@@ -138,7 +138,7 @@ def test_far_presses_are_named_and_another_recording_is_doubted(
     presses_mm[corner] *= -1  # a sign was lost
     presses_mm[3] = np.nan
     (line,) = find_doubts(replace(recording, presses_mm=presses_mm), localization, 0.9, 45)
-    assert line.startswith(f"more than 4 r90 from where the fibres say: press {corner} at (")
+    assert line.startswith(f"stated more than 4 r90 from where they are predicted: press {corner} at (")
     expected = ["2% of 300 presses lie within r90: is it the recording of this pad?"]
     assert find_doubts(recording, localization, 0.02, 300) == expected
     assert find_doubts(recording, localization, 0.02, 10) == []  # of so few it may be chance
