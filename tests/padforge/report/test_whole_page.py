@@ -39,12 +39,11 @@ def test_page_with_a_study_of_lost_fibres_and_presses_of_known_force(pad: Path, 
     start = json.loads((pad / "recording" / "start.json").read_text())
     start["source"]["rig"]["depths_mm"] = [0.5, 5.0]
     written(pad / "recording" / "start.json", start)
-    lines = [
-        {"event": "started", "press": 0, "reading": 1, "x_mm": 0, "y_mm": 0, "depth_mm": 0.5},
-        {"event": "done", "press": 0, "reading": 2, "at_mm": [0, 0, 0.45], "force_n": 1.25},
-        {"event": "started", "press": 1, "reading": 3, "x_mm": 0, "y_mm": 0, "depth_mm": 5.0},
-        {"event": "done", "press": 1, "reading": 4, "at_mm": [0, 0, 4.95]},
-    ]
+    lines = []
+    for press, (depth_mm, force) in enumerate([(0.5, {"force_n": 1.25}), (1.25, {}), (5.0, {})]):
+        begin = {"press": press, "reading": 2 * press + 1, "x_mm": 0, "y_mm": 0, "depth_mm": depth_mm}
+        end = {"press": press, "reading": 2 * press + 2, "at_mm": [0, 0, depth_mm - 0.05]}
+        lines += [{"event": "started"} | begin, {"event": "done"} | end | force]
     (pad / "recording" / "journal.ndjson").write_text("".join(json.dumps(line) + "\n" for line in lines))
     network, retrained = {(): 1.0, (0,): 7.5, (1,): 3.0}, {(): 1.0, (0,): 2.0, (1,): 8.5}
     methods = {"one network": errors(network), "retrained": errors(retrained)}
