@@ -51,9 +51,9 @@ def test_interrupt_ends_whole_comparison(tmp_path, monkeypatch):
     started = []
 
     def interrupted(spec, folder, *arguments, **options):
-        started.append(folder)
+        started.append(options["options"].time_budget)
         return {}, SimpleNamespace(stopped="interrupted")
 
     monkeypatch.setattr(comparison, "run_design", interrupted)
-    result = called("design", "compare", "--vary", "pad.grid=1,2", cwd=tmp_path)
-    assert (result.code, len(started)) == (130, 1)
+    result = called("design", "compare", "--vary", "pad.grid=1,2", "--time-budget", "7", cwd=tmp_path)
+    assert (result.code, started) == (130, [7.0])
