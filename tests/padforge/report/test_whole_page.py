@@ -8,7 +8,7 @@ from typing import Any
 from padforge.common.files import provenance
 from padforge.common.page import PageSection
 from padforge.report import write_report
-from padforge.sense.report.sections import calibration_sections, fibre_loss_sections, recording_sections
+from padforge.sense.report.sections import calibration_sections, recording_sections
 from tests.helpers.golden import page_text
 from tests.padforge.report.conftest import errors, written
 
@@ -86,7 +86,4 @@ def test_sections_on_documents(golden) -> None:
     simulated = {"provenance": {"recording_kind": "simulated"}, "split": "random", "by_moment": []}
     for more in (rig, simulated | {"errors": document["errors"][:1]}):
         sections += calibration_sections(Path("none"), document | more)
-    errors_mm = {(): 1.0, (0,): 2.0, (1,): 4.0, (2,): 3.0, (0, 1): 10.0, (0, 2): 20.0, (1, 2): 5.0}
-    by_subset = [{"failed": list(failed), "mean_mm": error} for failed, error in errors_mm.items()]
-    sections += fibre_loss_sections(Path("none"), {"by_subset": by_subset})
     golden("padforge/sections.txt", section_text(sections))
