@@ -17,6 +17,7 @@ from padforge.common.parallel import Checkpoints
 from padforge.design import Contact, SearchSettings
 from padforge.design.contact_set import judged_contacts
 from padforge.design.report import press_sections
+from padforge.sense.recording.recording import Recording
 from padforge.sense.report.calibration import calibrate_into
 from tests.helpers.door import called, refused
 from tests.helpers.less import compare_little, small_pictures
@@ -105,7 +106,7 @@ def test_resume_repeats_stages_of_changed_settings(
     assert {name for name in ("mould.stl", "recording") if after[name] != before[name]} == others
 
 
-def test_resume_repeats_stages_of_changed_files(folder: Path) -> None:
+def test_resume_repeats_stages_of_changed_files(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def kept() -> dict[str, str]:
         blank = (".png", "orientation.svg", "crossing.svg", "fabrication.json")  # pictures, and digests of them
         return {name: digest for name, digest in digests(folder, *VOLATILE).items() if not name.endswith(blank)}
@@ -116,6 +117,12 @@ def test_resume_repeats_stages_of_changed_files(folder: Path) -> None:
     (folder / "out" / "pad" / "recording" / "readings.bin").write_bytes(b"")
     assert resumed(folder) == "design, contacts"
     assert kept() == before
+    (folder / "pad.toml").write_text(SMALL.replace("presses = 60", 'plan = "plan.csv"'))
+    monkeypatch.setattr("padforge.sense.report.calibration.calibrate_into", breaks)
+    for x_mm in (1, 2):
+        (folder / "plan.csv").write_text("x_mm,y_mm\n" + 60 * f"{x_mm},0\n")
+        assert called("run", "--resume", cwd=folder).code == 130
+        assert set(Recording.open(folder / "out" / "pad" / "recording").presses_mm[:, 0]) == {x_mm}
 
 
 @pytest.mark.slow

@@ -4,16 +4,18 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
 
-from padforge.sense import FaultDetector, Localizer, Recording, calibrate, recalibrate
+from padforge.sense import Localizer, Recording, calibrate, recalibrate
 from padforge.sense.health import health_model, trace_model
 from padforge.sense.health.fault_detector import HEALTH_FILES
 from padforge.sense.localizer import recalibration, single_press, training
 from padforge.sense.localizer.features import PressFeatures
 from padforge.sense.localizer.model import LocalizerModel
+from padforge.sense.report import calibration
 from padforge.sense.settings import LocalizerSettings
 from padforge.sense.twin import identification as twin_identification
 from padforge.sense.twin.identification import Identification
@@ -131,13 +133,16 @@ def test_recalibration_predicts_each_fold_by_models_that_have_not_seen_it(
 
 
 def test_health_learns_nothing_from_presses_held_back(
-    recording: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    recording: Recording, localizer: LocalizerModel, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """By a localizer, beside which health is learnt."""
     monkeypatch.setattr(trace_model, "MAX_STEPS", 2)
     monkeypatch.setattr(health_model, "MIN_PRESSES", 100)
+    calibrated = replace(localizer, test=tuple(range(120, 130))), Mock(to_dict=dict)
+    monkeypatch.setattr(calibration, "calibrate", lambda *_, **__: calibrated)
     known = first_presses(recording, 130)
     for name, each in (("plain", known), ("spoilt", without_sense(known, 120))):
-        FaultDetector().fit(each, np.arange(120, 130)).save(tmp_path / name)
+        calibration.calibrate_into(each, tmp_path / name, LocalizerSettings(), without=("figures",))
     for file in HEALTH_FILES:
         assert (tmp_path / "plain" / file).read_bytes() == (tmp_path / "spoilt" / file).read_bytes()
 

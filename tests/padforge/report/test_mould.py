@@ -60,6 +60,7 @@ def test_view_colours_heights_from_the_lowest_point_of_the_mesh(made: Path, tmp_
     mould.export(tmp_path / "mould.stl")
     document["sha256"] = {"mould.stl": sha256(tmp_path / "mould.stl")}
     document["settings"]["mould"]["floor_mm"] = 1.5
+    document["fibres"] = [fibre | {"depth_mm": 0.9} for fibre in document["fibres"]]  # of a pad that has shrunk
     section, _ = fabrication_sections(tmp_path, document)
     data = json.loads("".join(section.body).partition('id="mould-mesh">')[2].partition("</script>")[0])
     colours = {"horizontal": HORIZONTAL, "vertical": VERTICAL}

@@ -8,7 +8,7 @@ from typing import Any
 from padforge.common.files import provenance
 from padforge.common.page import PageSection
 from padforge.report import write_report
-from padforge.sense.report.sections import calibration_sections, fibre_loss_sections, recording_sections
+from padforge.sense.report.sections import calibration_sections, recording_sections
 from tests.helpers.golden import page_text
 from tests.padforge.report.conftest import errors, written
 
@@ -39,12 +39,11 @@ def test_page_with_a_study_of_lost_fibres_and_presses_of_known_force(pad: Path, 
     start = json.loads((pad / "recording" / "start.json").read_text())
     start["source"]["rig"]["depths_mm"] = [0.5, 5.0]
     written(pad / "recording" / "start.json", start)
-    lines = [
-        {"event": "started", "press": 0, "reading": 1, "x_mm": 0, "y_mm": 0, "depth_mm": 0.5},
-        {"event": "done", "press": 0, "reading": 2, "at_mm": [0, 0, 0.45], "force_n": 1.25},
-        {"event": "started", "press": 1, "reading": 3, "x_mm": 0, "y_mm": 0, "depth_mm": 5.0},
-        {"event": "done", "press": 1, "reading": 4, "at_mm": [0, 0, 4.95]},
-    ]
+    lines = []
+    for press, (depth_mm, force) in enumerate([(0.5, {"force_n": 1.25}), (1.25, {}), (5.0, {})]):
+        begin = {"press": press, "reading": 2 * press + 1, "x_mm": 0, "y_mm": 0, "depth_mm": depth_mm}
+        end = {"press": press, "reading": 2 * press + 2, "at_mm": [0, 0, depth_mm - 0.05]}
+        lines += [{"event": "started"} | begin, {"event": "done"} | end | force]
     (pad / "recording" / "journal.ndjson").write_text("".join(json.dumps(line) + "\n" for line in lines))
     network, retrained = {(): 1.0, (0,): 7.5, (1,): 3.0}, {(): 1.0, (0,): 2.0, (1,): 8.5}
     methods = {"one network": errors(network), "retrained": errors(retrained)}
@@ -87,7 +86,4 @@ def test_sections_on_documents(golden) -> None:
     simulated = {"provenance": {"recording_kind": "simulated"}, "split": "random", "by_moment": []}
     for more in (rig, simulated | {"errors": document["errors"][:1]}):
         sections += calibration_sections(Path("none"), document | more)
-    errors_mm = {(): 1.0, (0,): 2.0, (1,): 4.0, (2,): 3.0, (0, 1): 10.0, (0, 2): 20.0, (1, 2): 5.0}
-    by_subset = [{"failed": list(failed), "mean_mm": error} for failed, error in errors_mm.items()]
-    sections += fibre_loss_sections(Path("none"), {"by_subset": by_subset})
     golden("padforge/sections.txt", section_text(sections))

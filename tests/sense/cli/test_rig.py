@@ -228,6 +228,8 @@ def test_doctor_says_how_a_rig_is(bench: Bench, golden) -> None:
     states_s[60:] += 0.4
     bench.arm.drain, bench.arm.protective_stop, bench.arm.force_n = lambda: states + 0.0, True, None
     states[:, 0] = states_s
+    state = bench.arm.state
+    bench.arm.state = lambda: replace(state(), time_s=bench.arm.time() - 0.14)
     bench(*DOCTOR, title="little is well")
     bench.renew()
     bench.arm.emergency_stop, bench.arm.force_n = True, 3.26

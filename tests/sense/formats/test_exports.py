@@ -68,7 +68,7 @@ def test_bag(three: Recording, localization: Localization, golden: Golden, tmp_p
     states = np.array([[100.0, 100, 200, 300, 0, 0, np.pi / 2, 1, 0, 0], [101.0, 400, 500, 600, 0, 0, 0, 0, 0, 0]])
     states = np.vstack([np.full((1, 10), -5.0), states, np.full((1, 10), NAN)])  # times that no stamp can hold
     recording = replace(three, source={"kind": "test", "rig": {"mirrored": mirrored}})
-    faults = [FibreFault(1, 1, (1,), "stuck", 99)]
+    faults = [FibreFault(1, 0, (1,), "stuck", 99)]
     export_bag(recording, tmp_path / "three.mcap", localization, faults, (0,), states)
     left_out = ("/pad/recording", "/pad/readings", "/pad/health", "/pad/pressed", "/arm/pose") if mirrored else ()
     lines = []

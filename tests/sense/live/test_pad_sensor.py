@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -88,11 +89,15 @@ def test_sensor_reads_what_the_pipeline_says(boards, sensor: PadSensor, few: Rec
     assert [sensor.read()[name] for name in ("pressed", "valid", "x_mm", "r90_mm")] == [0, 0, 0, 0]
 
 
-def test_a_position_from_before_is_not_that_of_a_press_under_way(boards, sensor: PadSensor, monkeypatch) -> None:
-    """A model of method `published` estimates a press once it is over."""
+@pytest.mark.parametrize("rests", [False, True])
+def test_a_position_from_before_is_not_that_of_a_press_under_way(boards, sensor, monkeypatch, rests: bool) -> None:
+    """A model of method `published` estimates a press once it is over; a finger that `rests` outlasts a second one."""
     monkeypatch.setattr(Live, "pressed", True)
+    if rests:
+        shown = property(lambda live: [replace(live.presses[0], final=False, x_mm=7.0)])
+        monkeypatch.setattr(Live, "shown_presses", shown)
     sensor.connect()
-    assert [sensor.read()[name] for name in ("pressed", "valid", "x_mm")] == [1, 0, 0]
+    assert [sensor.read()[name] for name in ("pressed", "valid", "x_mm")] == [1, rests, 7 * rests]
 
 
 def read_for(sensor: PadSensor, duration_s: float) -> None:

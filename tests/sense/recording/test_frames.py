@@ -7,8 +7,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from padforge.common.progress import ignore_progress
 from padforge.sense import Recording
 from padforge.sense.live.pipeline import Estimate, Live
+from padforge.sense.localizer.evaluation import errors_by_moment
 from padforge.sense.localizer.model import LocalizerModel
 from padforge.sense.recording.frames import FRAME_S, FrameStream, frame_rate_hz, framed, reading_edges, time_means
 
@@ -114,6 +116,9 @@ def test_more_readings_of_the_same_locate_alike(localizer: LocalizerModel, brief
     at_once, at_often = localizer.predict(once), localizer.predict(often)
     np.testing.assert_allclose(at_often.positions_mm, at_once.positions_mm, atol=1e-4)
     np.testing.assert_allclose(at_often.r90_mm, at_once.r90_mm, atol=1e-4)
+    errors = [errors_by_moment(localizer, each, np.arange(9), (0,), ignore_progress) for each in (once, often)]
+    at_once, at_often = ([[row["time_s"], row["mean_mm"]] for row in each["by_moment"]] for each in errors)
+    np.testing.assert_allclose(at_often, at_once, atol=1e-4)
 
 
 def test_live_averages_a_faster_stream(localizer: LocalizerModel, recording: Recording) -> None:

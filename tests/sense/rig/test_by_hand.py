@@ -60,10 +60,10 @@ def test_plan_targets_keeps_the_order_of_a_file(tmp_path: Path) -> None:
 
 
 def test_plan_targets_rounds_none_into_a_keep_out() -> None:
-    hole = ((-4.6, -20.0), (4.6, -20.0), (4.6, 20.0), (-4.6, 20.0))
+    hole = ((-4.1, -20.0), (4.1, -20.0), (4.1, 20.0), (-4.1, 20.0))
     positions = plan_targets(replace(config_of(presses=400), pad_settings=PadSettings(keep_out_mm=(hole,))))
     assert len(positions) == 400
-    assert not ((np.abs(positions) < [4.6, 20.0]).all(axis=1)).any()
+    assert not ((np.abs(positions) < [4.1, 20.0]).all(axis=1)).any()
     assert (positions == np.rint(positions)).mean() > 0.9
 
 

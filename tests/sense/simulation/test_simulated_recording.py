@@ -154,6 +154,9 @@ def test_a_pad_like_a_twin_has_the_median_of_its_gains_and_noise() -> None:
     half = model.responses(positions_mm, np.full(2, 2.5)).held
     expected = -0.05 / 2 * relative_stretch(other, other.to_grid(positions_mm), twin.contact())
     assert half == pytest.approx(expected, abs=1e-5)
+    held = {"held": TwinPart(DISTANCE_MM, WEIGHT, 2 * np.insert(GAINS, 1, 0.0))}
+    model = model_like_twin(other, replace(twin, channels=channels, parts=held), ideal_rig())
+    assert model.responses(positions_mm, np.full(2, 2.5)).held == pytest.approx(2 * expected, abs=1e-5)
     measured = measured_rig(replace(twin, channels=channels), ideal_rig())
     assert (measured.scatter, measured.scatter_common) == (0.1, 0.2)
 
