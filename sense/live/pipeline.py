@@ -147,7 +147,8 @@ class BufferedPress:
     touched: int  # first reading that shows the touch
     down_command: int  # first reading after the command down, estimated by the touch
     previous_end: int  # `up_command` of the previous press, < `down_command`
-    baseline: Array  # readings (1, C) before the press, V
+    rest: Array  # readings (1, C) before the pad was touched, V
+    baseline: Array  # readings (1, C) before the press, V; with a finger held before, those under that one
     history: Array  # history features (1, C, J), V, see `PressFeatures`
     up_command: int | None = None  # first reading after the command up; None while the press is held
     up_s: float = 0.0  # time of `up_command`
@@ -313,14 +314,14 @@ class Live:
 
         Returns:
             "pressed": whether the pad is pressed.
-            "fibres": "swing" (deviation from the baseline over the typical response, None if missing) and "state".
+            "fibres": "swing" (deviation from the untouched pad over the typical response, None if missing) and "state".
             "presses": `Estimate.to_dict` with "measures_text", "moment_text" and "text".
             "track": positions [x, y] of the latest press, mm, more than one if the finger has moved.
             "faults": a line for each fault, or one on another pad.
         """
         swings, end = np.full(len(self._response_v), np.nan), self._buffer.end
         if end:
-            baseline = self._presses[0].baseline[0] if self._presses else self._buffer.baseline(end)
+            baseline = self._presses[0].rest[0] if self._presses else self._buffer.baseline(end)
             swings = (self._buffer.rows(end - 1, end)[0, 1:] - baseline) / self._response_v
         return {
             "pressed": self.pressed,
@@ -359,7 +360,7 @@ class Live:
         down, previous_end = (np.array([max(index - first, 0)]) for index in (down_command, self._previous_end))
         baseline, history = mean_at_rest(readings, down, previous_end), compute_history(readings, down)
         press = BufferedPress(
-            self._n_presses, time_s, touched, down_command, self._previous_end, baseline=baseline, history=history
+            self._n_presses, time_s, touched, down_command, self._previous_end, baseline, baseline, history
         )
         self._add(press)
         return events
@@ -401,7 +402,7 @@ class Live:
         if before.unlike:
             return
         press = BufferedPress(
-            self._n_presses, time_s, touched, down_command, sunk_in, baseline=first.baseline, history=first.history
+            self._n_presses, time_s, touched, down_command, sunk_in, first.rest, first.baseline, first.history
         )
         press.finger, press.other = 3 - first.finger, first
         if first.fixed is None:

@@ -6,7 +6,11 @@ import os
 import re
 import signal
 import threading
+import time
+from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 import trimesh
@@ -14,9 +18,12 @@ from safetensors.numpy import load_file
 
 from padforge.common.files import sha256
 from padforge.common.parallel import Checkpoints
+from padforge.common.settings import Spec
 from padforge.design import Contact, SearchSettings
 from padforge.design.contact_set import judged_contacts
+from padforge.design.design_run import load_result
 from padforge.design.report import press_sections
+from padforge.run import Run
 from padforge.sense.recording.recording import Recording
 from padforge.sense.report.calibration import calibrate_into
 from tests.helpers.door import called, refused
@@ -88,22 +95,42 @@ def test_resume_reuses_finished_run_of_the_same_search(folder: Path, monkeypatch
     assert not note.exists()
 
 
-@pytest.mark.parametrize(
-    ("old", "new", "kept", "others"),
-    [
-        ("epochs = 4", "epochs = 5", "design, mould, recording, contacts", set()),
-        ("[rig]", "[mould]\nwall_mm = 3\n[rig]", "design, recording, contacts, calibration", {"mould.stl"}),
-        ("[rig]", "[silicone]\nmodulus_kpa = 70\n[rig]", "design, recording, contacts, calibration", set()),
-    ],
-)
-def test_resume_repeats_stages_of_changed_settings(
-    folder: Path, old: str, new: str, kept: str, others: set[str]
-) -> None:
-    before = digests(folder)
-    (folder / "pad.toml").write_text(SMALL.replace(old, new))
-    assert resumed(folder) == kept
-    after = digests(folder)
-    assert {name for name in ("mould.stl", "recording") if after[name] != before[name]} == others
+def test_resume_repeats_stages_of_changed_settings(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """One setting of each section after another, the first of which really changes what is made."""
+    out, text, before = folder / "out" / "pad", SMALL, digests(folder)
+
+    def read(name: str) -> dict[str, Any]:
+        return json.loads((out / f"{name}.json").read_text())
+
+    as_before: dict[str, Callable[[], Any]] = {
+        "design.design_run.run_design": lambda: (None, load_result(out)),
+        "fabricate.build": lambda: SimpleNamespace(to_dict=lambda: read("fabrication")),
+        "sense.rig.operation.record_simulated": lambda: Recording.open(out / "recording"),
+        "design.contact_comparison.compare_contacts": lambda: read("contacts"),
+        "sense.report.calibration.calibrate_into": lambda: read("calibration"),
+    }
+    for section, change, *repeated in (
+        ("mould", "wall_mm = 3", "mould"),
+        ("pad", 'leads = "one side"', "design", "mould", "recording", "contacts"),
+        ("contact", "depth_mm = 2", "design", "recording", "contacts"),
+        ("search", "noise = 0.05", "design", "contacts"),
+        ("rules", "border_mm = 1", "design", "mould"),
+        ("printer", "bed_mm = [200, 200, 200]", "mould"),
+        ("silicone", "modulus_kpa = 70", "mould"),
+        ("fibre", "ohm_per_mm = 10", "mould"),
+        ("dispenser", "feed_mm_s = 5", "mould"),
+        ("rig", "noise_mv = 3", "recording"),
+        ("localizer", "seed = 1", "calibration"),
+    ):
+        head = f"[{section}]\n"
+        text = text.replace(head, f"{head}{change}\n") if head in text else f"{text}{head}{change}\n"
+        (folder / "pad.toml").write_text(text)
+        assert resumed(folder) == ", ".join(stage for stage in ALL.split(", ") if stage not in repeated), section
+        if section == "mould":
+            after = digests(folder)
+            assert [name for name in ("mould.stl", "recording") if after[name] != before[name]] == ["mould.stl"]
+            for name, result in as_before.items():
+                monkeypatch.setattr(f"padforge.{name}", lambda *_, result=result, **__: result())
 
 
 def test_resume_repeats_stages_of_changed_files(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -218,6 +245,10 @@ def test_time_budget_covers_all_stages(tmp_path: Path, brief: None, monkeypatch:
 
 
 def test_run_trains_nothing_in_a_time_budget_that_is_spent(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A part of it counts from the beginning of the run, whatever has passed of it."""
+    begun = Run(Spec.load(None), folder, time_budget=100, started_s=time.monotonic() - 30)
+    assert begun.remaining_s(0.5) == pytest.approx(20, abs=1)
+    assert begun.remaining_s(reserve_s=25) == pytest.approx(45, abs=1)
     monkeypatch.setattr("padforge.run.RESERVE_S", 4.999)
     (folder / "out" / "pad" / "localizer.json").unlink()
     said = "--time-budget: got 5 s, nothing of it remains for the training; continue with --resume and more"

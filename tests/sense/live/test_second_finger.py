@@ -1,5 +1,6 @@
 """A second finger that lands while the first one rests is localized from the change; fingers lift one by one."""
 
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -63,8 +64,17 @@ def follow(model: LocalizerModel, trials: list[list[Touch]], seed: int = 5) -> l
         touches += [touch._replace(down=starts[-1] + touch.down, up=starts[-1] + touch.up) for touch in trial]
     readings = simulate_fingers(pad, touches, seed)
     live = Live(model, rate_hz=RIG.rate_hz)
-    events = live.update(np.arange(len(readings)) / RIG.rate_hz, readings)
+    times_s, events, swings, moved_v = np.arange(len(readings)) / RIG.rate_hz, [], [], []
+    for begin, touch in pairwise([Touch(np.zeros(2), 0, 0), *sorted(touches, key=lambda touch: touch.up)]):
+        events += live.update(times_s[begin.up : touch.up], readings[begin.up : touch.up])
+        rest = max(start for start in starts if start < touch.up)
+        swings.append([fibre["swing"] for fibre in live.view()["fibres"]])
+        moved_v.append(readings[touch.up - 1] - readings[rest - 5 : rest].mean(axis=0))
+    events += live.update(times_s[touch.up :], readings[touch.up :])
     assert not live.pressed
+    # however many fingers are on it, the view shows each fibre's change from its rest, on one scale
+    scale = np.median(np.divide(swings, moved_v), axis=0)
+    np.testing.assert_allclose(swings, scale * moved_v, atol=0.1)
     estimates = [event for event in events if isinstance(event, Estimate)]
     firsts = [start - REST / 2 for start in starts[WARM_UP:]]
     numbers = np.searchsorted(firsts, [estimate.time_s * RIG.rate_hz for estimate in estimates]) - 1

@@ -17,12 +17,13 @@ from padforge.sense import Evaluation, Recording, calibrate, evaluate
 from padforge.sense.health.fault_detector import FibreFault, mask_faults
 from padforge.sense.localizer import training
 from padforge.sense.localizer.calibration import (
+    Experience,
     calibrate_uncertainty,
     missing_target_lines,
     split_presses,
     trainable_targets,
 )
-from padforge.sense.localizer.evaluation import distances
+from padforge.sense.localizer.evaluation import conformal, distances
 from padforge.sense.localizer.model import LocalizerModel
 from padforge.sense.localizer.moments import N_TIMED, complete_at
 from padforge.sense.localizer.network import predict_members
@@ -160,7 +161,9 @@ def test_known_measures_need_depth_that_varies(
         assert len(trainable_targets(changed, np.arange(8, 400))) == 2
 
 
-def test_calibrate_uncertainty_corrects_overconfidence(recording: Recording, localizer: LocalizerModel) -> None:
+def test_calibrate_uncertainty_corrects_overconfidence(
+    recording: Recording, localizer: LocalizerModel, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """A member that has far too high an opinion of itself is put right by them, and counts for what it is worth."""
     bias = localizer.residual_network["last.b"].copy()
     bias[:, :, 2:] -= np.log(50)
@@ -179,6 +182,14 @@ def test_calibrate_uncertainty_corrects_overconfidence(recording: Recording, loc
         predict_members(each.networks, moments[-1], *each.corrected)[-1, :, 2:] for each in (proud, put_right)
     )
     np.testing.assert_allclose(after - before, np.full_like(before, shift[0, 0, 2]), atol=1e-4)
+    # radii after the default training also rest on other pads, at each moment and with as many fibres failed
+    monkeypatch.setattr("padforge.sense.localizer.calibration.CONTRADICTION", np.inf)
+    with mock.patch("padforge.sense.localizer.calibration.conformal", wraps=conformal) as radii:
+        calibrate_uncertainty(proud, moments, recording.presses_mm[test], 2, n_trained=300)
+    shares = [0, 1 / recording.fibres]
+    usual = [[Experience.at(n + 1).ratio(300, share) for share in shares] for n in range(N_TIMED)]
+    ratios = np.reshape([call.args[3] for call in radii.call_args_list], (N_TIMED, 2)) / usual
+    np.testing.assert_allclose(ratios, np.full_like(ratios, ratios[0, 0]))
 
 
 def test_calibrate_keeps_a_time_budget_and_says_when_a_localizer_is_not_trained_out(

@@ -120,6 +120,11 @@ def test_stop_halts_at_once_and_position_stays_known(emergency_parser):
         assert to_rest(arm).pose[2] == pytest.approx(40)
 
 
+def push_aside(printer: EmulatedPrinter) -> None:
+    real = printer.firmware.position
+    printer.firmware.position = lambda time_s: (real(time_s)[0] + 3, *real(time_s)[1:])
+
+
 @pytest.mark.parametrize(
     ("disturb", "cause", "match", "under_way"),
     [
@@ -127,8 +132,9 @@ def test_stop_halts_at_once_and_position_stays_known(emergency_parser):
         (EmulatedPrinter.restart, "lost", "has restarted, so that its position is unknown", False),
         (EmulatedPrinter.unplug, "lost", "the printer is gone", False),
         (lambda printer: printer.busy(10), "stale", "it may be busy", True),
+        (push_aside, "lost", r"is at 83\.00, 110\.00, .* mm, but was sent to 80\.00, 110\.00, 40\.00 mm", True),
     ],
-    ids=["halt", "restart", "unplug", "busy"],
+    ids=["halt", "restart", "unplug", "busy", "aside"],
 )
 def test_state_raises_within_two_seconds_of_fault(disturb, cause, match, under_way):
     with connected() as (arm, printer):
