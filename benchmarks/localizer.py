@@ -21,8 +21,8 @@ from padforge.sense.arrays import Array, Floats
 from padforge.sense.localizer.features import compute_features
 from padforge.sense.localizer.network import predict
 from padforge.sense.localizer.scaler import FeatureScaler, ScaledFeatures, TrainingPresses
+from padforge.sense.localizer.training import MIN_BATCHES, train_members
 from padforge.sense.localizer.training import PUBLISHED_HIDDEN as HIDDEN
-from padforge.sense.localizer.training import train_members, training_steps
 from padforge.sense.recording.recording import Recording
 from padforge.sense.simulation.simulated_recording import simulate
 
@@ -146,9 +146,8 @@ def _train_adam(x: Array, y: Array, passes: int) -> Predict:
 
 
 def _train_masked(presses: TrainingPresses, table: Floats, steps: int) -> Predict:
-    usual = settings.LocalizerSettings()
-    epochs = max(1, round(steps * usual.epochs / training_steps(len(presses), usual)))
-    options = settings.LocalizerSettings(epochs=epochs)
+    batches = max(MIN_BATCHES, len(presses) // settings.LocalizerSettings().batch)
+    options = settings.LocalizerSettings(epochs=-(-steps // batches))
     trained = train_members(presses, table, options, np.random.default_rng(0), ignore_progress)
 
     def positions(x: Array) -> Array:

@@ -86,9 +86,7 @@ AUGMENTATION = 1.6
 pad of 45 mm, and 5 mm with 240, between which there is more to interpolate."""
 POSITION_AUGMENTATION = 0.26  # the same where depths vary, scaled, for a press of the middle depth
 DEPTH_AUGMENTATION = 0.3  # standard deviation of augmented depths, scaled, for a press of the middle depth
-BATCHES_PER_ROOT = 0.185
-"""Minimum steps of an epoch over the root of the number of samples, two a press: 3 with 120 presses, whose networks err
-more with 9, 6 with 500, and 9 with 1275."""
+MIN_BATCHES = 9  # minimum steps of an epoch
 MAX_STEPS = 9900  # maximum steps of a training
 DEPTH_STEP_FACTOR = 2  # factor on the steps where depths vary, which is harder to learn
 RECENT_BATCHES = 64  # of which every second one of the residual network is drawn
@@ -236,10 +234,9 @@ def train_members(
     return TrainedNetworks(networks, bayes, trained.get(RESIDUAL, {}), trained_share)
 
 
-def training_steps(samples: int, options: LocalizerSettings) -> int:
-    """Return the steps of a training: `epochs` times through the samples, or more of few samples."""
-    batches = max(samples // options.batch, BATCHES_PER_ROOT * math.sqrt(samples))
-    return min(MAX_STEPS, round(options.epochs * batches))
+def training_steps(presses: int, options: LocalizerSettings) -> int:
+    """Return the steps of a training: `epochs` times through the presses, within `MIN_BATCHES` and `MAX_STEPS`."""
+    return min(MAX_STEPS, options.epochs * max(MIN_BATCHES, presses // options.batch))
 
 
 def train_published(train: TrainingPresses, early_stop: TrainingPresses, rng: np.random.Generator) -> Weights:

@@ -155,9 +155,7 @@ def test_train_members_trains_a_network_for_each_phase(n_timed: int, members: in
     trained = training.train_members(presses, table, options, rng, show)
     phases = PHASES[n_timed]
     lengths = [phase.length for phase in phases.values()] + [RESIDUAL_PHASE.length] * (members > 1)
-    steps = training.training_steps(40, options)
-    assert steps == 6  # three epochs of 40 // 16 batches
-    assert totals.pop("") == {sum(round(steps * length) for length in lengths)}
+    assert totals.pop("") == {sum(round(3 * training.MIN_BATCHES * length) for length in lengths)}
     assert list(totals) == ["Bayesian localizer"] * (members > 1)
     assert list(trained.networks) == list(phases)
     for weights in trained.networks.values():
