@@ -147,7 +147,7 @@ class BufferedPress:
     touched: int  # first reading that shows the touch
     down_command: int  # first reading after the command down, estimated by the touch
     previous_end: int  # `up_command` of the previous press, < `down_command`
-    rest: Array  # readings (1, C) before the pad was touched, V
+    untouched: Array  # readings (1, C) before any finger touched the pad, V
     baseline: Array  # readings (1, C) before the press, V; with a finger held before, those under that one
     history: Array  # history features (1, C, J), V, see `PressFeatures`
     up_command: int | None = None  # first reading after the command up; None while the press is held
@@ -321,7 +321,7 @@ class Live:
         """
         swings, end = np.full(len(self._response_v), np.nan), self._buffer.end
         if end:
-            baseline = self._presses[0].rest[0] if self._presses else self._buffer.baseline(end)
+            baseline = self._presses[0].untouched[0] if self._presses else self._buffer.baseline(end)
             swings = (self._buffer.rows(end - 1, end)[0, 1:] - baseline) / self._response_v
         return {
             "pressed": self.pressed,
@@ -402,7 +402,7 @@ class Live:
         if before.unlike:
             return
         press = BufferedPress(
-            self._n_presses, time_s, touched, down_command, sunk_in, first.rest, first.baseline, first.history
+            self._n_presses, time_s, touched, down_command, sunk_in, first.untouched, first.baseline, first.history
         )
         press.finger, press.other = 3 - first.finger, first
         if first.fixed is None:

@@ -110,9 +110,10 @@ def _take_step(
         square[i] += second * (gradient[i] * gradient[i] - square[i])
         n_moving += mean[i] * gradient[i] > zero
     further = np.float32(rate / (1 - BETAS[0] ** step) / max(n_moving / len(weights), MIN_MOVING))
-    unbiased, kept, renewed = np.float32(1 / (1 - BETAS[1] ** step)), np.float32(1 - rate * decay), np.float32(renewal)
+    unbiased = np.float32(1 / (1 - BETAS[1] ** step))
+    shrinkage, renewed = np.float32(1 - rate * decay), np.float32(renewal)
     for i in range(len(weights)):
         change = mean[i] / (np.sqrt(unbiased * square[i]) + epsilon)
-        weights[i] = kept * weights[i] - (further * change if mean[i] * gradient[i] > zero else zero)
+        weights[i] = shrinkage * weights[i] - (further * change if mean[i] * gradient[i] > zero else zero)
         average[i] += renewed * (weights[i] - average[i])
         gradient[i] = zero
