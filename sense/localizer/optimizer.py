@@ -98,12 +98,8 @@ def _take_step(
     The moving average of the weights is renewed by that share. In two passes over memory it takes a sixth of the time
     that a dozen operations of torch take.
     """
-    first, second, epsilon, zero = (
-        np.float32(1 - BETAS[0]),
-        np.float32(1 - BETAS[1]),
-        np.float32(EPSILON),
-        np.float32(0),
-    )
+    first, second = np.float32(1 - BETAS[0]), np.float32(1 - BETAS[1])
+    epsilon, zero = np.float32(EPSILON), np.float32(0)
     n_moving = 0
     for i in range(len(weights)):
         mean[i] += first * (gradient[i] - mean[i])
