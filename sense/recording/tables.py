@@ -271,10 +271,10 @@ def _split(lines: Iterator[tuple[int, str]], separator: str) -> Iterator[tuple[i
 def _find_dialect(sample: list[tuple[int, str]]) -> _Dialect:
     comments = [(number, line.lstrip("# ")) for number, line in sample if line.startswith("#")]
     lines = [(number, line) for number, line in sample if not line.startswith("#")]
-    separator, first = "", 0
+    separator, n_skipped = "", 0
     if lines and re.fullmatch(r"\W?sep=.\W*", lines[0][1]):  # Excel writes it, in quotes or not
-        separator, first = lines[0][1].strip('"')[4], 1
-    lines = lines[first:]
+        separator, n_skipped = lines[0][1].strip('"')[4], 1
+    lines = lines[n_skipped:]
     candidates = {candidate: list(_split(iter(lines), candidate)) for candidate in separator or SEPARATORS}
     separator = max(candidates, key=lambda candidate: _n_values([row for _, row in candidates[candidate]]))
     rows = [(number, [cell.strip() for cell in row]) for number, row in candidates[separator]]
@@ -284,9 +284,10 @@ def _find_dialect(sample: list[tuple[int, str]]) -> _Dialect:
     shares = [np.mean([_is_value(cell) for cell in cells if cell] or [True]) for cells in zip(*table, strict=True)]
     is_data = [len(row) == width and any(map(_is_number, row)) and _fits(row, shares) for _, row in rows]
     start = is_data.index(True) if any(is_data) else len(rows)
-    number = rows[start][0] if start < len(rows) else (rows[-1][0] + 1 if rows else 1)
+    first_line = rows[start][0] if start < len(rows) else (rows[-1][0] + 1 if rows else 1)
     # 2. Find the lines of names and units before it.
-    header, names, units = _find_names(rows[:start], width, [item for item in comments if item[0] < number], separator)
+    above = [(number, text) for number, text in comments if number < first_line]
+    header, names, units = _find_names(rows[:start], width, above, separator)
     unnamed = list(zip(*table, strict=True))[len(names) :]
     columns = list(zip(*[row for _, row in rows[start:] if len(row) == width], strict=True))
     measured = [_MEASURED.fullmatch(next(filter(None, cells), "")) for cells in columns]
@@ -298,11 +299,10 @@ def _find_dialect(sample: list[tuple[int, str]]) -> _Dialect:
     values = [match[2] for _, row in rows[start:] for cell in row if (match := _MEASURED.fullmatch(cell))]
     has_comma = any(re.fullmatch(r"[-+]?\d*,\d+", value) for value in values)
     has_point = any(re.fullmatch(r"[-+]?\d*\.\d+", value) for value in values)
-    dates = frozenset(
-        i for i, cells in enumerate(columns) if 2 * sum(bool(_DATE.fullmatch(c)) for c in cells) > len(cells)
-    )
+    date_shares = [np.mean([bool(_DATE.fullmatch(cell)) for cell in cells]) for cells in columns]
+    dates = frozenset(i for i, share in enumerate(date_shares) if share > 0.5)
     units = [*units, *[""] * (len(names) - len(units))]
-    return _Dialect(separator, has_comma and not has_point, header, number, width, names, units, dates)
+    return _Dialect(separator, has_comma and not has_point, header, first_line, width, names, units, dates)
 
 
 def _find_names(

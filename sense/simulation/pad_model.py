@@ -306,11 +306,12 @@ class LivePad:
         self._solve(positions_mm[depths_mm > 0])
         for row, depth in enumerate(np.maximum(depths_mm / self._depth_mm, 0).tolist()):
             step, self._depth = depth - self._depth, depth
-            if not (depth or step):
+            time_s = (self._n_read + row) / self._rate_hz
+            if depth == step == 0:  # the tip stays above the pad
                 continue
-            if depth and step == depth:
-                self._touch(positions_mm[row], (self._n_read + row) / self._rate_hz)
-            press, time_s = self._presses[-1], (self._n_read + row) / self._rate_hz
+            if step == depth:  # it was above the pad before
+                self._touch(positions_mm[row], time_s)
+            press = self._presses[-1]
             moved = np.zeros_like(press.replaced)
             if depth:
                 press.release_s = time_s
