@@ -93,9 +93,8 @@ def parse_columns(text: str, quantities: Sequence[str] = DATASETS) -> list[Colum
         if quantity not in named and not (quantity == "time" and "rate" in named):
             expected = f"expected {' and '.join(required)}"
             if quantity == "time":  # other tables hold a line per press
-                expected += (
-                    ", or rate=HZ of regular readings; features of whole presses are for Localizer.fit in Python"
-                )
+                advice = "features of whole presses are for Localizer.fit in Python"
+                expected += f", or rate=HZ of regular readings; {advice}"
             raise InputError(f"columns {short_repr(text)} do not name {quantity}, {expected}")
     for one, other in (("x", "y"), ("down_command", "up_command")):
         if (one in named) != (other in named):

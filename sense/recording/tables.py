@@ -405,9 +405,8 @@ def _parse_dates(texts: list[str], what: str) -> Array:
                 f"{what}: dates such as {texts[0]!r} need pandas: pip install 'padforge[formats]'"
             ) from error
         is_european = bool(re.match(r"\d{1,2}\.", texts[0]))
-        dates = pandas.to_datetime(
-            pandas.Series(texts), format="mixed", dayfirst=is_european, errors="coerce", utc=True
-        )
+        series = pandas.Series(texts)
+        dates = pandas.to_datetime(series, format="mixed", dayfirst=is_european, errors="coerce", utc=True)
         times = dates.dt.tz_localize(None).to_numpy("datetime64[ns]")
     seconds = times.astype(np.int64) / 1e9
     return np.where(np.isnat(times), np.nan, seconds)
