@@ -38,22 +38,18 @@ _WEIGHTS = {"uniform": geometry.UNIFORM, "inverse_square": geometry.INVERSE_SQUA
 _LENGTHS = {"manhattan": geometry.MANHATTAN, "euclidean": geometry.EUCLIDEAN}
 LAYER_REACH = {"bonded": 8.0, "slipping": 16.0}
 """Distance outside the contact at which strains of a layer are cut off, thicknesses. The neglected part is less than
-1 % of the largest signal of a straight fibre. Strains of a slipping layer decay only with the square of the distance.
-"""
+1 % of the largest signal of a straight fibre. Strains of a slipping layer decay only with the distance squared."""
 MAX_REACH_RADII = 4.0
-"""Maximum thickness that counts for that, contact radii: strains of a thicker layer decay with the cube."""
+"""Maximum thickness for that distance, contact radii: strains of a thicker layer decay with the distance cubed."""
 FIBRE_BLUR_MM = 0.1
 """Standard deviation of the Gaussian by which strains are averaged, about that of the width of a fibre of 0.3 mm. It
-smooths the step of the strains at the edge of the contact, which hardly changes signals, the integrals of strains.
-"""
+smooths the step of strains at the edge of the contact, which hardly changes signals, the integrals of strains."""
 PANEL_SHARE = 0.4
 """Length of an interval of distances in which strains are one polynomial, relative to its distance from the edge of the
-contact or, if that is more, to the depth of the fibres. Polynomials of degree 7 then err by 1e-8 of the largest strain.
-"""
+contact or, if more, to the depth of the fibres. Polynomials of degree 7 then err by 1e-8 of the largest strain."""
 DEPTH_STEPS = 16
 """Number of depths for which the contact is solved, to interpolate signals and forces. Fewer would err by more than
-0.5 % of full scale, since signals bend when the edge of the contact passes a fibre.
-"""
+0.5 % of full scale, since signals bend when the edge of the contact passes a fibre."""
 PressShape = tuple[tuple[Array, Array], Array, geometry.WeightLaw]  # chains, extents and weight law of a press
 
 
@@ -334,7 +330,7 @@ def describe_large_strain(contact: Contact) -> str:
         return ""
     return (
         f"[contact] strains the silicone by up to {largest:.2f}, {contact.depth_mm:g} mm deep in"
-        f" {contact.thickness_mm:g} mm, as a linear layer has it and no real one can be: signals and errors are rough"
+        f" {contact.thickness_mm:g} mm, which is possible in a linear model alone: signals and errors are rough"
     )
 
 

@@ -47,8 +47,7 @@ REDUCED_MODULUS_KPA = reduced_modulus_kpa(MODULUS_KPA)
 """E* of that silicone, kPa."""
 TERMS = 16
 """Number of Legendre polynomials of phi, with which forces have a relative error of 1e-6 up to a contact radius of ten
-thicknesses, and of 5e-4 at MAX_CONTACT.
-"""
+thicknesses, and of 5e-4 at MAX_CONTACT."""
 MAX_CONTACT = 100.0  # maximum contact radius, thicknesses
 _DECAY = 25.0  # wavenumber times depth below the face from which a field is neglected, since it has decayed to exp(-25)
 

@@ -117,7 +117,7 @@ class Morphology:
         layout = Layout.create((half, half) if self.fibres is None else self.fibres, self.pitch_mm)
         _validate(knots, layout)
         if not layout.is_square:
-            # as they will be once written and read, which differs from grid units by rounding
+            # rounded as in a file, whose unit is the pitch, so that reading it gives the same knots
             knots = _to_pitches(knots, layout) * layout.spacing
         knots.setflags(write=False)
         self.__dict__.update(knots=knots, pitch_mm=layout.pitch_mm, fibres=layout.counts, layout=layout)
@@ -355,7 +355,7 @@ def _published_knots(content: dict[str, Any]) -> Array:
 
 
 def _max_misfit(knots: Array, content: dict[str, Any], n_presses: int = 32) -> float:
-    """Return the largest error of fibres' signals to the samples of a published file; 0 where it has no samples."""
+    """Return the largest error of fibres' signals to those in a published file, by the better weight; 0 if none are."""
     if not {"K", "loc_all", "sens_raw_all"} <= content.keys():
         return 0.0
     settings, expected = content["K"], content["sens_raw_all"][:n_presses]

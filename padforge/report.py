@@ -101,7 +101,7 @@ def _find_mismatches(
 
 
 def _provenance_row(folder: Path, stage: str, document: Mapping[str, Any]) -> list[object]:
-    """Return stage, command, seed, versions and inputs, each compared with the file of that name in the folder."""
+    """Return stage, command, seed, versions and inputs; inputs are compared with the files of their names here."""
     origin = document["provenance"]
     versions = ", ".join(f"{package} {version}" for package, version in origin.get("versions", {}).items())
     inputs = "; ".join(_describe_inputs(folder, origin.get("inputs", {})))
@@ -112,7 +112,7 @@ def _describe_inputs(folder: Path, inputs: Mapping[str, Any]) -> Iterator[str]:
     for name, digest in inputs.items():
         if not isinstance(digest, str):  # the provenance of an input that was computed
             yield f"{name}: {digest['command']}" if digest else name
-        elif Path(name).name == name and (folder / name).is_file():  # a name with a folder is never opened
+        elif Path(name).name == name and (folder / name).is_file():  # a name that contains a path is never opened
             match = "the one here" if find_unchanged(folder, {name: digest}) else "not the one here"
             yield f"{name} {digest} ({match})"
         else:

@@ -42,7 +42,7 @@ _STAGE_SECTIONS = {
 
 EPOCHS = 90
 """Passes of the training through the presses unless `[localizer]` states them: half of the default of `padforge sense
-calibrate`, by which a simulated pad errs 0 to 3 % more, and a built one 2 to 5 %."""
+calibrate`. That makes errors on a simulated pad larger by 0 to 3 %, and on a built one by 2 to 5 %."""
 RESERVE_S = 30.0  # reserved after the training for calibration of radii, errors, fault detection, figures and report
 FORMAT = "padforge-run/1"
 NAME = "run.json"
@@ -73,11 +73,11 @@ class Run:
 
     spec: "Spec"  # settings of all stages
     out: Path  # folder of the pad
-    seed: int | None = None  # of every random choice; that of each section if None
-    formats: tuple[str, ...] = ("stl", "step", "svg", "png")  # of the mould
+    seed: int | None = None  # of every random choice; None for the seeds of the sections
+    formats: tuple[str, ...] = ("stl", "step", "svg", "png")  # files of the mould
     resume: bool = False  # whether to reuse the stages that an earlier run has finished
     time_budget: float | None = None  # seconds for all stages together; unlimited if None
-    force: bool = False  # replace also a pad that is in use, and a localizer not trained on simulated presses
+    force: bool = False  # whether to replace even a pad in use, or a localizer not trained on simulated presses
     started_s: float = field(default_factory=time.monotonic)
 
     def remaining_s(self, share: float = 1.0, reserve_s: float = 0.0) -> float | None:
@@ -172,7 +172,7 @@ def check_run(run: Run) -> None:
 
     check_settings(run.spec)
     require_formats(run.formats)
-    metadata.version("torch")  # a missing one is refused here, not after the search
+    metadata.version("torch")  # if it is missing, this raises now and not after the search
     pad, rig = run.spec.section(PadSettings), read_rig(run.spec, seed=run.seed)
     FabricationSettings.from_spec(run.spec).require_consistent(pad.layout)
     rig.inputs(pad.layout.fibres)

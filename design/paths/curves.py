@@ -17,12 +17,12 @@ from padforge.design.kernels.pchip import population_slopes
 from padforge.design.morphology import Array, Morphology, assemble_knots, split_axes
 from padforge.design.settings import Layout
 
-FOLD = np.pi / 2  # gaps along a fibre from which its points keep the gap: half a turn of a circle one gap wide
+FOLD = np.pi / 2  # distance along a fibre, in gaps, from which on points must keep the gap: half a circle one gap wide
 # range of headings that cannot fold: chords within an angle a of a line are at least cos a times the arc
 UNFOLDED = 2 * np.arccos(1 / FOLD)
 SPARE_LENGTH = 1e-4  # length of all spare knots of a fibre, grid units: far below what can be printed
-_LEVEL_TOLERANCE = 1e-9  # rises below this are none: positions in a file in pitches are right to rounding
-_TINY = 1e-30  # divides in position of the length of a segment whose ends coincide
+_LEVEL_TOLERANCE = 1e-9  # smaller rises are due to rounding of positions that a file states in pitches
+_TINY = 1e-30  # divisor in place of the length of a segment whose ends coincide
 
 
 def _hermite(pad: Morphology) -> tuple[Array, Array, Array]:
@@ -338,9 +338,9 @@ def bend_radius(
     how a fibre of finite stiffness lies. The curve is assumed to turn evenly between two points; the turn in a window
     is then piecewise linear in the window's position, with its maximum at a window that starts or ends at a point.
 
-    The points (n, 2) are so dense that chords measure the length, a corner is a point twice; headings (n,), rad, of the
-    tangents there are unwrapped. Turns `out_of_plane` (n - 1,), rad, are those of `rolled_turns`. Returned are the
-    radius, and the position (2,) of the middle of that bend.
+    The points (n, 2) are so dense that chords measure the length; at a corner two of them coincide. Headings (n,), rad,
+    of the tangents there are unwrapped. Turns `out_of_plane` (n - 1,), rad, are those of `rolled_turns`. Returned are
+    the radius, and the position (2,) of the middle of that bend.
     """
     arc = arc_lengths(points)
     window = min(window, arc[-1])

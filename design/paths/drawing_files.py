@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 MAX_COORDINATE = 1e6  # largest absolute coordinate, in units of the drawing
 _FIBRES = re.compile(r"(fibre|fiber|horizontal|vertical)", re.IGNORECASE)
-JOIN_MM = 0.01  # distance of ends that are joined, as programs round where pieces of a line meet
+JOIN_MM = 0.01  # maximum distance of ends that are joined, since programs round where pieces of a line meet
 
 
 @dataclass(frozen=True)
@@ -92,7 +92,7 @@ class DrawnPlan:
         if not curves:
             return []
         size = float(np.ptp(np.vstack([curve.points[[0, -1]] for curve in curves]), axis=0).max())
-        tolerance = min(JOIN_MM / self.unit_mm, 1e-3 * size)  # of a drawing in m whose unit is not stated
+        tolerance = min(JOIN_MM / self.unit_mm, 1e-3 * size)  # the latter if the unit, not stated, is m
         edges = [
             edgeminer.make_edge(curve.points[0], curve.points[-1], payload=number)
             for number, curve in enumerate(curves)

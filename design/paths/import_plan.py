@@ -17,7 +17,7 @@ from padforge.design.settings import FAMILIES, Layout
 
 READERS = {".svg": read_svg, ".dxf": read_dxf}
 MAX_BYTES = 2**22  # size of a drawing; drawings of fibres are far smaller
-MAX_KNOTS = 64  # inner knots of a fibre, as of `[search] knots`
+MAX_KNOTS = 64  # maximum inner knots of a fibre, as for `[search] knots`
 _MAX_BACKTRACK_MM = 2e-4  # largest step backwards along the axis: files are rounded
 _MARGIN_MM = 1.0  # curves farther beyond the pad than this are leads to its other sides, which are ignored
 _FLATNESS_MM = 1e-3  # tolerance to which curves are compared
@@ -251,7 +251,7 @@ def _check_fit(line: Array, path: _FibrePath, layout: Layout, tolerance_mm: floa
     if error_mm > max(tolerance_mm, path.error_mm) * 1.05:
         farthest = int(np.argmax(shapely.distance(shapely.points(fitted), drawn)))
         position = _format_position(fitted[farthest], 0)
-        error = f"{MAX_KNOTS} knots keep within {error_mm:.3g} mm of it, at {position}"
+        error = f"a fibre of {MAX_KNOTS} knots is {error_mm:.3g} mm off at {position}"
         raise InputError(f"{path.name}: {error}; allowed is {tolerance_mm:g} mm (--tolerance-mm)")
     return ImportedFibre(path.name, path.error_mm, error_mm)
 

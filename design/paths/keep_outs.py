@@ -46,7 +46,7 @@ class _Passage:
     def __init__(self, box: Array, family: int, pad: PadSettings, rules: RulesSettings) -> None:
         layout = pad.layout
         unit, width = layout.unit_mm, layout.extent[1 - family]
-        # more than the rules', since a PCHIP curve leaves the polygon of its knots
+        # more than the rules demand, since a PCHIP curve leaves the polygon of its knots
         clearance = 1.15 * rules.keep_out_mm / unit + MARGIN
         (self.begin, low), (self.end, high) = box[:, [family, 1 - family]] + np.array([[-clearance], [clearance]])
         gap, border = max(rules.min_gap_mm / unit, MARGIN), rules.border_mm / unit
@@ -66,7 +66,7 @@ class _Passage:
         # length l has curvature 6 h / l^2
         rise = float(np.abs(self.lanes - levels).max(initial=0))
         length = max(1.5 * np.sqrt(6 * rise * rules.min_mean_bend_radius_mm / unit), rise)
-        available = self.begin, layout.extent[family] - self.end  # the search has to mend a steeper transition
+        available = self.begin, layout.extent[family] - self.end  # the search has to repair steeper transitions
         self.transitions = [max(min(length, limit), MARGIN) for limit in available]
         self.marks = [self.begin - self.transitions[0], self.begin, self.end, self.end + self.transitions[1]]
 

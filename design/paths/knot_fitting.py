@@ -14,15 +14,15 @@ from padforge.design.paths.curves import arc_lengths, interpolate
 
 SAMPLES = 700  # samples of a polyline
 _MAX_STEP = 0.4  # largest shift of a knot along the axis in one fit, as a share of the way to its neighbour
-_TINY = 1e-12  # room of a knot that has none: bounds must differ
-_SUPPORT = 3  # spans on either side of a knot that may depend on it, while it moves within one
+_TINY = 1e-12  # minimum room of a knot, since bounds must differ
+_SUPPORT = 3  # spans on either side of a knot that depend on it: two by PCHIP, and one more as it moves
 _MIN_SPAN = 2e-3  # smallest distance of knots along the axis, as a share of the curve's extent
 
 
 def fit_knots(points: Array, tolerance: float, max_inner: int = 64) -> Array:
     """Fit the knots (n, 2) of a PCHIP curve to a polyline (m, 2); misfits are measured along the normal.
 
-    Coordinates along ascend strictly. The tolerance may be exceeded with `max_inner` inner knots, the most allowed.
+    Coordinates along ascend strictly. If `max_inner` inner knots do not suffice, the misfit exceeds the tolerance.
     """
     samples, weight = _sample(points)
     knots = samples[_find_turns(samples, tolerance)]
@@ -129,7 +129,7 @@ def _fit_within_room(samples: Array, weight: Array, knots: Array) -> Any:
         residual,
         knots[1:-1].ravel(),
         bounds=bounds.reshape(2, -1),
-        jac_sparsity=np.repeat(depends, 2, axis=1),  # derivatives by knots without a span in common at once
+        jac_sparsity=np.repeat(depends, 2, axis=1),  # knots that share no span are differentiated together
         x_scale="jac",
         ftol=1e-3,
         max_nfev=8,
@@ -140,7 +140,7 @@ def _remove_redundant(samples: Array, weight: Array, knots: Array, tolerance: fl
     while len(knots) > 2:
         fewer = [np.delete(knots, k, axis=0) for k in range(1, len(knots) - 1)]
         fewer.sort(key=lambda trial: _misfit(samples, weight, trial).max())
-        for trial in fewer[:4]:  # of the knots whose removal makes the smallest misfit
+        for trial in fewer[:4]:  # without the knots whose removal gives the smallest misfit
             optimised = _optimise(samples, weight, trial)
             if _misfit(samples, weight, optimised).max() <= tolerance:
                 knots = optimised

@@ -27,11 +27,11 @@ FINE_MM = 3e-4  # tolerance of the drawn rings against the exact outlines; their
 MAX_SPANS = 8
 """Longer splines are cut: the CAD kernel's default integration is inexact on edges of many spans (1.4e-4 at twelve)."""
 _JOINT_MM = 1e-3  # maximum distance of a joint from its outline; others lie inside, where walls merge
-_STRAIGHT_MM = 1e-3  # sagitta above which an edge is straight; chords of drawn curves have several times less
-_ARC_TOLERANCE_MM = 1e-4  # of arcs and straight runs
-_KNOT_DECIMALS = 4  # of knots, mm; further decimals lengthen STEP files and depend on memory alignment
+_STRAIGHT_MM = 1e-3  # sagitta above which an edge is no chord of a drawn curve, whose sagitta is several times less
+_ARC_TOLERANCE_MM = 1e-4  # tolerance of arcs and straight runs
+_KNOT_DECIMALS = 4  # decimals of knots, mm; further ones lengthen STEP files and depend on memory alignment
 _MIN_SPAN_MM = 1e-3  # minimum distance of inner knots from the ends
-_ALONG_FACTOR = 20  # tolerance of the parameter against the arc length over that of the shape, which it hardly changes
+_ALONG_FACTOR = 20  # tolerance along the curve relative to that across; errors along hardly change the shape
 
 
 @dataclass(frozen=True, eq=False)

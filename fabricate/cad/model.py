@@ -63,14 +63,14 @@ first, *others = map(build123d.import_brep, sys.argv[2:])
 build123d.export_brep(first.fuse(*others), sys.argv[1])
 """
 """Program that writes the union of files to its first argument."""
-_MIN_CIRCLE_CORNERS = 32  # of a polygon that stands for a circle
+_MIN_CIRCLE_CORNERS = 32  # minimum corners of a polygon that represents a circle
 MAX_DEVIATION = 2e-4  # maximum relative deviation of a ridge's volume from that of its mesh
 MAX_BODY_DEVIATION = 5e-4  # the same for other parts, such as a lid, whose round holes are polygons in the mesh
 KERNEL_ERRORS = Standard_Failure, Standard_NullObject, RuntimeError, ValueError
 """Errors of the CAD kernel and of build123d."""
-_DECIMALS = 5  # of points, mm; more would only lengthen a STEP file
-_MIN_EDGE_MM = 2e-5  # of an outline, so that rounding does not merge two points
-_AREA_TOLERANCE = 1e-2  # relative, of areas; it selects adaptive integration, whose error is far smaller
+_DECIMALS = 5  # decimals of points, mm; more would only lengthen a STEP file
+_MIN_EDGE_MM = 2e-5  # minimum edge of an outline, so that rounding does not merge two points
+_AREA_TOLERANCE = 1e-2  # relative; it selects adaptive integration of areas, whose error is far smaller
 _INTO_TERRACE_MM = 0.005  # overlap of a terrace with the one below, so that no two faces coincide
 
 
@@ -207,7 +207,7 @@ def _edge(curve: OutlineCurve, z: float) -> Edge:
         middle = np.round([x + radius * np.cos(half), y + radius * np.sin(half)], _DECIMALS + 2)
         first, second, third = gp_Pnt(*start), gp_Pnt(*middle.tolist(), z), gp_Pnt(*end)
         arc = GC_MakeArcOfCircle(first, second, third).Value()
-        return Edge(BRepBuilderAPI_MakeEdge(arc, first, third).Edge())  # with these ends, unlike the arc's own
+        return Edge(BRepBuilderAPI_MakeEdge(arc, first, third).Edge())  # the arc alone has slightly other ends
     return Edge.make_line(start, end)
 
 

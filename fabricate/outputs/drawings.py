@@ -52,7 +52,7 @@ def orientation_sentence(counts: tuple[int, int], leads: str) -> str:
 
 SCALE_MM = 10.0  # length of the scale bar, which verifies the size of a print
 _TEXT_MM = 2.5  # maximum text height, by drawing standards; smaller for a narrow pitch
-_GAP_MM = 1.0  # between the silicone and the text beside it
+_GAP_MM = 1.0  # gap between the silicone and the text beside it
 _LETTER_WIDTH = 0.6  # mean width of a letter, in text heights
 _VIEW = "as it lies in the tray, seen from above"
 _DESCRIPTION = (
@@ -87,7 +87,7 @@ class _TrackSheet:
         ]
         self.ends = np.array([[lead.point_past_edge(plan.settings.mould.exit_mm) for lead in pair] for pair in pairs])
 
-        # Outside the silicone, at the starts; with leads to one side, at both ends
+        # Numbers lie outside the silicone, at the starts; with leads to one side, at both ends.
         self.numbers: list[_Label] = []
         for ends in self.ends.swapaxes(0, 1)[: 1 + (plan.settings.pad.leads == "one side")].tolist():
             for fibre, (x, y) in enumerate(ends):
@@ -212,7 +212,7 @@ def tracks_dxf(plan: Plan) -> str:
         x_min, y_min, x_max, y_max = sheet.frame
         space.reset_extents((x_min, y_min, 0), (x_max, y_max, 0))
         document.set_modelspace_vport(height=y_max - y_min, center=((x_min + x_max) / 2, (y_min + y_max) / 2))
-        for kind in sorted(document.entitydb.dxf_types_in_use()):  # a set, whose order varies
+        for kind in sorted(document.entitydb.dxf_types_in_use()):  # the order of the set varies
             document.classes.add_class(kind)
         document.write(stream)
     return stream.getvalue()

@@ -66,8 +66,8 @@ what is added on either side narrows the silicone between two.
 {layers:.3g} layers.
 - Calibrate the exposure: a wall that is {ridge:g} mm wide in the file must be so on the plate.
 - Wash and cure it well. Traces of resin can keep silicone from curing: try a drop on a scrap first."""
-_MIN_LINE = 0.85  # minimum width of a line, in nozzles
-_MAX_ROWS = 24  # of a table of crossings on a page
+_MIN_LINE = 0.85  # minimum width of a line, in nozzle diameters
+_MAX_ROWS = 24  # maximum rows of a table of crossings on a page
 
 
 def laying_document(plan: Plan, mould_mm3: float) -> dict[str, Any]:
@@ -301,7 +301,7 @@ def print_settings_rows(mould: MouldSettings, printer: PrinterSettings) -> list[
     ridge_lines = "one line" if n_lines == 1 else f"{n_lines} lines"
     if ridge < printer.nozzle_mm - 1e-9:
         ridge_lines = "narrower than the nozzle: see the checks"
-    # The first layer contains the fraction of a layer in the floor; it is at most half a nozzle, or 1.5 layers, high.
+    # The first layer takes up the floor's excess over whole layers; it is at most half a nozzle, or 1.5 layers, high.
     layers = mould.floor_mm / layer
     fraction = max(0.0, layers - math.floor(layers + 1e-6))
     max_first = min(max(1.5, printer.nozzle_mm / 2 / layer), layers)

@@ -40,7 +40,7 @@ _GREY = "#77746c"  # colour of text beside a picture
 _RAMP = (PAPER, "#a9c4c9", "#4f7f8e", "#24404c")  # colours of a mesh from its lowest visible height to its highest
 _DPI = 100
 PIXELS = 900  # longer side of the axes: 14 pixels a mm for the published pad, about six for a ridge
-_FLAT = 1e-3  # mm or slope: a face is flat below it, and vertical if z of its normal is below it
+_FLAT = 1e-3  # height, mm, below which a face is flat, and z of the normal below which it is vertical
 _MARGIN_LEFT, _MARGIN_RIGHT, _MARGIN_TOP, _MARGIN_BOTTOM = 66, 24, 44, 62  # pixels, for title, ticks and axis labels
 _COLUMNS = 3  # entries in a row of the legend
 _LINE = 15  # height of a line of the note below the legend, pixels
@@ -165,8 +165,8 @@ def _draw_layer(picture: "_Picture", plan: Plan, layer: FibreLayer) -> list[Any]
 # Orientation
 
 TURN_DEG = 20.0  # example of the angle of the pad in use under the arm
-_WIDTH_MM = 64.0  # of a panel
-_HEIGHT_MM = 56.0  # of a panel
+_WIDTH_MM = 64.0  # width of a panel
+_HEIGHT_MM = 56.0  # height of a panel
 _HALF_MM = 21.0  # half the side of the mould in a panel
 _PANELS = (
     ("1  In the mould", "tracks down, numbers mirrored"),
@@ -294,25 +294,26 @@ def draw_crossing(plan: Plan, path: Path) -> None:
     The pad is turned over, and adhesive covers both fibres.
     """
     fibre_mm, width = plan.settings.fibre.material.diameter_mm, plan.settings.mould.ridge_width_mm
-    depths = [[(plan.depths_mm[plan.layer_indices[k]], k) for k in (c.first, c.second)] for c in plan.crossings]
-    (upper, above), (lower, below) = sorted(min(depths, key=lambda pair: abs(pair[0][0] - pair[1][0])))
+    pairs = [[(plan.depths_mm[plan.layer_indices[k]], k) for k in (c.first, c.second)] for c in plan.crossings]
+    narrowest = min(pairs, key=lambda pair: abs(pair[0][0] - pair[1][0]))
+    (upper_mm, upper), (lower_mm, lower) = sorted(narrowest)
     half, bottom = 4 * width, -plan.thickness_mm
     picture = _Picture((-2 * half, bottom, 2 * half, -bottom / 6), drawings.CROSSING_CAPTION, 4)
     axes, seal = picture.axes, "#e9dfb8"
     axes.set(xlabel="along the upper fibre (mm)", ylabel="height over the face (mm)")
     handles = picture.box(-2 * half, bottom, 4 * half, -bottom, PAPER, f"silicone, {plan.thickness_mm:g} mm")
-    handles += picture.box(-2 * half, -upper, 4 * half, upper, seal, "adhesive")
-    picture.box(-width / 2, -lower, width, lower, seal)
-    label, colour = f"fibre {above + 1}, in a track {upper:.3g} mm deep", FAMILY_COLOURS[plan.family(above)]
-    handles += picture.box(-2 * half, -upper, 4 * half, fibre_mm, colour, label)
-    turn = np.linspace(0, 2 * np.pi, 60)
-    round_ = fibre_mm / 2 * np.column_stack([np.cos(turn), np.sin(turn)]) + (0, fibre_mm / 2 - lower)
-    label, colour = f"fibre {below + 1}, in a track {lower:.3g} mm deep", FAMILY_COLOURS[plan.family(below)]
-    handles += axes.fill(*round_.T, facecolor=colour, edgecolor=_EDGE, linewidth=0.5, label=label)
-    gap_mm = lower - upper - fibre_mm
+    handles += picture.box(-2 * half, -upper_mm, 4 * half, upper_mm, seal, "adhesive")
+    picture.box(-width / 2, -lower_mm, width, lower_mm, seal)
+    label, colour = f"fibre {upper + 1}, in a track {upper_mm:.3g} mm deep", FAMILY_COLOURS[plan.family(upper)]
+    handles += picture.box(-2 * half, -upper_mm, 4 * half, fibre_mm, colour, label)
+    angle = np.linspace(0, 2 * np.pi, 60)
+    circle = fibre_mm / 2 * np.column_stack([np.cos(angle), np.sin(angle)]) + (0, fibre_mm / 2 - lower_mm)
+    label, colour = f"fibre {lower + 1}, in a track {lower_mm:.3g} mm deep", FAMILY_COLOURS[plan.family(lower)]
+    handles += axes.fill(*circle.T, facecolor=colour, edgecolor=_EDGE, linewidth=0.5, label=label)
+    gap_mm = lower_mm - upper_mm - fibre_mm
     if gap_mm > 0:
-        axes.plot([width, width], [-upper, -lower + fibre_mm], "|-", color=INK, linewidth=1)
-        axes.text(1.3 * width, (fibre_mm - upper - lower) / 2, f"{gap_mm:.2g} mm", va="center", color=INK)
+        axes.plot([width, width], [-upper_mm, -lower_mm + fibre_mm], "|-", color=INK, linewidth=1)
+        axes.text(1.3 * width, (fibre_mm - upper_mm - lower_mm) / 2, f"{gap_mm:.2g} mm", va="center", color=INK)
     picture.save(path, handles)
 
 

@@ -24,7 +24,7 @@ MAX_BYTES = 3_000_000  # maximum size of a packed mesh; base64 makes 4 MB of it,
 _STEPS = np.iinfo(np.uint16).max  # steps of a coordinate along a side of the bounding box
 _TOLERANCES_MM = (0.01, 0.02, 0.05, 0.1, 0.2)  # tried in order for a large mesh; the last is half a common nozzle
 _PICTURES = ("mould.stl", "mould.png", "tracks.png", "toolpath.svg", drawings.ORIENTATION_FILE, drawings.CROSSING_FILE)
-_MAX_POSITIONS = 3
+_MAX_POSITIONS = 3  # positions of a finding in a table
 _VIEW = """\
 <figure class="view" id="mould-view" hidden>
 <canvas tabindex="0" role="application" aria-label="{label}"></canvas>
@@ -51,8 +51,8 @@ class PackedMesh:
     low_mm: NDArray[np.float64]  # corner of the box around it; shape (3,)
     size_mm: NDArray[np.float64]  # sides of the box; shape (3,)
     vertices: NDArray[np.uint16]  # positions in the box, 0 to 65535 along each side; shape (n, 3)
-    triangles: NDArray[np.uint16] | NDArray[np.uint32]  # of two bytes if these suffice; shape (m, 3)
-    tolerance_mm: float  # that it was simplified to; 0 if it was not
+    triangles: NDArray[np.uint16] | NDArray[np.uint32]  # vertex indices, of two bytes if these suffice; shape (m, 3)
+    tolerance_mm: float  # tolerance to which it was simplified; 0 if it was not
 
     @property
     def nbytes(self) -> int:

@@ -1,7 +1,7 @@
 """Assembly of a recording from the arrays of a foreign file: readings, their times, and presses.
 
-Values that cannot be right are corrected if the correction is certain, with a note, or else refused, with the mapping
-that would be right.
+Values that cannot be right are corrected, with a note, if the correction is certain. Otherwise they are refused, and
+the message names the mapping that would be right.
 """
 
 import re
@@ -32,10 +32,10 @@ Arrays = Sequence[tuple[ColumnEntry, NDArray[Any]]]
 """Arrays of a file, each with its entry of the mapping."""
 MEASURES = {"depth": "depths_mm", "reached": "reached_mm", "force": "forces_n"}
 """Quantities with one value a press, and their attributes of a `Recording`."""
-MAX_GAP = 3  # readings without a position that are bridged within a press
-MAX_JITTER_MM = 0.5  # change of a position, measured by an arm or camera within a press, from one reading to the next
-MAX_NOISE_SHARE = 0.1  # size of a negative force relative to the largest one: the offset of a load cell
-MAX_LATE_SHARE = 0.01  # fraction of readings that are left out since their times go back
+MAX_GAP = 3  # maximum readings without a position that are bridged within a press
+MAX_JITTER_MM = 0.5  # maximum change from one reading to the next of a position measured within a press
+MAX_NOISE_SHARE = 0.1  # maximum negative force, relative to the largest one, that is the offset of a load cell
+MAX_LATE_SHARE = 0.01  # maximum fraction of readings that are left out since their times go back
 WRAPS_S = (2**32 / 1e6, 2**32 / 1e3, 2**16 / 1e3, 2**16 / 1e6, 86400.0, 43200.0)
 """Periods of the clocks of boards: counters of us and ms with 32 and 16 bits, and times of day."""
 
@@ -44,8 +44,8 @@ WRAPS_S = (2**32 / 1e6, 2**32 / 1e3, 2**16 / 1e3, 2**16 / 1e6, 86400.0, 43200.0)
 class ForeignArrays:
     """The content of a file, read by a mapping.
 
-    Of the arrays, `time` and `press` have R values; `fibres` is (R, C), (C, R), (R,) or frames (R, h, w), in one array
-    or several; `positions` is (n, 2) or (2, n), and x and y are (n,), for n readings or presses.
+    The arrays `time` and `press` have R values; `fibres` is one or more arrays (R, C), (C, R), (R,) or frames
+    (R, h, w). `positions` is (n, 2) or (2, n), and x and y are (n,), for n readings or n presses.
     """
 
     path: Path
@@ -54,15 +54,15 @@ class ForeignArrays:
     notes: list[str] = field(default_factory=list)  # a line for each omission in reading
     line_number: Callable[[int], int] | None = None  # returns the line of a row, for messages; by default rows, from 0
     is_own: bool = False  # whether padforge wrote the file, so that positions are exact and every line is a reading
-    is_held: bool = False  # whether values hold until the next one, so that a position does not mean a press
+    is_held: bool = False  # whether each value was repeated up to the next one; then a position does not mean a press
 
 
 def assemble_recording(content: ForeignArrays, presses: Arrays = ()) -> Recording:
     """Return the recording in the arrays of a file; `presses` from a separate table replace those in the file.
 
-    Presses are defined by `down_command` and `up_command`, or else by `press`, or else by positions that are missing
-    between presses; otherwise they are detected in the readings. Of positions, depths and forces with one value a
-    reading, a press gets the one in its middle. Raises InputError for arrays that are inconsistent or no recording.
+    Presses are defined by the first of these that the file has: `down_command` and `up_command`; `press`; positions
+    that are missing between presses. Otherwise they are detected in the readings. Where positions, depths or forces
+    have one value a reading, a press gets the value in its middle. Raises InputError if the arrays are inconsistent.
     """
     with naming_file(content.path):
         return _assemble(content, presses)
@@ -76,8 +76,10 @@ def _assemble(content: ForeignArrays, presses: Arrays) -> Recording:
         values = _scale(entry, entry.select(array))
         if entry.quantity == "fibres":
             fibres.append((entry, values))
-        elif entry.quantity == "positions" or values.size in values.shape:
-            columns[entry.quantity] = values if entry.quantity == "positions" else values.ravel()
+        elif entry.quantity == "positions":
+            columns["positions"] = values
+        elif values.size in values.shape:  # a row or a column
+            columns[entry.quantity] = values.ravel()
         else:
             raise InputError(f"{entry.quantity} has shape {values.shape}, expected one row or column")
     if "rate" in columns:
@@ -93,20 +95,20 @@ def _assemble(content: ForeignArrays, presses: Arrays) -> Recording:
             raise InputError(f"fibres rest at {level_v:.4g} V, allowed is {MAX_VOLTS:g} V; are they {hint}?")
     names = [name for each in fibres for name in _fibre_names(*each)]
     # 1. Leave out lines without a reading, and repair times.
-    with_values = {name: values for name, values in columns.items() if len(values) == len(times)}
-    keep, is_held = np.ones(len(times), bool), content.is_held
+    by_line = {name: values for name, values in columns.items() if len(values) == len(times)}
+    is_reading, is_held = np.ones(len(times), bool), content.is_held
     if not content.is_own:
-        keep = ~np.isnan(readings).all(axis=1)
-        if not keep.all() and keep.any():
-            present = [~np.isnan(values.reshape(len(times), -1)).all(axis=1) for values in with_values.values()]
-            if present and not np.any(present & keep):  # a table of several sources, which write separate lines
+        is_reading = ~np.isnan(readings).all(axis=1)
+        if not is_reading.all() and is_reading.any():
+            present = [~np.isnan(values.reshape(len(times), -1)).all(axis=1) for values in by_line.values()]
+            if present and not np.any(present & is_reading):  # readings and other values are logged in separate lines
                 is_held = True
-                columns |= {name: _hold(values) for name, values in with_values.items()}
-            notes.append(f"{(~keep).sum()} lines without any reading are no readings")
-    rows, times = _repair_times(np.where(keep, times, np.nan), keep, notes, content.line_number)
-    if len(rows) < len(keep):
+                columns |= {name: _hold(values) for name, values in by_line.items()}
+            notes.append(f"{(~is_reading).sum()} lines without a value of any fibre are not read as readings")
+    rows, times = _repair_times(np.where(is_reading, times, np.nan), is_reading, notes, content.line_number)
+    if len(rows) < len(is_reading):
         readings = readings[rows]
-        columns = {name: values[rows] if len(values) == len(keep) else values for name, values in columns.items()}
+        columns |= {name: columns[name][rows] for name in by_line}
     # 2. Find the presses.
     timed = {entry.quantity for entry, _ in arrays if entry.factor is not None}
     for name in timed & {"down_command", "up_command"}:
@@ -114,7 +116,7 @@ def _assemble(content: ForeignArrays, presses: Arrays) -> Recording:
         tolerance = 1e-3 * np.median(np.diff(times)) if len(times) > 1 else 0.0
         columns[name] = np.searchsorted(times, columns[name] - tolerance).astype(np.float64)
     columns = _within(columns, len(times), notes) if presses else columns
-    positions, rows = _join_positions(columns), np.arange(len(times))
+    positions, position_rows = _join_positions(columns), np.arange(len(times))
     jitter_mm = 0.0 if content.is_own else MAX_JITTER_MM
     if positions is not None and not content.is_own:
         is_half = np.isnan(positions).any(axis=1)
@@ -122,9 +124,9 @@ def _assemble(content: ForeignArrays, presses: Arrays) -> Recording:
             notes.append(f"{n_half} positions have one of x and y, and count as missing")
             positions = np.where(is_half[:, None], np.nan, positions)
     if positions is not None and len(positions) == len(times) and not {"press", "down_command"} & columns.keys():
-        rows = _bridge_gaps(positions, jitter_mm)
-        positions, n_bridged = positions[rows], int((rows != np.arange(len(rows))).sum())
-        if n_bridged:
+        position_rows = _bridge_gaps(positions, jitter_mm)
+        positions = positions[position_rows]
+        if n_bridged := int((position_rows != np.arange(len(times))).sum()):
             notes.append(f"{n_bridged} readings within presses lack a position; gaps of up to {MAX_GAP} are bridged")
     commands = _find_presses(columns, None if is_held else positions, len(times), jitter_mm)
     source = {**content.source, FIBRE_NAMES: names}
@@ -139,14 +141,16 @@ def _assemble(content: ForeignArrays, presses: Arrays) -> Recording:
         if len(values) == len(down):
             return values
         if len(values) != len(times):
-            expected = f"one for each of {len(down)} presses or {len(times)} readings"
-            raise InputError(f"{name} are {len(values)}, expected {expected}")
-        return values[rows[np.clip((down + up) // 2, 0, len(times) - 1)]]
+            n_expected = f"{len(down)} presses or {len(times)} readings"
+            raise InputError(f"{name} are {len(values)}, expected one for each of {n_expected}")
+        return values[position_rows[np.clip((down + up) // 2, 0, len(times) - 1)]]
 
+    # 3. Give each press its depth, force and position.
     measures = {name: at_presses(MEASURES[name], columns[name]) for name in MEASURES if name in columns}
-    entries = {entry.quantity: entry for entry, _ in arrays}  # the last one, that of the table of presses, counts
-    for name in [name for name in ("depth", "force") if name in measures]:
-        measures[name] = _upright(entries[name], measures[name], notes)
+    entries = {entry.quantity: entry for entry, _ in arrays}  # those of the table of presses replace earlier ones
+    for name in ("depth", "force"):
+        if name in measures:
+            measures[name] = _correct_sign(entries[name], measures[name], notes)
     presses_mm = np.full((len(down), 2), np.nan) if positions is None else at_presses("positions", positions)
     presses_mm = np.where(presses_mm == UNKNOWN, np.nan, presses_mm)
     source |= {NOTE: "; ".join(notes)} if notes else {}
@@ -168,7 +172,7 @@ def _scale(entry: ColumnEntry, array: NDArray[Any]) -> Array:
 def _by_readings(values: Array, n_readings: int) -> Array:
     """Return (R, c) readings from (R, c), (c, R), (R,), or frames with R along their first or last axis."""
     if values.ndim == 0 or n_readings not in (values.shape[0], values.shape[-1]):
-        expected = f"({n_readings}, C) or (C, {n_readings}), as time has it"
+        expected = f"({n_readings}, C) or (C, {n_readings}), {n_readings} as in time"
         raise InputError(f"fibres have shape {values.shape}, expected {expected}")
     by_readings = values if len(values) == n_readings else np.moveaxis(values, -1, 0)
     return by_readings.reshape(n_readings, -1)
@@ -192,10 +196,10 @@ def _hold(values: Array) -> Array:
 def _repair_times(
     times_s: Array, is_reading: Mask, notes: list[str], line_number: Callable[[int], int] | None
 ) -> tuple[Indices, Array]:
-    """Return the rows (n,) of readings with a time, and their times (n,), which ascend, from those of all rows (R,), s.
+    """Make the times (R,) of all rows ascend; return the rows (n,) of the remaining readings, and their times (n,), s.
 
-    The wrap of a clock is added; readings whose times are missing (NaN) or go back are left out if they are few,
-    otherwise InputError is raised; equal times are spread between their neighbours. Each correction adds to the notes.
+    Wraps of a clock are undone. Readings whose times are missing (NaN) or go back are left out if they are few;
+    otherwise InputError is raised. Equal times are spread between their neighbours. Each correction adds a note.
     """
 
     def name_rows(rows: Indices) -> str:
@@ -217,7 +221,7 @@ def _repair_times(
     offsets, n_wraps = np.zeros(len(times)), 0
     for row in np.flatnonzero(steps < 0):
         for wrap in WRAPS_S:
-            # A wrap needs a clock just below it, and a period of many readings; otherwise two lines were swapped.
+            # A clock wraps just below its period, which spans many readings; otherwise two lines were swapped.
             if 0 < steps[row] + wrap <= 5 * usual < 0.1 * wrap and 0 <= times[row] < wrap:
                 offsets[row + 1 :] += wrap
                 n_wraps += 1
@@ -253,7 +257,7 @@ def _repair_times(
 
 def _longest_ascent(values: Array) -> Indices:
     """Return the indices of the longest subsequence that never descends, by patience sorting."""
-    tails: list[float] = []
+    tails: list[float] = []  # lowest last value of a subsequence, by its length
     tail_rows: list[int] = []
     before = np.full(len(values), -1)
     for row, value in enumerate(values.tolist()):
@@ -277,8 +281,11 @@ def _within(columns: Mapping[str, Array], n_readings: int, notes: list[str]) -> 
     return {name: values[is_within] if len(values) == len(down) else values for name, values in columns.items()}
 
 
-def _upright(entry: ColumnEntry, values: Array, notes: list[str]) -> Array:
-    """Return depths or forces of presses; a force little below 0 becomes 0, and a sign that is inverted is refused."""
+def _correct_sign(entry: ColumnEntry, values: Array, notes: list[str]) -> Array:
+    """Return depths or forces of presses; a depth of 0 becomes NaN, a force little below 0 becomes 0.
+
+    Raises InputError if most are negative, since then the sign is inverted.
+    """
     if 2 * (values < 0).sum() > (~np.isnan(values)).sum():
         factor = -1 if entry.factor is None else -entry.factor
         what = f"{entry.quantity} is below 0 in most presses, such as {np.nanmin(values):g}"
@@ -331,23 +338,22 @@ def _find_presses(
     if not pressed.any() or pressed.all():
         return None
     down, up = _find_runs(positions, pressed, jitter_mm)
-    # Positions that are known from some reading on do not tell when the pad is pressed.
-    is_late = jitter_mm > 0 and len(down) > 1 and pressed[down[0] :].all()
-    return None if is_late else (down, up)
+    # Measured positions that never end once they have begun do not show when the pad is pressed.
+    is_endless = jitter_mm > 0 and len(down) > 1 and pressed[down[0] :].all()
+    return None if is_endless else (down, up)
 
 
 def _bridge_gaps(positions: Array, jitter_mm: float) -> Indices:
     """Return the row (R,) of the positions (R, 2) for each reading: its own, or in a short gap the last one before it.
 
-    A short gap has at most MAX_GAP readings, fewer than half of a rest between presses, and the same position before
-    and after it.
+    A short gap has at most MAX_GAP readings, fewer than half as many as the median rest between presses, and the same
+    position before and after it.
     """
     positioned = np.flatnonzero(~np.isnan(positions[:, 0]))
     before, after = positioned[:-1], positioned[1:]
     n_missing = after - before - 1
-    is_same = (np.abs(positions[after] - positions[before]) <= jitter_mm).all(axis=1) & (
-        positions[before, 0] != UNKNOWN
-    )
+    is_known = positions[before, 0] != UNKNOWN
+    is_same = is_known & (np.abs(positions[after] - positions[before]) <= jitter_mm).all(axis=1)
     rests = n_missing[~is_same & (n_missing > 0)]
     max_gap = min(MAX_GAP, (np.median(rests) - 1) // 2) if len(rests) else 0
     rows = np.arange(len(positions))

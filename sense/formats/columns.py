@@ -93,9 +93,8 @@ def parse_columns(text: str, quantities: Sequence[str] = DATASETS) -> list[Colum
         if quantity not in named and not (quantity == "time" and "rate" in named):
             expected = f"expected {' and '.join(required)}"
             if quantity == "time":  # other tables hold a line per press
-                expected += (
-                    ", or rate=HZ of regular readings; features of whole presses are for Localizer.fit in Python"
-                )
+                advice = "features of whole presses are for Localizer.fit in Python"
+                expected += f", or rate=HZ of regular readings; {advice}"
             raise InputError(f"columns {short_repr(text)} do not name {quantity}, {expected}")
     for one, other in (("x", "y"), ("down_command", "up_command")):
         if (one in named) != (other in named):
@@ -146,14 +145,14 @@ def matches(name: str, pattern: str) -> bool:
     """Return whether a name is that of an entry, or matches its pattern."""
     if (span := re.fullmatch(r"(\d+)-(\d+)", pattern)) and name.isdecimal():
         return int(span[1]) <= int(name) <= int(span[2])
-    return name == pattern or fnmatchcase(name, pattern.replace("[", "[[]"))  # a bracket is literal: it holds a unit
+    return name == pattern or fnmatchcase(name, pattern.replace("[", "[[]"))  # a bracket holds a unit
 
 
 def match_columns(entries: Sequence[ColumnEntry], names: Sequence[str]) -> list[tuple[ColumnEntry, int]]:
-    """Return an entry, with the name of its column, and an index for each column that entries name; fibres come last.
+    """Return, for each column that an entry names, that entry with the column's name, and its index; fibres come last.
 
-    A pattern excludes the columns of earlier entries. Columns of one pattern whose names differ only by a number are
-    in the order of that number, others in the order of the file.
+    A pattern does not match the columns of earlier entries. Columns of one pattern whose names differ only by a number
+    are in the order of that number, others in the order of the file.
     """
     matched: list[tuple[ColumnEntry, int]] = []
     used: set[int] = set()

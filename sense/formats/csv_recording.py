@@ -107,9 +107,8 @@ def describe_table(path: Path, encoding: str = "") -> list[str]:
     values = table.read_columns(range(len(table.names)))
     lines = [f"table of {len(values)} lines, text in {table.encoding}" + ("" if table.has_header else ", no header")]
     for name, unit, *cells in zip(table.names, table.units, *table.rows[:3], strict=True):
-        lines.append(
-            f"{name or '(no name)'}{f' [{unit}]' if unit else ''}: {', '.join(cell or '-' for cell in cells)}, ..."
-        )
+        in_unit, first_values = f" [{unit}]" if unit else "", ", ".join(cell or "-" for cell in cells)
+        lines.append(f"{name or '(no name)'}{in_unit}: {first_values}, ...")
     return lines + table.notes
 
 

@@ -131,7 +131,7 @@ def _map_arrays(
 def check_no_presses(presses: Arrays) -> None:
     """Raise InputError if there is a separate table of presses for a complete recording."""
     if presses:
-        raise InputError("holds presses of its own, expected --columns for readings beside --presses")
+        raise InputError("holds presses itself, expected no --presses, or --columns that name its readings")
 
 
 def describe_arrays(path: Path) -> list[str]:

@@ -187,7 +187,7 @@ def _write_table(path: Path, table: "pa.Table", starts: Sequence[int] = (0,), en
 
 
 def _statistics(values: _Column) -> dict[str, Any]:
-    """Return the statistics of each of k values over the frames; missing ones are left out, zeros if all are."""
+    """Return the statistics of each of k values over the frames that have it; zeros if none has."""
     rows = values.reshape(len(values), -1).astype(np.float64)
     rows = np.where(np.isnan(rows).all(axis=0), 0.0, rows)
     quantile = np.nanquantile if np.isnan(rows).any() else np.quantile  # the same in a tenth of the time

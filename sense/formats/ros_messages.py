@@ -35,7 +35,7 @@ FRAME, ARM_FRAME = "pad", "base"
 _POSITION = ("pose.pose.position.x", "pose.pose.position.y", "pose.pose.position.z", "pose.covariance")
 DEPTH_VARIANCE = 14  # index of the variance of z in a covariance of 6 x 6; those of x and y are 0 and 7
 UNKNOWN_VARIANCE = -1.0  # variance of an unknown quantity, as in `sensor_msgs/msg/Imu`
-Z90 = 1.6449  # a normal variable is within so many standard deviations in 90 % of cases
+Z90 = 1.6449  # half-width of the central 90 % of a normal distribution, in standard deviations
 _INDICES = ("down_command", "up_command")
 _NUMBERS = ("times_s", "presses_mm", "depths_mm", "reached_mm", "forces_n")
 
@@ -55,8 +55,8 @@ TOPICS = {
     PRESSED: TopicType("std_msgs/msg/Bool", "true while the probe is sent down", ("data",)),
     PLACE: TopicType(
         "geometry_msgs/msg/PoseWithCovarianceStamped",
-        "m, z is minus the depth commanded (plus, where the pad lay mirrored: frames are right-handed); "
-        "covariance 0 is as commanded, -1 unknown; unknown positions are left out",
+        "m, z is minus the commanded depth, or plus it if the pad lay mirrored, since frames are right-handed; "
+        "covariance is 0 if commanded, -1 if unknown; unknown positions are left out",
         _POSITION,
     ),
     REACHED: TopicType(

@@ -50,7 +50,7 @@ _FIELDS = dict.fromkeys(QUANTITIES, "data") | {
     "positions": r"(.*\.)?(position|point)\.[xy]|[xy]",
     "force": r"(.*\.)?force\.[xyz]|data",
 }
-"""Numbers of a message that are a quantity, by the paths that std_msgs and geometry_msgs have."""
+"""Patterns of the paths at which messages of std_msgs and geometry_msgs hold each quantity."""
 _Arrays = list[tuple[ColumnEntry, NDArray[Any]]]
 
 
@@ -244,7 +244,7 @@ def _decode_entry(entry: ColumnEntry, raw: Mapping[str, ros.RawMessages]) -> ros
         paths = [path for path in counts if re.fullmatch(_FIELDS[entry.quantity], path.removeprefix(f"{field}."))]
         paths = [field] if field in counts else paths
         is_vector = field in counts or entry.quantity == "fibres" or all(counts[path] == 1 for path in paths)
-        if is_vector and 0 < len(paths) <= 3:  # with several positions or forces, one is to be named
+        if is_vector and 0 < len(paths) <= 3:  # of several positions or forces, the mapping must name one
             return ros.decode(raw[name], paths)
         fields = join_names(list(counts))
     has = f"name one of its fields as {name}.FIELD: {fields}" if counts else "which holds no numbers"
@@ -287,7 +287,7 @@ def _hold(stamps: Indices, values: Array, clock: Indices) -> Array:
     """Return the last of the values (n, ...) at or before each reading; shape (R, ...), NaN before the first value."""
     last = np.searchsorted(stamps, clock, side="right") - 1
     if len(stamps) == len(clock) and np.array_equal(stamps, clock):
-        return values  # also if stamps repeat
+        return values  # row by row, since stamps may repeat
     held = values[np.maximum(last, 0)]
     held[last < 0] = np.nan
     return held

@@ -153,13 +153,13 @@ class BufferedPress:
     up_command: int | None = None  # first reading after the command up; None while the press is held
     up_s: float = 0.0  # time of `up_command`
     finger: int = 1  # see `Estimate`
-    other: "BufferedPress | None" = None  # that of the finger held before; its relaxation is no part of this one
+    other: "BufferedPress | None" = None  # press of the finger that was held before, whose relaxation is subtracted
     fixed: Estimate | None = None  # last estimate before another finger changed the readings
-    course: PressCourse | None = None  # expected, at the last position
-    _opening: Array | None = None
+    course: PressCourse | None = None  # expected course at the last position
+    _opening: Array | None = None  # readings around `down_command`, see `store_opening`
 
     def relaxation(self, rows: Indices) -> Array:
-        """Return how the response to the other finger changes from `down_command` to readings (n,); (n, C), V."""
+        """Return the change (n, C), V, of the response to the other finger from `down_command` to readings (n,)."""
         if self.other is None or self.other.course is None:
             return np.zeros((len(rows), 1))
         response = self.other.course.response(np.append(rows, self.down_command) - self.other.down_command)
@@ -183,16 +183,17 @@ class BufferedPress:
         end of the previous press.
         """
         up_command = until if self.up_command is None else min(self.up_command, until)
-        opened = min(self.down_command + OPENING, until)
-        latest = max(up_command - LATEST, opened)
+        opening_end = min(self.down_command + OPENING, until)
+        latest = max(up_command - LATEST, opening_end)
         if self._opening is None:
-            opening = buffer.rows(self.down_command - LEAD, opened)[:, 1:]
+            opening = buffer.rows(self.down_command - LEAD, opening_end)[:, 1:]
         else:
-            opening = self._opening[: len(self._opening) + opened - (self.down_command + OPENING)]
-        first = opened - len(opening)
+            n_after_until = self.down_command + OPENING - opening_end
+            opening = self._opening[: len(self._opening) - n_after_until]
+        first, n_omitted = opening_end - len(opening), latest - opening_end
         readings = np.concatenate([opening, buffer.rows(latest, until)[:, 1:]])
-        readings = readings - self.relaxation(np.append(np.arange(first, opened), np.arange(latest, until)))
-        up = up_command - first - (latest - opened)
+        readings = readings - self.relaxation(np.append(np.arange(first, opening_end), np.arange(latest, until)))
+        up = up_command - first - n_omitted
         return readings, self.down_command - first, up, max(self.previous_end - first, 0)
 
 
@@ -244,7 +245,7 @@ class Live:
         response_v = (np.abs(scaler.mean_v) + 2 * scaler.scale_v)[:, :n_windows].max(axis=1)
         self._response_v = np.where(response_v > 0, response_v, 1.0)  # typical maximum, the scale of the view
         self._detector = PressDetector(fibres)
-        self._frames, self._last_s = FrameStream(rate_hz, fibres), -np.inf  # _last_s: last reading
+        self._frames, self._last_s = FrameStream(rate_hz, fibres), -np.inf  # frames, and time of the last reading
         self._buffer = RingBuffer(1 + fibres)  # times and voltages of frames
         self._presses: list[BufferedPress] = []  # current ones, in the order of their touches
         # A change that may be a second finger, and the estimate of the first one before it.
@@ -348,9 +349,9 @@ class Live:
     def _begin(self, touched: int) -> list[Event]:
         """Start a press, and return the remaining events of the previous one."""
         touched = max(touched, self._buffer.end - SLACK)  # a slow change may be recognised as a touch hours later
-        down_command = self._buffer.command_index(touched, TOUCH_DELAY_S)
-        free = [press.up_command + 1 for press in self._presses if press.up_command is not None]
-        down_command = max([down_command, *free])
+        # the command follows the releases of earlier presses, which end now
+        released = [press.up_command for press in self._presses if press.up_command is not None]
+        down_command = max([self._buffer.command_index(touched, TOUCH_DELAY_S), *(up + 1 for up in released)])
         events = self._cut(self._presses, down_command)
         self._candidate = self._lift = None
         down_command = max(down_command, self._previous_end + 1)
@@ -359,10 +360,8 @@ class Live:
         first = self._buffer.end - len(readings)
         down, previous_end = (np.array([max(index - first, 0)]) for index in (down_command, self._previous_end))
         baseline, history = mean_at_rest(readings, down, previous_end), compute_history(readings, down)
-        press = BufferedPress(
-            self._n_presses, time_s, touched, down_command, self._previous_end, baseline, baseline, history
-        )
-        self._add(press)
+        begin = self._n_presses, time_s, touched, down_command, self._previous_end
+        self._add(BufferedPress(*begin, baseline, baseline, history))
         return events
 
     def _add(self, press: BufferedPress) -> None:
@@ -375,7 +374,7 @@ class Live:
         return [event for press in list(presses) for event in self._follow(press, end)]
 
     def _end(self, released: int) -> list[Event]:
-        """End the press whose release shows at a reading; which one of two that is, `_tell_released` finds out."""
+        """End the press whose release shows at a reading; of two, `_release_lifted` finds later which one it was."""
         self._candidate, held = None, self._held
         if not held or self._lift is not None:
             return []
@@ -388,7 +387,7 @@ class Live:
         return events
 
     def _suspect(self, touched: int) -> None:
-        """Consider a change under a press, from a reading on, for the touch of a second finger."""
+        """Make a change that begins at a reading, during a press, the candidate for a second finger."""
         held = self._held
         if len(held) != 1 or self._localizer.features != "windows":
             return
@@ -404,7 +403,7 @@ class Live:
         press = BufferedPress(
             self._n_presses, time_s, touched, down_command, sunk_in, first.untouched, first.baseline, first.history
         )
-        press.finger, press.other = 3 - first.finger, first
+        press.finger, press.other = 3 - first.finger, first  # the other one of fingers 1 and 2
         if first.fixed is None:
             first.course = self._course(first, down_command, before)
         rows = np.arange(max(sunk_in, down_command + REST[0]), down_command)
@@ -421,7 +420,7 @@ class Live:
         """Return the events at the latest reading."""
         events: list[Event] = []
         if self._lift is not None and self._buffer.end >= self._lift + RELEASE_WINDOWS[LIFT_WINDOWS[-1]][1]:
-            events += self._tell_released(self._lift)
+            events += self._release_lifted(self._lift)
             self._lift = None
         elif self._candidate is not None:
             events += self._judge(*self._candidate)
@@ -430,7 +429,7 @@ class Live:
         return events
 
     def _judge(self, press: BufferedPress, before: Estimate) -> list[Event]:
-        """Follow a candidate if a second finger explains it; forget one that is complete and not explained."""
+        """Start the candidate as a press if a second finger explains it; drop it once it is complete without that."""
         first, until = self._held[0], self._buffer.end
         press.store_opening(self._buffer)
         n_complete = int(complete_windows(*(np.array([index]) for index in (press.down_command, until, until))).sum())
@@ -449,8 +448,8 @@ class Live:
             self._candidate = None
         return []
 
-    def _tell_released(self, lift: int) -> list[Event]:
-        """Release the one of two fingers, or both, whose release best explains the change since a reading."""
+    def _release_lifted(self, lift: int) -> list[Event]:
+        """Release that one of two fingers, or both, whose expected release best explains the change since a reading."""
         held, events = self._held, list[Event]()
         for press in held:
             if press.fixed is None:
@@ -459,25 +458,25 @@ class Live:
         courses = [press.course for press in held if press.course is not None]
         window = RELEASE_WINDOWS[LIFT_WINDOWS[0]][0], RELEASE_WINDOWS[LIFT_WINDOWS[-1]][1]
         after, before = (self._mean(lift + first, lift + end) for first, end in (window, (-3, 0)))
-        steps = np.array([course.changes_by_release[list(LIFT_WINDOWS)].mean(axis=0) for course in courses])
+        expected = np.array([course.changes_by_release[list(LIFT_WINDOWS)].mean(axis=0) for course in courses])
         sets, mask = ([0], [1], [0, 1]), courses[0].fibre_mask & courses[1].fibre_mask
-        errors = [float((((after - before) - steps[ends].sum(axis=0))[mask] ** 2).sum()) for ends in sets]
+        errors = [float((((after - before) - expected[lifted].sum(axis=0))[mask] ** 2).sum()) for lifted in sets]
         best, second_best = np.argsort(errors)[:2]
-        ends = sets[best]
+        lifted = sets[best]
         if errors[best] > MAX_ERROR_RATIO * errors[second_best]:
-            ends = [1]  # one counts as held on, but it may be either, so both count as of unknown position
+            lifted = [1]  # a guess: either may be the one that is still held, so both positions become unknown
             names, anywhere_mm = ("std_x_mm", "std_y_mm", "r50_mm", "r90_mm"), np.array(UNIFORM)[[0, 0, 1, 2]]
             radii_mm = dict(zip(names, (self._localizer.scaler.scale_mm * anywhere_mm).tolist(), strict=True))
             for press in held:
                 if press.fixed is not None:
                     press.fixed = replace(press.fixed, unlike=True, **radii_mm)
                     events.append(self._show(press.fixed))
-        elif ends == [1]:
-            held[1].fixed = None  # its release shows undisturbed, and locates it better
-        for number in ends:
+        elif lifted == [1]:
+            held[1].fixed = None  # only its own release changes the readings now, and locates it better
+        for number in lifted:
             held[number].release(lift, self._buffer)
-        if len(ends) == 1:
-            self._detector.hold(courses[1 - ends[0]].pressed[-1])
+        if len(lifted) == 1:
+            self._detector.hold(courses[1 - lifted[0]].pressed[-1])
         return events
 
     def _mean(self, first: int, end: int) -> Array:
@@ -498,18 +497,19 @@ class Live:
             until = min(until, end)
         events: list[Event] = []
         if press.fixed is not None:
-            events += [self._show(replace(press.fixed, final=True))] * is_complete
+            if is_complete:
+                events.append(self._show(replace(press.fixed, final=True)))
         elif is_complete or (self._localizer.features == "windows" and self._lift is None):
             # published features need a complete press, and after a lift it is not yet known which finger rests
             events.append(self._show(self._estimate(press, until, is_complete)))
         if press.up_command is not None and is_complete:
             if press.fixed is None and press.other is None:
                 events += [*self._check_pad(press, until), *self._check_fibres(press, until)]
-            elif self._monitor is not None:  # counts presses that it is not shown
+            elif self._monitor is not None:  # it skips this press, but numbers those after it
                 self._monitor.n_presses += 1
             self._previous_end = max(self._previous_end, press.up_command)
             self._presses.remove(press)
-            press.other = None  # fingers that take turns without a rest would be remembered for ever
+            press.other = None  # otherwise fingers that take turns without a rest form an endless chain
         return events
 
     def _estimate(self, press: BufferedPress, until: int, final: bool) -> Estimate:
@@ -572,7 +572,7 @@ class Live:
         return [OtherPad(press.number)] * (self.is_other_pad and not was_other_pad)
 
     def _check_fibres(self, press: BufferedPress, end: int) -> list[FibreFault]:
-        """Return the faults detected up to a complete press, once; none while the pad is taken for another one."""
+        """Return the faults that are detected and not yet returned; none while the pad is taken for another one."""
         if self._monitor is None:
             return []
         readings, down_command, up_command, previous_end = press.excerpt(self._buffer, end)

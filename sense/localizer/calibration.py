@@ -51,8 +51,8 @@ from padforge.sense.settings import LocalizerSettings
 FEW_PRESSES = 500  # up to which the plan of a pad predicts its response better than basis functions
 MIN_TRAINING = 3  # training presses that a split must leave, since fewer have no scale
 CALIBRATION_SHARE = {"ensemble": 0.08, "published": 0.15 / 0.85}
-"""Share of the presses not tested that calibrates the uncertainty: "published" 15 % of all if 15 % are tested, half of
-it for early stopping."""
+"""Share of the presses outside of the test that calibrates the uncertainty. For "published", early stopping takes half
+of it; if 15 % of all presses are tested, it is 15 % of all."""
 MAX_TIME_BUDGET_S = 1e9
 MIN_DEPTH_RANGE_MM = 0.2  # range of the central 90 % of depths, at or below which depth does not vary
 PRIOR_COUNT = 2  # weight of the expected error of a member in the calibration of its scale, in presses
@@ -66,15 +66,15 @@ MOMENT_SUBSETS = 4  # the same where there are several moments
 class Experience:
     """Errors of 26 other localizers at a moment of a press, as a prior for the radii.
 
-    They are of nine pads, simulated or published, and have the default size, all steps of training and 235 to 3500
-    training presses. The standard deviation of their mean ratios is `PAD_SPREAD`.
+    These localizers, of nine pads, simulated or published, had the default size and were trained in all steps on 235 to
+    3500 presses. The standard deviation of their mean ratios is `PAD_SPREAD`.
     """
 
-    growth_presses: float  # with n training presses, new presses err 1 + this / n times as much as expected
+    growth_presses: float  # after n training presses, errors on new ones are 1 + growth_presses / n times the expected
     mean_ratio: float  # mean of distance / r50 before calibration, growth included
 
     @staticmethod
-    def at(n_complete: int) -> "Experience":
+    def at_moment(n_complete: int) -> "Experience":
         """Return the experience when `n_complete` windows of a press are complete."""
         return TOUCH if n_complete < N_PRESS_WINDOWS else HELD if n_complete == N_PRESS_WINDOWS else RELEASE
 
@@ -83,9 +83,9 @@ class Experience:
         return 1 + self.growth_presses / n_trained
 
     def ratio(self, n_trained: int, failed_share: float) -> float:
-        """Return the mean ratio of distance to expected radius with a share of the fibres failed.
+        """Return the mean ratio of distance to expected radius when a share of the fibres has failed.
 
-        Errors grow less where fibres have failed, since they are large anyway.
+        Errors on new presses then grow less, since they are large in training already.
         """
         return self.mean_ratio * (1 - FAILURE_DECREASE * failed_share * (1 - 1 / self.growth(n_trained)))
 
@@ -93,10 +93,8 @@ class Experience:
 TOUCH = Experience(growth_presses=70, mean_ratio=0.78)
 HELD = Experience(growth_presses=180, mean_ratio=0.84)
 RELEASE = Experience(growth_presses=190, mean_ratio=0.73)
-FAILURE_DECREASE = 1.1
-"""Relative decrease of the growth of errors, per share of failed fibres."""
-PAD_SPREAD = 0.1
-"""Standard deviation of the mean ratio between pads, relative."""
+FAILURE_DECREASE = 1.1  # relative decrease of the growth of errors, per share of failed fibres
+PAD_SPREAD = 0.1  # relative standard deviation of the mean ratio between pads
 
 
 @dataclass(frozen=True)
@@ -110,8 +108,8 @@ class CalibrationData:
     feature_set: FeatureSet
     rate_hz: float
     sha256: str  # of the source
-    # features by number of complete windows and indices of presses; None for features without moments
-    at: Callable[[int, Indices], PressFeatures] | None = None
+    # returns features by number of complete windows and indices of presses; None for features without moments
+    features_at: Callable[[int, Indices], PressFeatures] | None = None
     pad: Morphology | None = None  # plan of the pad, as a prior
     contact: Contact = field(default_factory=Contact)
 
@@ -180,7 +178,7 @@ def fit_recording(
     time_budget: float | None = None,
     pad: Morphology | None = None,
 ) -> LocalizerModel:
-    """Train a localizer on the presses `training` of a recording, without a test; raises as `fit_model`."""
+    """Train a localizer on the presses `training` of a recording, without testing it; raises as `fit_model`."""
     from padforge.sense.signals.press_detection import align_to_detected  # compiled kernels take long to import
 
     on_progress(0, 0, "features")
@@ -193,13 +191,14 @@ def fit_recording(
     is_published = options.method == "published"
     features = compute_features(readings, *commands, is_published=is_published)
 
-    def at(n_complete: int, presses: Indices) -> PressFeatures:
+    def features_at(n_complete: int, presses: Indices) -> PressFeatures:
         until = complete_at(n_complete, *commands)
         return compute_features(readings, *commands, until, history=features.history)[presses]
 
     feature_set: FeatureSet = "published" if is_published else "windows"
     source = feature_set, recording.rate_hz, recording.digest
-    data = CalibrationData(features, detected, recording.presses_mm, measures, *source, None if is_published else at)
+    at_moments = None if is_published else features_at
+    data = CalibrationData(features, detected, recording.presses_mm, measures, *source, at_moments)
     if pad is not None:
         data = replace(data, pad=pad, contact=stated_contact(recording))
     return fit_model(data, training, options, rng, on_progress, time_budget)
@@ -216,9 +215,9 @@ def fit_model(
 ) -> LocalizerModel:
     """Train a localizer and calibrate its uncertainty.
 
-    A share of the presses, drawn as the split states, calibrates the uncertainty. The others are used in training as
-    commanded and, a second time, as detected. The published training has separate presses for early stopping, without
-    which its intervals would be too short.
+    A share of the presses, split off by `options.split`, calibrates the uncertainty. The others are trained on twice:
+    with their windows after the command, and after the detected touch. The published training stops early by presses of
+    its own; if it stopped by those that calibrate, intervals would be too short.
 
     Raises:
         InputError: too few presses, or a training that diverged.
@@ -245,8 +244,8 @@ def fit_model(
         leverage = fit.leverage
 
     # 2. Tests for single presses, networks and Bayesian localizers
-    left_out = leave_one_out_residuals(presses, table, leverage)
-    tests = tuple(SinglePressTest.fit(table, left_out, scaler.centring, n) for n in stages(n_timed))
+    unfitted = leave_one_out_residuals(presses, table, leverage)
+    tests = tuple(SinglePressTest.fit(table, unfitted, scaler.centring, n) for n in stages(n_timed))
     bayes, residual_network, trained_share = (), {}, 1.0
     if is_ensemble:
         trained = train_members(presses, table, options, rng, on_progress, time_budget, leverage)
@@ -271,20 +270,21 @@ def fit_model(
     )
 
     # 3. Uncertainty
-    if data.at is None:
+    if data.features_at is None:
         moments = [scaler.transform(data.features[calibration])]
     else:
-        moments = [scaler.transform(data.at(n_complete, calibration)) for n_complete in range(1, n_timed + 1)]
-    # without moments n is 0, and moments[-1] is the only entry
-    tests = tuple(test.calibrated(moments[n - 1]) for test, n in zip(tests, stages(n_timed), strict=True))
+        moments = [scaler.transform(data.features_at(n_complete, calibration)) for n_complete in range(1, n_timed + 1)]
+    stage_moments = [moments[n_complete - 1] if n_complete else moments[0] for n_complete in stages(n_timed)]
+    tests = tuple(test.calibrated(presses) for test, presses in zip(tests, stage_moments, strict=True))
     model = replace(model, single_press=tests)
     true_mm = data.positions_mm[calibration]
     true_measures = {name: values[calibration] for name, values in data.measures.items()}
     defaults = LocalizerSettings()
     is_default = all(getattr(options, name) == getattr(defaults, name) for name in ("members", "hidden", "layers"))
     is_converged = trained_share * options.epochs >= CONVERGED_SHARE * defaults.epochs
-    is_usual = is_default and is_ensemble and n_timed and not data.measures and is_converged
-    n_trained = len(train) if is_usual else None
+    # `Experience` is that with localizers of this kind alone
+    has_experience = is_default and is_ensemble and n_timed and not data.measures and is_converged
+    n_trained = len(train) if has_experience else None
     levels = _n_levels(options, model.fibres)
     return calibrate_uncertainty(model, moments, true_mm, levels, true_measures, on_progress, n_trained)
 
@@ -304,7 +304,7 @@ def calibrate_uncertainty(
         model: to calibrate.
         moments: features of the presses when 1, 2, ... windows are complete, or once for features without moments.
         positions_mm: of the presses; shape (Q, 2).
-        levels: most failed fibres, plus one.
+        levels: numbers of failed fibres to calibrate for, 0 .. `levels` - 1.
         measures: as in `evaluation.conformal`.
         on_progress: called with the stage of the work.
         n_trained: number of training presses, if the experience with other pads serves as a prior.
@@ -321,15 +321,13 @@ def calibrate_uncertainty(
     prior_ratios = None
     if n_trained:
         failed_shares = np.arange(levels) / model.fibres
-        experience = [Experience.at(n_complete) for n_complete in range(1, len(moments) + 1)]
+        experience = [Experience.at_moment(n_complete) for n_complete in range(1, len(moments) + 1)]
         expected = np.array([[each.ratio(n_trained, share) for share in failed_shares] for each in experience])
         prior_ratios = adapt_ratios(expected, predictions, positions_mm)
+    ratios = [[None] * levels] * len(moments) if prior_ratios is None else prior_ratios.tolist()
     factors: list[list[Array]] = [
-        [
-            conformal(of_set, positions_mm, measures, None if prior_ratios is None else prior_ratios[moment, n_failed])
-            for n_failed, of_set in enumerate(of_moment)
-        ]
-        for moment, of_moment in enumerate(predictions)
+        [conformal(sets, positions_mm, measures, ratio) for sets, ratio in zip(*of_moment, strict=True)]
+        for of_moment in zip(predictions, ratios, strict=True)
     ]
     if len(moments) > 1:
         factors = [factors[0], *factors]  # a placeholder for 0 complete windows, where nothing is predicted
@@ -340,13 +338,14 @@ def calibrate_uncertainty(
 def adapt_ratios(
     expected: Array, predictions: Sequence[Sequence[Sequence[Localization]]], positions_mm: Array
 ) -> Array | None:
-    """Adapt the mean ratios of distance to radius of other pads to a pad; None if its presses contradict them.
+    """Adapt mean ratios of distance to radius, known from other pads, to this pad; None if its presses contradict them.
 
-    The pad differs from the others by one factor, which is estimated from its presses and from `PAD_SPREAD`.
+    The ratios of this pad are taken as those of the others times one factor, which is estimated from the presses and a
+    prior about 1 of standard deviation `PAD_SPREAD`.
 
     Args:
-        expected: by moment and number of failed fibres; shape (K, L).
-        predictions: at each moment, for each number of failed fibres, with some sets of them.
+        expected: ratios by moment and number of failed fibres; shape (K, L).
+        predictions: by moment, by number of failed fibres, and for some sets of them.
         positions_mm: of the presses; shape (Q, 2).
     """
     ratios = [
@@ -361,6 +360,7 @@ def adapt_ratios(
 
 
 def _n_levels(options: LocalizerSettings, fibres: int) -> int:
+    """Return the count of numbers of failed fibres, 0 included, that a localizer is trained for."""
     return min(options.max_failures, fibres - 1) + 1 if options.method == "ensemble" else 1
 
 
@@ -374,24 +374,24 @@ def _calibrate_scales(
 ) -> LocalizerModel:
     """Scale the expected errors of members to their errors on presses that were not used in training.
 
-    This corrects the weights of the members: the Bayesian localizer is overconfident after few or badly placed presses,
-    since training presses are augmented by the response that it predicts them with. After `n_trained` presses, the mean
-    of the scales is known from other pads, and these presses determine the ratios between members alone.
+    The scales correct the weights of the members. The Bayesian localizer is overconfident after few or badly placed
+    presses, since it predicts training presses by the same response that augments them. If `n_trained` is given, the
+    mean of the scales is known from other pads, and the presses determine only the ratios between members.
     """
     positions = model.scaler.scale_positions(positions_mm)
     subsets = [
         failed for n_failed in range(levels) for failed in failure_subsets(model.fibres, n_failed, SCALE_SUBSETS)
     ]
 
-    # 1. Mean ratio of error to expected error of each member, by moment and set of failed fibres, with the expected
-    # ratio as the prior; `outputs` and `ratios` hold the members of each of `names` in turn
+    # 1. Mean ratio of error to expected error of each member, by moment and set of failed fibres, shrunk towards the
+    # expected ratio; the first axis of `outputs` and `ratios` holds the members of each of the networks `names` in turn
     ratios_of: dict[str, list[Array]] = {}  # by network
     n_presses = len(positions_mm)
     first = int(len(moments) > 1)
     for n_complete, features in enumerate(moments, first):
         on_progress(n_complete - first, len(moments), "expected errors")
-        growth = Experience.at(n_complete).growth(n_trained) if n_trained else 1.0
-        rows = np.flatnonzero(count_complete(features.complete) == n_complete)  # the next press may cut off some
+        growth = Experience.at_moment(n_complete).growth(n_trained) if n_trained else 1.0
+        rows = np.flatnonzero(count_complete(features.complete) == n_complete)  # the next press cut others short
         names = active_networks(model.networks, n_complete, features.complete.shape[1], bool(model.bayes))
         for failed in subsets if len(rows) else ():
             outputs = predict_members(model.networks, features[rows].without(failed), *model.corrected)
@@ -402,10 +402,9 @@ def _calibrate_scales(
             if n_trained:
                 ratios *= growth / ratios.mean()
             ratios = (PRIOR_COUNT * growth + n_presses * ratios) / (PRIOR_COUNT + n_presses)
-            for name in names:
-                n_members = 1 if name == RESIDUAL else len(model.networks[name]["last.b"])
-                ratios_of.setdefault(name, []).append(ratios[:n_members])
-                ratios = ratios[n_members:]
+            n_members = [1 if name == RESIDUAL else len(model.networks[name]["last.b"]) for name in names]
+            for name, of_network in zip(names, np.split(ratios, np.cumsum(n_members)[:-1]), strict=True):
+                ratios_of.setdefault(name, []).append(of_network)
 
     # 2. Scale of each member
     log_scales = {name: np.log(np.mean(ratios, axis=0)) for name, ratios in ratios_of.items()}
@@ -446,7 +445,7 @@ def _split_training(
 
 
 def trainable_targets(recording: Recording, presses: Indices) -> dict[str, Array]:
-    """Return the depths, if known, above 0 and varying in `presses`, and then forces if known there."""
+    """Return the depths, if they vary and are known and above 0 in all `presses`; then also forces, if known in all."""
     measures = recording.measures
     depth, force = (measures[name][presses] for name in ("depth_mm", "force_n"))
     if np.isnan(depth).any() or depth.min() <= 0 or np.ptp(np.percentile(depth, [5, 95])) <= MIN_DEPTH_RANGE_MM:
@@ -465,16 +464,16 @@ def missing_target_lines(recording: Recording, model: LocalizerModel) -> list[st
     if "depth_mm" not in predicted and n_shallow:
         return [f"depth is not learnt: {n_shallow} of {presses} presses reached 0 mm or less"]
     if "depth_mm" not in predicted and 0 < n_depth < presses:
-        return [f"depth is not learnt: it is known of {n_depth} of {presses} presses, needed is of all"]
+        return [f"depth is not learnt: it is known of {n_depth} of {presses} presses, expected all"]
     if "depth_mm" in predicted and "force_n" not in predicted and n_force:
-        return [f"force is not learnt: it is known of {n_force} of {presses} presses, needed is of all"]
+        return [f"force is not learnt: it is known of {n_force} of {presses} presses, expected all"]
     return []
 
 
 def split_unseen(
     recording: Recording, model: LocalizerModel | None, options: LocalizerSettings
 ) -> tuple[Indices, Indices]:
-    """Return presses of known position for training, and those for a test, which a `model` has not been trained on."""
+    """Split the presses of known position into those for training and those for a test, unseen by `model` if given."""
     positioned = np.flatnonzero(recording.has_position)
     if model is not None and (test := held_back_presses(model, recording)) is not None:
         return np.setdiff1d(positioned, test), test
@@ -498,7 +497,7 @@ def split_presses(
     Raises:
         InputError: fewer than `min_training` presses would be left.
     """
-    # a split within the training presses holds one back at least
+    # a further split of training presses, which has a lower `min_training`, holds back at least one
     n_held_back = max(round(share * presses), 1 if min_training < MIN_TRAINING else 0)
     if not 1 <= n_held_back <= presses - min_training:
         raise InputError(

@@ -47,7 +47,7 @@ MEASURE_COLUMNS = {"depth_mm": ("depth_mm", "depth_r90_mm"), "force_n": ("force_
 COLUMNS = ("press", "x_mm", "y_mm", "std_x_mm", "std_y_mm", "r50_mm", "r90_mm", "unlike")
 """Columns of `write_localization`; those of `MEASURE_COLUMNS` follow where depth and force are predicted."""
 Digest = Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
-_CHUNK = 2**16  # presses times fibres
+_CHUNK = 2**16  # presses times fibres that are predicted at once
 
 
 @dataclass(frozen=True)
@@ -68,8 +68,8 @@ class Localization:
         r50_mm: (Q,) radius that holds the true position in 50 % of cases.
         r90_mm: (Q,) radius that holds it in 90 % of cases.
         measures: depth and force by the names of `Recording.measures`, where they are predicted.
-        unlike: (Q,) whether two presses explain the responses much better than one, as of two fingers; the radii
-            of such a press are those of an unknown position. None if not tested.
+        unlike: (Q,) whether two presses, for example by two fingers, explain the responses much better than one; the
+            radii of such a press are those of an unknown position. None if not tested.
     """
 
     positions_mm: Array
@@ -113,8 +113,8 @@ class LocalizerDocument:
     features: FeatureSet
     rate_hz: Annotated[float, Field(ge=MIN_RATE_HZ, le=MAX_RATE_HZ)]  # of the training recording
     scaler: FeatureScaler
-    # (K + 1, L, 3 + T) by numbers of complete windows and of failed fibres: factors on predicted standard
-    # deviations that give calibrated ones, the radii of 50 and 90 %, and the r90 of T measures
+    # (K + 1, L, 3 + T), by numbers of complete windows and of failed fibres: factors by which predicted standard
+    # deviations become calibrated ones, radii of 50 and 90 %, and the r90 of T measures
     interval_factors: Annotated[Array, *array_field(1e-9, 1e6)]
     training_recording_sha256: Digest
     split: Split = "random"  # of training and test presses
@@ -122,7 +122,7 @@ class LocalizerDocument:
     recalibrated_by: tuple[Digest, ...] = ()  # recordings of recalibrations
     fibre_names: tuple[str, ...] = ()  # of the training recording, if it was imported
     pad_sha256: Digest | Literal[""] = ""  # `pad_digest` of the training recording
-    trained_share: Annotated[float, Field(gt=0, le=1)] = 1.0  # of the usual steps of a training
+    trained_share: Annotated[float, Field(gt=0, le=1)] = 1.0  # share of its usual steps that the training took
     radii_presses: Annotated[int, Field(ge=0)] = 0  # presses on which the factors were calibrated
     errors: Sequence[Mapping[str, int | float]] = ()  # rows of `evaluation.error_row` on the test presses
     provenance: Mapping[str, JsonValue] = field(default_factory=dict)
@@ -320,24 +320,24 @@ class LocalizerModel(LocalizerDocument):
         targets, std, slid = (np.concatenate(part) for part in zip(*parts, strict=True))
         fibre_mask, n_complete = presses.fibre_mask, count_complete(presses.complete)
         level = np.minimum((~fibre_mask).sum(axis=1), self.max_failures)
-        # a finger that slid is located as before it settled
+        # the network of the touch locates a finger that slid, even when it rests again
         factors = self.interval_factors[np.where(slid, N_PRESS_WINDOWS - 1, n_complete), level]
         to_std, to_r50, to_r90 = factors[:, :3].T * self.scaler.scale_mm
         radius = np.hypot(*std[:, :2].T)
         is_complete = n_complete > 0 if presses.complete.shape[1] else np.ones(len(presses), bool)
         has_fibres = fibre_mask.all(axis=1) if self.method == "published" else fibre_mask.any(axis=1)
-        blind = np.logical_not(is_complete & has_fibres)
-        anywhere = np.array(UNIFORM) * self.scaler.scale_mm
+        is_unknown = np.logical_not(is_complete & has_fibres)
+        unknown_std_mm, unknown_r50_mm, unknown_r90_mm = np.array(UNIFORM) * self.scaler.scale_mm
         measures = {}
         for column, target in enumerate(self.scaler.measures):
-            value = target.inverse_transform(np.where(blind, 0.0, targets[:, 2 + column]))
-            r90 = np.where(blind, 1.0, factors[:, 3 + column] * std[:, 2 + column])
+            value = target.inverse_transform(np.where(is_unknown, 0.0, targets[:, 2 + column]))
+            r90 = np.where(is_unknown, 1.0, factors[:, 3 + column] * std[:, 2 + column])
             measures[target.name] = MeasureEstimate(value, target.scale * r90)
         return Localization(
-            self.scaler.positions_mm(np.where(blind[:, None], 0.0, targets[:, :2])),
-            np.where(blind[:, None], anywhere[0], to_std[:, None] * std[:, :2]),
-            np.where(blind, anywhere[1], to_r50 * radius),
-            np.where(blind, anywhere[2], to_r90 * radius),
+            self.scaler.positions_mm(np.where(is_unknown[:, None], 0.0, targets[:, :2])),
+            np.where(is_unknown[:, None], unknown_std_mm, to_std[:, None] * std[:, :2]),
+            np.where(is_unknown, unknown_r50_mm, to_r50 * radius),
+            np.where(is_unknown, unknown_r90_mm, to_r90 * radius),
             measures,
         )
 
@@ -386,7 +386,7 @@ class LocalizerModel(LocalizerDocument):
             name = files.document.name
             raise InputError(f"{folder}: no {name}, expected a folder that `padforge sense calibrate` wrote") from error
         scaler = document.scaler
-        # for J = 0, [] has no last axis
+        # without history features (J = 0) the file holds empty lists, which lack the last axis
         coef = scaler.history_coef.reshape(*scaler.history_mean_v.shape, scaler.mean_v.shape[-1])
         document = replace(document, scaler=replace(scaler, history_coef=coef))
         n_timed = len(document.interval_factors) - 1

@@ -1,4 +1,4 @@
-"""Expected course of a press: what a finger that rests or lifts does to readings in which another one is localized."""
+"""Expected course of a press, which is subtracted from readings to localize another finger in them."""
 
 from dataclasses import dataclass
 
@@ -10,26 +10,26 @@ from padforge.sense.localizer.model import LocalizerModel
 from padforge.sense.localizer.moments import N_PRESS_WINDOWS, PRESS_MIDDLES
 from padforge.sense.localizer.response_model import interpolate_grid
 
-MAX_RATIO = 0.9  # of successive changes of a response that relaxes
+MAX_RATIO = 0.9  # maximum ratio of successive changes of a relaxing response
 MIN_V2 = 1e-15  # lower limit of sums of squares, V^2
 
 
 @dataclass(frozen=True)
 class PressCourse:
-    """Responses that the calibration expects of a press at a position, in proportion to the measured response.
+    """Response over time that the calibration expects of a press at a position, scaled to the measured response.
 
-    Responses are without the effect of earlier presses.
+    The effect of earlier presses is removed.
     """
 
     measured: Array  # (C,), V, in the latest complete window
-    expected: Array  # (C,), V, in the same
+    expected: Array  # (C,), V, in the same window
     fibre_mask: Mask  # (C,), valid fibres
     pressed: Array  # (len(PRESS_WINDOWS), C), V, expected
     released: Array  # (len(RELEASE_WINDOWS), C), V, expected
 
     @classmethod
     def fit(cls, model: LocalizerModel, features: PressFeatures, position_mm: Array) -> "PressCourse":
-        """Fit the proportion to the features of one press at a position (2,); the localizer is of windows."""
+        """Scale the expected response at a position (2,) to the features of one press, of the feature set "windows"."""
         scaler = model.scaler
         position = scaler.scale_positions(position_mm[None])
         scaled = np.stack([interpolate_grid(model.table, position)[0], scaler.transform(features).inputs[0]])
@@ -50,12 +50,12 @@ class PressCourse:
         return self.released - self.pressed[-1]
 
     def share_explained_by(self, other: "PressCourse") -> float:
-        """Return the share of the squares of the measured response that is in proportion to that of another press."""
+        """Return the share of the squares of the measured response that a multiple of another measured one explains."""
         mask = self.fibre_mask & other.fibre_mask
         return self._share(_proportion(self.measured, other.measured, mask) * other.measured)
 
     def response(self, frames: Array) -> Array:
-        """Return the response (n, C), V, at frames (n,) after the command down; it relaxes on after the windows."""
+        """Return the response (n, C), V, at frames (n,) after the command down, extrapolated as a geometric series."""
         weights = np.stack([np.interp(frames, PRESS_MIDDLES, row) for row in np.eye(N_PRESS_WINDOWS)], axis=1)
         earlier, later = np.diff(self.pressed[-3:], axis=0)
         ratio = float(np.clip((earlier * later).sum() / max((earlier**2).sum(), MIN_V2), 0.0, MAX_RATIO))
@@ -68,6 +68,6 @@ class PressCourse:
 
 
 def _proportion(measured: Array, expected: Array, fibre_mask: Mask) -> float:
-    """Return the least-squares factor, at least 0, of an expected response (C,) to a measured one."""
+    """Return the factor, at least 0, that fits an expected response (C,) to a measured one by least squares."""
     energy = max(float((expected[fibre_mask] ** 2).sum()), MIN_V2)
     return max(float((measured * expected)[fibre_mask].sum()) / energy, 0.0)

@@ -1,8 +1,8 @@
 """Augmented presses for training: at random moments, moved to other positions, at rest or sliding.
 
-A press that is moved has the response of the table at its new position, plus its own residual. A sliding finger has the
-superposition of the responses to its earlier positions, each delayed by its age (see `_trace_slide`), so that strokes
-are learnt from presses.
+The features of a press that is moved are the response of the table at its new position, plus its own residual. Those of
+a sliding finger superpose the responses to its earlier positions, each delayed by its age (see `_trace_slide`), so that
+strokes are learnt from presses.
 """
 
 import math
@@ -34,10 +34,11 @@ MAX_SLIDE_READINGS = 40  # maximum readings beyond `PRESS_WINDOWS` for which a f
 RESIDUAL_LENGTH_MM = 10.0  # correlation length of residuals along a slide
 LAST_INSTANT_WINDOW = 4  # last of `PRESS_WINDOWS` that responds without delay
 N_LATEST = len(LATEST_WINDOWS)
-_HOLD = PRESS_WINDOWS[-1][1]
-_ENDS = np.array([0, *(end for _, end in PRESS_WINDOWS), _HOLD + 1])  # of `PRESS_WINDOWS`, with one before and after
-_WINDOW_OF = np.array([max(sum(first <= n for first, _ in PRESS_WINDOWS) - 1, 0) for n in range(_HOLD)])
-"""Window of each reading after the probe was sent down."""
+_N_READINGS = PRESS_WINDOWS[-1][1]  # readings after the probe was sent down, up to the end of `PRESS_WINDOWS`
+_ENDS = np.array([0, *(end for _, end in PRESS_WINDOWS), _N_READINGS + 1])
+"""Readings after which 0, 1, ... `PRESS_WINDOWS` are complete, and one reading after the last of these."""
+_WINDOW_OF = np.array([max(sum(first <= n for first, _ in PRESS_WINDOWS) - 1, 0) for n in range(_N_READINGS)])
+"""Window of each of these readings; that before the first window counts to it."""
 
 
 class _Source(NamedTuple):
@@ -53,7 +54,7 @@ class _Source(NamedTuple):
 
 
 class _Moments(NamedTuple):
-    """Moments at which the presses of a batch are read, of which the first ones slide."""
+    """Moments at which the B presses of a batch are read; the first n of them slide."""
 
     counts: Indices  # complete windows; shape (B,)
     last: Indices  # latest reading of the press; shape (B,)
@@ -81,15 +82,8 @@ class PressSampler:
         if self.targets.shape[1] > 2:
             expected *= 1 + self.depth_gain * self.targets[:, 2:3]
         residual = (presses.inputs - expected.reshape(presses.inputs.shape)).astype(np.float32)
-        self._source = _Source(
-            np.ascontiguousarray(table),
-            residual,
-            presses.complete,
-            presses.now_factor,
-            presses.now_offset,
-            float(self.depth_gain),
-            LATEST_NOISE,
-        )
+        windows = presses.complete, presses.now_factor, presses.now_offset
+        self._source = _Source(np.ascontiguousarray(table), residual, *windows, float(self.depth_gain), LATEST_NOISE)
         self._n_timed = presses.complete.shape[1]
         self._bayes = tuple(stage.map_arrays(torch.from_numpy) for stage in bayes)
         self.n_inputs = fibres * (n_features + 1) + self._n_timed + (N_SUMMARY if bayes else 0)
@@ -126,12 +120,14 @@ class PressSampler:
         return x, position.numpy()
 
     def _sample_moments(self, batch: int) -> _Moments:
-        """Sample moments of the phase; a single one with Bayesian localizers, since each serves one stage."""
+        """Sample moments of the phase; with Bayesian localizers one for all, since each of these serves one stage."""
+        # 1. Numbers of complete windows, and the latest reading while these and no more are complete
         n_moments, rng, shares = 1 if self._bayes else batch, self.rng, np.cumsum(self._phase.shares)
         offsets = np.searchsorted(shares, rng.random(n_moments) * shares[-1], side="right")
         counts = np.full(batch, self._phase.first + offsets)
-        begin, end = (_ENDS[np.minimum(counts + k, N_PRESS_WINDOWS + 1)] for k in (0, 1))
+        begin, end = (_ENDS[np.minimum(n_complete, N_PRESS_WINDOWS + 1)] for n_complete in (counts, counts + 1))
         last = begin + (rng.random(batch) * (end - begin)).astype(np.int64) - 1
+        # 2. Velocities of sliding fingers; after the last window they slide on
         n_sliding = round(self._phase.sliding * batch) if self._speed and self._n_timed else 0
         low, high = np.log(SPEEDS_MM_S)
         speed = self._speed * np.exp(rng.uniform(low, high, n_sliding))
@@ -144,7 +140,7 @@ class PressSampler:
 
 
 def sample_fibre_dropout(batch: int, fibres: int, max_failures: int, rng: np.random.Generator) -> Mask:
-    """Sample (B, C) fibre masks: all fibres valid, or 1 .. `max_failures` masked, each set of a size equally likely."""
+    """Sample (B, C) fibre masks: none masked, or 1 .. `max_failures`; all sets of a size are equally likely."""
     count = rng.integers(1, max(max_failures, 1) + 1, (batch, 1))
     full = rng.random((batch, 1)) < (FULL_SHARE if max_failures else 1.0)
     rank = rng.random((batch, fibres)).argsort(axis=1)
@@ -165,7 +161,7 @@ def _compute_inputs(
         moments: `_Moments` of the presses.
         noise: standard deviation of noise on the features.
         rng: random number generator.
-        x: 0; shape (B, I). Masked features, and windows that are not complete, stay 0.
+        x: filled with 0; shape (B, I). Masked features, and windows that are not complete, stay 0.
     """
     side, (fibres, size), n_timed = len(source.table), source.residual.shape[1:], source.complete.shape[1]
     residual, features, latest = np.empty(size), np.empty(size), np.empty(N_LATEST)
@@ -192,7 +188,7 @@ def _compute_inputs(
             x[b, fibres * size + c] = 1
             # 2. Response of a finger at rest
             for f in range(size):
-                if f < N_PRESS_WINDOWS or complete[f]:  # the latest readings may be of a window that is not complete
+                if f < N_PRESS_WINDOWS or complete[f]:  # the latest readings may lie in a window that is not complete
                     residual[f] = source.residual[row, c, f] + noise * rng.standard_normal()
                     features[f] = gain * _respond(source.table, i, j, u, v, c, f) + residual[f]
             # 3. Windows that the slide changes, and the latest readings

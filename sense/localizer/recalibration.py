@@ -53,8 +53,8 @@ class Recalibration:
     Attributes:
         presses: number of new presses.
         change: "corrected", "refitted", or None if neither was kept.
-        candidates: "change" (None for the old localizer), "mean_mm" and "standard_error_mm" of all models compared:
-            errors of presses left out, and standard errors of their gains; averaged over numbers of failed fibres.
+        candidates: "change" (None for the old localizer), "mean_mm" and "standard_error_mm" of each model compared:
+            its mean error on presses left out, and the standard error of its gain, over all numbers of failed fibres.
         new_fibres: indices of the fibres that respond differently from before, if refitted.
         twice_as_many_mm: error expected with twice as many presses, if refitted; else None.
         before: rows of `evaluation.error_row` on the new presses, by the old localizer.
@@ -211,7 +211,7 @@ def refit(
     """
     from padforge.sense.localizer.training import retrain  # torch takes long to import
 
-    # 1. Response: the prior is the present table or the corrected one, by evidence
+    # 1. Response, about the table of the old or of the corrected localizer, whichever has the larger evidence
     starts = [old, fit_correction(old, features, positions_mm, measures)]
     fits = [_fit_response(start, features, positions_mm, measures, plan) for start in starts]
     best = int(np.argmax([fit.log_evidence for *_, fit in fits]))
@@ -243,7 +243,7 @@ def refit(
 def _fit_response(
     old: LocalizerModel, features: PressFeatures, positions_mm: Array, measures: Measures, plan: ResponsePrior | None
 ) -> tuple[TrainingPresses, Floats, ResponseFit]:
-    """Return scaled presses, the response table (S, S, C, F + G) and its fit, with the log evidence of volts."""
+    """Return scaled presses, the response table (S, S, C, F + G), and its fit with the evidence of windows in volts."""
     scaler, n_windows = old.scaler, features.windows.shape[2]
     predicted = old.predict_features(scaler.transform(features)).measures
     # Unknown depths and forces are replaced by their predictions.
@@ -261,7 +261,7 @@ def fit_correction(
 ) -> LocalizerModel:
     """Correct gains of fibres, rotation, scale and shift by robust least squares with a normal prior.
 
-    Gains go into the scaling, the pose into last layers, `bayes` and `table`.
+    Gains change the feature scaler; rotation, scale and shift change the last layers, `bayes` and `table`.
     """
     from scipy.optimize import least_squares  # slow to import
 
@@ -286,13 +286,14 @@ def fit_correction(
 
 
 def _transform(parameters: Array) -> tuple[Array, Array, Array]:
-    """Return gains (C,), rotation times scale (2, 2) and scaled shift (2,) of parameters in prior deviations."""
+    """Return gains (C,), rotation times scale (2, 2) and scaled shift (2,), from parameters in prior deviations."""
     angle, log_scale = ROTATION_STD * parameters[-4:-2]
     rotation = np.exp(log_scale) * np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
     return np.exp(GAIN_STD * parameters[:-4]), rotation, SHIFT_STD * parameters[-2:]
 
 
 def _corrected(model: LocalizerModel, parameters: Array) -> LocalizerModel:
+    """Correct all but the table, by parameters in prior standard deviations."""
     gains, rotation, shift = _transform(parameters)
     names = ("mean_v", "scale_v", "history_mean_v")
     bayes = tuple(stage.transformed(rotation, shift) for stage in model.bayes)
@@ -300,7 +301,7 @@ def _corrected(model: LocalizerModel, parameters: Array) -> LocalizerModel:
         model,
         networks={name: _transformed_weights(each, rotation, shift) for name, each in model.networks.items()},
         bayes=bayes,
-        # outputs offsets, which do not shift
+        # its outputs are offsets from Bayesian positions, so that a shift does not change them
         residual_network=_transformed_weights(model.residual_network, rotation, np.zeros(2)) if bayes else {},
         scaler=replace(model.scaler, **{name: gains[:, None] * getattr(model.scaler, name) for name in names}),
     )
@@ -323,7 +324,10 @@ def _transformed_table(table: Floats, rotation: Array, shift: Array) -> Floats:
 
 
 class CrossValidation:
-    """Cross-validation of changes on new presses in folds, for subsets of failed fibres, by their size from 0."""
+    """Cross-validation of changes of a localizer, on features, positions (Q, 2), mm, and measures of new presses.
+
+    Each fold is predicted without each set of failed fibres in `subsets`, which are ordered by their size from 0.
+    """
 
     def __init__(
         self, presses: tuple[PressFeatures, Array, Measures], n_folds: int, subsets: Sequence[Sequence[tuple[int, ...]]]
@@ -353,12 +357,13 @@ class CrossValidation:
             for level in self._subsets
         ]
 
+    def _errors(self, predictions: Predictions) -> list[Array]:
+        """Return the errors (S, Q), mm, of the presses without each of S sets, by number of failed fibres."""
+        return [np.array([distances(each.positions_mm, self.presses[1]) for each in level]) for level in predictions]
+
     def mean_error(self, predictions: Predictions) -> float:
         """Return the mean error, mm, averaged over numbers of failed fibres."""
-        positions_mm = self.presses[1]
-        return float(
-            np.mean([np.mean([distances(each.positions_mm, positions_mm) for each in level]) for level in predictions])
-        )
+        return float(np.mean([errors.mean() for errors in self._errors(predictions)]))
 
     def candidate(self, change: str | None, before: Predictions, predictions: Predictions) -> dict[str, Any]:
         """Return a row of `Recalibration.candidates`."""
@@ -367,15 +372,8 @@ class CrossValidation:
 
     def gain(self, before: Predictions, after: Predictions) -> tuple[float, float]:
         """Return the mean decrease of errors, mm, averaged over numbers of failed fibres, and its standard error."""
-
-        def errors(prediction: Localization) -> Array:
-            return distances(prediction.positions_mm, self.presses[1])
-
-        levels = [
-            [errors(old) - errors(new) for old, new in zip(*level, strict=True)]
-            for level in zip(before, after, strict=True)
-        ]
-        decrease = np.mean([np.mean(level, axis=0) for level in levels], axis=0)
+        levels = zip(self._errors(before), self._errors(after), strict=True)
+        decrease = np.mean([(old - new).mean(axis=0) for old, new in levels], axis=0)
         return float(decrease.mean()), float(decrease.std(ddof=1) / np.sqrt(len(decrease)))
 
     def error_rows(self, predictions: Predictions) -> list[dict[str, Any]]:

@@ -2,8 +2,8 @@
 
 The windows of a fibre are a sum of Gaussian radial basis functions of the position (proportional to the depth, if
 depths vary) plus a linear function of its history, fitted jointly by ridge regression. Silicone creeps, so the effect
-of the history is subtracted before the windows are used. The history also modulates the sensitivity: a fibre that was
-stretched a moment ago responds more strongly by a fifth. This modulation, a linear function of the history for each
+of the history is subtracted before the windows are used. The history also modulates the sensitivity: the response of a
+fibre that was stretched a moment ago is larger by a fifth. This modulation, a linear function of the history for each
 phase, is an input of the networks.
 """
 
@@ -31,10 +31,10 @@ class ResponseModel:
     """Fitted response of a pad."""
 
     table: Array  # (S, S, C, F + G), V, windows on a grid over [-1, 1] in x and y; 0 for the G modulations
-    # (C, J, F + G), V/V, effect of a volt of history on the windows; and, with a minus sign, on the relative
-    # sensitivity in each of G phases, 1/V
+    # (C, J, F + G), effect of a volt of each history feature: V, on F windows; and 1/V, with the opposite sign, on the
+    # relative sensitivity in G phases
     history_coef: Array
-    history_mean_v: Array  # (C, J), history at which the table holds
+    history_mean_v: Array  # (C, J), mean history, at which the table holds
 
     @classmethod
     def fit(
@@ -49,17 +49,17 @@ class ResponseModel:
     ) -> "ResponseModel":
         """Fit the response, fibre by fibre, to the presses in which the fibre is valid.
 
-        Positions (Q, 2) are within [-1, 1], windows (Q, C, F) and history (Q, C, J) in V; relative depths (Q,) are over
-        that of the table, None for 1. The sensitivity of each of the G slices of windows in `phases` is modulated as
-        one. `ridge_history` is the penalty on squared weights of the history.
+        Positions (Q, 2) are within [-1, 1], windows (Q, C, F) and history (Q, C, J) in V. Depths (Q,) are relative to
+        that of the table; None if all are equal. Each of the G slices of windows in `phases` has one modulation of the
+        sensitivity. `ridge_history` is the penalty on squared weights of the history.
         """
-        fibres, pasts = history.shape[1:]
+        fibres, n_history = history.shape[1:]
         size, n_rbf = windows.shape[2], RBF_SIDE**2
         grid_rbf = rbf_features(grid_positions(GRID_CELLS + 1).reshape(-1, 2))
-        history_mean = np.zeros((fibres, pasts))
-        history_coef = np.zeros((fibres, pasts, size + len(phases)))
+        history_mean = np.zeros((fibres, n_history))
+        history_coef = np.zeros((fibres, n_history, size + len(phases)))
         table = np.zeros((len(grid_rbf), fibres, size + len(phases)))
-        penalty = np.diag(np.repeat([RIDGE_POSITION, ridge_history], [n_rbf, pasts]))
+        penalty = np.diag(np.repeat([RIDGE_POSITION, ridge_history], [n_rbf, n_history]))
         for fibre in np.flatnonzero(fibre_mask.any(axis=0)):
             valid = fibre_mask[:, fibre]
             past, response = history[valid, fibre], windows[valid, fibre]
@@ -74,8 +74,9 @@ class ResponseModel:
                 expected = np.concatenate([rbf @ weights[:n_rbf] for _, rbf in _scaled_rbf(positions[valid], None)])
                 expected = expected if depth is None else depth[:, None] * expected
                 residual = response - expected - past @ weights[n_rbf:]
-                means = ((part[:, phase].mean(axis=1) for part in (expected, residual)) for phase in phases)
-                coef = np.column_stack([coef, *(-_sensitivity_modulation(*each, past) for each in means)])
+                for phase in phases:
+                    means = expected[:, phase].mean(axis=1), residual[:, phase].mean(axis=1)
+                    coef = np.column_stack([coef, -_sensitivity_modulation(*means, past)])
             std = std[:, None]
             history_coef[fibre] = np.divide(coef, std, out=np.zeros(coef.shape), where=std > MIN_SCALE_V)
             table[:, fibre, :size] = grid_rbf @ weights[:n_rbf]
@@ -136,7 +137,7 @@ def sum_by_position(positions: Array, values: Array) -> Array:
 
 
 def _scaled_rbf(positions: Array, relative_depth: Array | None) -> Any:
-    """Yield slices of presses and their basis functions times the depth, in chunks, since a press takes kilobytes."""
+    """Yield slices of presses, and their basis functions times the depth. A press takes kilobytes, hence the chunks."""
     for first in range(0, len(positions), _CHUNK):
         rows = slice(first, first + _CHUNK)
         rbf = rbf_features(positions[rows])
@@ -146,7 +147,7 @@ def _scaled_rbf(positions: Array, relative_depth: Array | None) -> Any:
 def _normal_equations(
     positions: Array, past: Array, response: Array, relative_depth: Array | None
 ) -> tuple[Array, Array]:
-    """Gram matrix X' X and moments X' response of the design matrix X of basis functions and history."""
+    """Return X' X and X' response for the design matrix X of basis functions and history."""
     gram = moments = np.zeros(())
     for rows, rbf in _scaled_rbf(positions, relative_depth):
         design_matrix = np.hstack([rbf, past[rows]])
@@ -155,10 +156,10 @@ def _normal_equations(
 
 
 def _sensitivity_modulation(expected: Array, residual: Array, past: Array) -> Array:
-    """Relative change (J,) of (Q,) responses per standard deviation of history, fitted to (Q,) residuals."""
+    """Fit the relative change (J,) of (Q,) responses per standard deviation of history to (Q,) residuals."""
     scale = expected.std()
     if not past.shape[1] or scale <= MIN_SCALE_V:
         return np.zeros(past.shape[1])
-    design_matrix = np.hstack([expected[:, None] / scale * past, past])  # with an additive effect beside it
+    design_matrix = np.hstack([expected[:, None] / scale * past, past])  # factor, and additive effect
     gram = design_matrix.T @ design_matrix + RIDGE_MODULATION * np.eye(design_matrix.shape[1])
     return np.linalg.solve(gram, design_matrix.T @ residual)[: past.shape[1]] / scale

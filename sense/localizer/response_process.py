@@ -2,7 +2,7 @@
 
 Some sixty presses do not determine the hundreds of basis functions of `ResponseModel`. The response of a fibre is
 modelled as that of an earlier pad, or zero, plus the deviations of `response_priors` and a smooth remainder. Their
-variances, and whether the fibre is that of the earlier pad, maximize the evidence, that is the marginal likelihood
+variances, and whether the fibre is that of the earlier pad, maximize the evidence, the marginal likelihood
 (C. E. Rasmussen, C. K. I. Williams, Gaussian processes for machine learning, 2006).
 """
 
@@ -18,17 +18,18 @@ from padforge.sense.localizer.response_model import GRID_CELLS, grid_positions, 
 
 SNR_NEW = 10.0, 30.0, 100.0
 """Candidate variances of the deviations of a new fibre, relative to the variance of a press about its response."""
-SNR_OLD = 0.1, 1.0, 10.0  # the same of a fibre of the earlier pad, which deviates less
+SNR_OLD = 0.1, 1.0, 10.0  # the same for a fibre of the earlier pad, which deviates less from that
 KERNELS = (1.0, 0.003), (1.0, 0.03), (1.0, 0.3), (0.0, 1.0)
-"""Candidate shares of the variance in the maps of the prior and in the smooth remainder; the last ignores the maps."""
+"""Candidate variances of the maps of the prior and of the smooth remainder, over the SNR; the last ignores the maps."""
 REMAINDER_STD = 0.35  # correlation length of the smooth remainder, scaled position
 LOG_ODDS = 0.05
-"""Difference of log evidence per press and window above which a fibre is that of the earlier pad, and below minus which
-it is new. Windows are correlated, so that smaller differences arise by chance."""
+"""Difference of log evidence, old less new, per press and window: above it a fibre is recognized as that of the earlier
+pad, below -LOG_ODDS as new. Smaller differences arise by chance, since windows are correlated."""
 MIN_OLD_SHARE = 0.5
-"""Share of fibres of the earlier pad above which the pad is the same; undecided fibres are then old ones, too."""
-SCATTER_SHARE = 0.8  # of the variance of a press, on a printed pad: this part grows with the square of the response
-ROUNDS = 2  # fits of the process; the first one ignores that growth
+"""Share of recognized fibres above which the pad is the earlier one, and undecided fibres are old, too. On another pad
+all fibres are new."""
+SCATTER_SHARE = 0.8  # share of the variance of a press that grows with its squared response, on a printed pad
+ROUNDS = 2  # fits of the process; the first one ignores this growth
 
 
 @dataclass(frozen=True)
@@ -124,7 +125,7 @@ def _fit_process(
     maps_covariance = at_presses @ at_presses.T
     smooth_covariance = np.outer(depth, depth) * _smooth_covariance(positions, positions)
     residual = windows if mean is None else windows - depth[:, None] * interpolate_grid(mean, positions)
-    # A press as commanded and as detected has one position twice: half the weight each.
+    # A press that is given twice, as commanded and as detected, has half the weight each time.
     multiplicity = sum_by_position(positions, np.ones(len(positions)))
     best, noise = None, multiplicity
     for _ in range(ROUNDS):
@@ -141,7 +142,7 @@ def _fit_process(
             log_det = np.linalg.slogdet(covariance)[1]
             log_evidence = -0.5 * float(len(windows) * np.log(variance).sum() + windows.shape[1] * log_det)
             if best is None or log_evidence > best.log_evidence:
-                variances = snr * share_maps, snr * share_smooth
+                variances = snr * share_maps, snr * share_smooth  # those of `_Process`
                 prior = positions, depth, maps, mean
                 best = _Process(log_evidence, *variances, weights, np.diag(precision), noise, *prior)
     assert best is not None

@@ -19,7 +19,7 @@ from padforge.sense.localizer.moments import LATEST_WINDOWS, PRESS_WINDOWS
 from padforge.sense.localizer.response_model import ResponseModel, interpolate_grid, leverages, remove_history
 from padforge.sense.localizer.response_process import ResponseFit, ResponsePrior, fit_response
 
-MAX_INPUT = 1e4  # scaled features are clipped to it; no press exceeds it
+MAX_INPUT = 1e4  # magnitude that scaled features are clipped to, and that no real press reaches
 
 
 def array_field(low: float, high: float) -> tuple[PlainValidator, PlainSerializer]:
@@ -94,9 +94,7 @@ class FeatureScaler:
     origin_mm: Annotated[Array, *array_field(-MAX_MM, MAX_MM)]  # (2,) position that is 0 when scaled
     scale_mm: Annotated[float, Field(gt=0, le=MAX_MM)]  # distance that is 1 when scaled
     half_size_mm: Annotated[Array, *array_field(0, MAX_MM)]  # (2,) half the size of the area that was pressed
-    measures: Annotated[
-        tuple[TargetScaler, ...], Field(max_length=2, strict=False)
-    ] = ()  # depth and force, if predicted
+    measures: Annotated[tuple[TargetScaler, ...], Field(max_length=2, strict=False)] = ()  # of depth and force
 
     @classmethod
     def fit(
@@ -178,7 +176,7 @@ class FeatureScaler:
         measures: Mapping[str, Array] | None = None,
         rate_hz: float = np.inf,
     ) -> "TrainingPresses":
-        """Scale features and targets of presses; with the rate of their readings, they may slide in the training."""
+        """Scale features and targets of presses; `rate_hz` of readings is needed only for training with slides."""
         scaled, targets = self.transform(features), self.scale_targets(positions_mm, measures)
         now_factor, now_offset = self.latest_window_map(scaled.complete.shape[1])
         return TrainingPresses(
@@ -214,7 +212,7 @@ class TrainingPresses(ScaledFeatures):
     now_factor: Floats  # see `FeatureScaler.latest_window_map`
     now_offset: Floats
     per_mm: float  # scaled distance of 1 mm
-    speed: float  # scaled distance per reading of 1 mm/s; 0 if presses do not slide
+    speed: float  # scaled distance that 1 mm/s covers per reading; 0 if presses do not slide
 
 
 def refit_response(
@@ -222,7 +220,7 @@ def refit_response(
 ) -> tuple[Floats, ResponseFit]:
     """Refit the F windows of a response table (S, S, C, F + G) to few presses; return the table, and the fit.
 
-    The mean of the prior, if any, is scaled and not centred, see `FeatureScaler.uncentre`.
+    The mean of the prior, if it has one, is in scaled units without centring, see `FeatureScaler.uncentre`.
     """
     relative_depth = 1 + presses.depth_gain * presses.targets[:, 2] if presses.depth_gain else None
     positions, windows = presses.targets[:, :2].astype(np.float64), scaler.uncentre(presses.inputs)[..., :n_windows]
@@ -234,8 +232,8 @@ def refit_response(
 def leave_one_out_residuals(presses: TrainingPresses, table: Floats, leverage: Array | None = None) -> TrainingPresses:
     """Enlarge the residuals of presses as if the response table had been fitted without their position.
 
-    The leave-one-out residual of a linear fit is the residual over 1 - leverage; with some hundred presses it is larger
-    by a third. The leverage (Q, C) is that of a fit with a prior, None for that of `ResponseModel`.
+    The leave-one-out residual of a linear fit is its residual divided by 1 - leverage; with some hundred presses it is
+    larger by a third. The leverage (Q, C) is that of a fit with a prior; None for that of a `ResponseModel`.
     """
     targets = presses.targets.astype(np.float64)
     positions, relative_depth = targets[:, :2], np.ones(len(targets))

@@ -27,19 +27,20 @@ STAGES = (N_PRESS_WINDOWS, N_TIMED)
 """Numbers of complete windows from which on presses are tested: while the finger rests, and after the release."""
 COMPONENTS = 4  # linear discriminants of a fibre; further ones are noise
 COARSENING = 6  # cells of the response table along a side of a cell of the grid
-MIN_CELLS = 2  # minimum distance of two presses in cells of the grid; below it lie errors of the response model
-MIN_SHARE = 0.2  # minimum ratio of the weaker of two presses to the stronger; below it lie the same errors
+# Two presses that are nearer, or of which one is weaker, would fit errors of the response model to a single press
+MIN_CELLS = 2  # minimum distance of two presses, in cells of the grid
+MIN_SHARE = 0.2  # minimum ratio of the weaker of two presses to the stronger
 MAX_STRENGTH = 1.5
-"""Maximum response to either of two presses relative to the strongest of the training: a single press that is twice as
-deep has a large misfit, which two strong presses would explain."""
+"""Maximum strength of either of two presses relative to the strongest in training. Without it, two strong presses would
+explain the large misfit of a single one that is twice as deep."""
 FALSE_RATE = 0.01  # share of single presses that the test rejects
 LEVELS = 4  # numbers of failed fibres, from 0, that the tests are calibrated for
 SUBSETS = 4  # sets of failed fibres of a size in the calibration
-MAX_LEFT_OUT = 2  # most fibres left out as failed, up to a third of all: the few others would fit any press
-# Excess of the mean log misfit over that of the calibration, in standard deviations of single presses, above which a
-# pad is another one. With 30 presses after 1500 of training, pads cast again had 2.0 with all fibres and 0.6 without
-# the worst, or more; healthy ones 0.5 and 0.3 or less; with two failed fibres the second was 0.4 or less, and with
-# gains drifted by up to 20 % one stayed below.
+MAX_LEFT_OUT = 2  # maximum fibres left out as failed, and at most a third of all, since few fibres fit any press
+# A pad is another one if its mean log misfit exceeds that of the calibration by both limits, in standard deviations of
+# single presses. With 30 presses after 1500 of training, the excess with all fibres / without the worst ones was at
+# least 2.0 / 0.6 on pads cast again, and at most 0.5 / 0.3 on healthy ones. With two failed fibres the second number
+# was at most 0.4; with gains that drifted by up to 20 %, one of the two stayed below its limit.
 MIN_MISFIT = 1.35  # with all fibres
 MIN_MISFIT_LEFT_OUT = 0.4  # without the fibres that fit worst
 MIN_PRESSES = 25  # with fewer presses a pad is not tested
@@ -61,11 +62,11 @@ class SinglePressTest:
     expected: Array  # (P, C, D), discriminants of the response
     precision: Array  # (P, C, D, D), inverse of their scatter
     offset: Array  # (C, D), discriminants without a response
-    floor_share: Array  # (1,), share of the scatter that does not grow with the response
-    max_strength: Array  # (1,), of either of two presses
-    limit: Array  # (L,), highest root likelihood ratio of a single press, by number of failed fibres
-    usual_misfit: Array  # (L, 2), mean and standard deviation of its logarithm, by number of failed fibres
-    n_presses: Array  # (1,), presses behind `limit` and `usual_misfit`; 0 before
+    floor_share: Array  # (1,), share of the scatter variance that does not grow with the response
+    max_strength: Array  # (1,), maximum strength of either of two presses
+    limit: Array  # (L,), root likelihood ratio above which a press is no single one, by number of failed fibres
+    usual_misfit: Array  # (L, 2), mean and standard deviation of the log misfit, by number of failed fibres
+    n_presses: Array  # (1,), presses that `limit` and `usual_misfit` are calibrated on; 0 before the calibration
 
     @classmethod
     def fit(
@@ -76,15 +77,17 @@ class SinglePressTest:
         n_complete: int,
         earlier: "SinglePressTest | None" = None,
     ) -> "SinglePressTest":
-        """Fit the leave-one-out scatter of presses about the response, by the first `n_complete` windows.
+        """Fit the leave-one-out scatter of presses about the response, in the first `n_complete` windows.
 
         The table (S, S, C, F + G) is the scaled response over [-1, 1] in x and y; `centring` (C, F + G) is what
-        scaling has subtracted from the features. Discriminants of an earlier pad are kept, since few
-        presses do not determine them.
+        scaling has subtracted from the features. Discriminants of an `earlier` test are kept, since few presses do not
+        determine them.
         """
+        # 1. Discriminants of the windows that are complete
         n_timed, side = presses.complete.shape[1], len(table)
         usable = np.ones(table.shape[3], bool)
-        usable[n_complete : (n_timed + len(LATEST_WINDOWS)) if n_timed else 0] = False
+        if n_timed:
+            usable[n_complete : n_timed + len(LATEST_WINDOWS)] = False
         table = np.where(usable, table, 0.0)
         positions = presses.targets[:, :2].astype(np.float64)
         relative_depth = 1 + presses.depth_gain * presses.targets[:, 2:3] if presses.depth_gain else np.ones((1, 1))
@@ -94,6 +97,7 @@ class SinglePressTest:
             table, residual, presses.fibre_mask, COMPONENTS, earlier.projection if earlier else None
         )
         residual = np.einsum("qcf,cfd->qcd", residual, projection) * presses.fibre_mask[:, :, None]
+        # 2. Responses and scatter on a coarse grid over the presses
         offset = np.einsum("cf,cfd->cd", centring * usable, projection)
         responses = np.einsum("xycf,cfd->xycd", table, projection) + offset
         low, high = positions.min(axis=0), positions.max(axis=0)
@@ -143,9 +147,9 @@ class SinglePressTest:
         return unlike
 
     def misfits(self, inputs: Floats, fibre_mask: Mask) -> Array:
-        """Return (Q, M) log misfits, standardized by the usual, without each set of up to MAX_LEFT_OUT fibres.
+        """Return (Q, M) log misfits, standardized by the usual ones, with each of M sets of fibres left out.
 
-        The first of the M sets is empty: all fibres in the (Q, C) mask are used.
+        The sets have up to MAX_LEFT_OUT fibres. The first one is empty: all fibres in the (Q, C) mask are used.
         """
         fibres = fibre_mask.shape[1]
         max_left_out = min(MAX_LEFT_OUT, fibres // 3)
@@ -163,7 +167,11 @@ class SinglePressTest:
         return _Fit(*map(np.concatenate, zip(*parts, strict=True)))
 
     def _fit_chunk(self, z: Array, masks: Mask) -> "_Fit":
-        """Fit presses of (Q, C, D) discriminants; the strength at each position has a closed form."""
+        """Fit a single press to (Q, C, D) discriminants z at each position, and keep the best position.
+
+        With the expected response m of a position and the precision P, the strength is z' P m / m' P m, but at least 0.
+        """
+        # z' P z is summed over the upper triangle of P, with twice the elements off the diagonal
         first, second = np.triu_indices(COMPONENTS)
         factors = self.precision[:, :, first, second] * np.where(first == second, 1.0, 2.0)
         weighted = np.einsum("pcde,pce->pcd", self.precision, self.expected)
@@ -197,7 +205,8 @@ class SinglePressTest:
             gram, moment = expected @ expected.T, expected @ measured
             norm = np.diag(gram)[:, None] * np.diag(gram)
             det = np.maximum(norm - gram**2, 1e-3 * norm)  # the two responses may be nearly the same
-            first = (np.diag(gram) * moment[:, None] - gram * moment) / np.maximum(det, 1e-9)  # strengths of both
+            # least-squares strengths of the first and of the second press, for each pair of positions (P, P)
+            first = (np.diag(gram) * moment[:, None] - gram * moment) / np.maximum(det, 1e-9)
             second = first.T
             is_pair = self._is_apart & (first > MIN_SHARE * second) & (second > MIN_SHARE * first)
             is_pair &= np.maximum(first, second) < self.max_strength
@@ -214,8 +223,8 @@ class SinglePressTest:
     def _is_apart(self) -> Mask:
         """Pairs of positions (P, P) that are distant enough for two presses."""
         distance = np.linalg.norm(self.positions[:, None] - self.positions, axis=2)
-        # half a cell against rounding
-        return distance > (MIN_CELLS - 0.5) * distance[distance > 0].min(initial=np.inf)
+        cell = distance[distance > 0].min(initial=np.inf)
+        return distance > (MIN_CELLS - 0.5) * cell  # half a cell less, against rounding
 
 
 def find_unlike(tests: Sequence[SinglePressTest], presses: ScaledFeatures) -> Mask:
@@ -232,7 +241,7 @@ def find_unlike(tests: Sequence[SinglePressTest], presses: ScaledFeatures) -> Ma
 
 
 def stages(n_timed: int) -> tuple[int, ...]:
-    """Return the numbers of complete windows, of K, from which on there is a test; 0 alone if K is 0."""
+    """Return the numbers of complete windows from which on each test holds; 0 alone without timed windows."""
     return STAGES if n_timed else (0,)
 
 
@@ -246,7 +255,7 @@ def find_misfits(tests: Sequence[SinglePressTest], presses: ScaledFeatures) -> A
 def is_other_pad(tests: Sequence[SinglePressTest], misfits: Array) -> bool:
     """Return whether presses with (Q, M) misfits are of another pad than that of the calibration, or one cast again.
 
-    The result is false for fewer than MIN_PRESSES. After the failure of a fibre, the others still fit without it.
+    The result is false for fewer than MIN_PRESSES. A failed fibre makes no other pad: without it the others fit.
     """
     if len(misfits) < MIN_PRESSES or tests[-1].n_presses[0] < 2:
         return False
@@ -264,17 +273,17 @@ class _Fit(NamedTuple):
 
 
 def _floor_share(residual: Array, response: Array) -> float:
-    """Return the share of the scatter that does not grow with the response, from (Q, C, D) presses of training.
+    """Return the share of the scatter variance that does not grow with the response, from (Q, C, D) training presses.
 
-    The scatter of the stronger half of the responses is compared with that of the weaker half, after the strength that
-    all fibres of a press have in common is fitted and removed.
+    First the strength that all fibres of a press have in common is fitted and removed. The variance is then assumed to
+    grow linearly with the squared response; its slope is taken from the stronger and the weaker half of the responses.
     """
     norm = np.maximum((response**2).sum(axis=(1, 2)), 1e-9)
     strength = (residual * response).sum(axis=(1, 2)) / norm
     residual = residual - strength[:, None, None] * response
-    scatter, energy = ((part**2).mean(axis=2).ravel() for part in (residual, response))
+    variance, energy = ((part**2).mean(axis=2).ravel() for part in (residual, response))
     is_strong = energy > np.median(energy)
-    if not is_strong.any() or not scatter.any():
+    if not is_strong.any() or not variance.any():
         return 1.0
-    growth, stronger = (part[is_strong].mean() - part[~is_strong].mean() for part in (scatter, energy))
-    return float(np.clip(1 - growth / stronger * energy.mean() / scatter.mean(), 0.0, 1.0))
+    rise, run = (part[is_strong].mean() - part[~is_strong].mean() for part in (variance, energy))
+    return float(np.clip(1 - rise / run * energy.mean() / variance.mean(), 0.0, 1.0))

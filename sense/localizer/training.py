@@ -3,8 +3,8 @@
 The loss is the distance, not its square, plus a likelihood of the expected error. Every step masks random fibres,
 augments the positions (and depths) of presses, whose features follow the response model, and reads them at random
 moments of a phase. The networks of the ensemble are trained without the Bayesian member, whose residual a smaller
-network learns. Their errors differ in kind, so that the combination errs by a tenth less. No choice is made on presses
-held back, which are too few for it.
+network learns. Since errors of both kinds differ, those of the combination are smaller by a tenth. The ensemble is not
+selected, or stopped early, by presses held back, which are too few for that.
 """
 
 import math
@@ -49,10 +49,10 @@ from padforge.sense.settings import LocalizerSettings
 
 @contextmanager
 def joint_progress(totals: Sequence[int], on_progress: OnProgress) -> Iterator[Callable[[int, int, int, str], None]]:
-    """Join the progress of trainings in threads, of so many steps each.
+    """Report the progress of several trainings in threads, with `totals` steps each, as one.
 
-    Yields a function of the number of a training, its steps so far, its steps in all, and its work before or after the
-    steps. It raises CancelledError in trainings that still run when the block ends, as on an error or Ctrl-C.
+    Yields a function that a training calls with its number, its steps done and in all, and, before and after the steps,
+    the name of its work. It raises CancelledError in trainings that still run when the block ends, as on Ctrl-C.
     """
     steps, lock, has_ended = [0] * len(totals), Lock(), Event()
 
@@ -73,11 +73,11 @@ def joint_progress(totals: Sequence[int], on_progress: OnProgress) -> Iterator[C
 MEASURE_WEIGHT = 0.5  # weight of the error of a scaled depth or force, relative to that of the distance
 LOG_ERROR_WEIGHT = 0.1  # weight of the likelihood of the expected error, relative to that of the distance
 ROUNDING = 0.5
-"""Share of the expected error below which the loss is the square of the distance rather than the distance: what is
-better than can be expected is chance."""
+"""Share of the expected error within which the loss is quadratic in the distance rather than linear: smaller errors
+than expected are chance."""
 COMMON_SQUARE = 10.0
-"""Mean square above which directions of the inputs are scaled down. The windows of a fibre correlate, so strongly that
-a network would learn their differences late."""
+"""Mean square of inputs along a direction above which the direction is scaled down. Windows of a fibre correlate so
+strongly that a network would otherwise learn late what they differ in."""
 COMMON_DIRECTIONS = 16  # directions that are scaled down at most, those in which inputs vary most
 COMMON_BATCHES = 16  # batches on which these directions are fitted
 INPUT_NOISE = 0.02  # standard deviation of noise on scaled features, which are about 1
@@ -89,15 +89,15 @@ DEPTH_AUGMENTATION = 0.3  # standard deviation of augmented depths, scaled, for 
 MIN_BATCHES = 9  # minimum steps of an epoch
 MAX_STEPS = 9900  # maximum steps of a training
 DEPTH_STEP_FACTOR = 2  # factor on the steps where depths vary, which is harder to learn
-RECENT_BATCHES = 64  # of which every second one of the residual network is drawn
-MAX_RESIDUAL_SIZE = {"hidden": 128, "layers": 3}  # of the residual network; larger ones gain nothing
+RECENT_BATCHES = 64  # latest batches of the residual network, which takes every second batch from these
+MAX_RESIDUAL_SIZE = {"hidden": 128, "layers": 3}  # a larger residual network gains nothing
 PUBLISHED_HIDDEN = 50  # neurons of the published network, of one tanh layer
 PACE_STEPS = 12  # steps that measure the pace, with a time budget
-MIN_LENGTHS = 5  # usual lengths of a training that a time budget must exceed for another member on each core
-MAX_MEMBERS = 64  # with a time budget
+MIN_LENGTHS = 5  # times the usual length that a time budget gives each training before it adds members
+MAX_MEMBERS = 64  # maximum members that a time budget adds up to
 MIN_STEPS = 36
-"""Steps that a time budget must allow each network: with 9 the error on the example is three times that of a complete
-training, with 36 it is a third larger."""
+"""Steps that a time budget must allow each network: after 9 steps the error on the example is three times that of a
+complete training, after 36 it is a third larger."""
 
 
 class TrainedNetworks(NamedTuple):
@@ -117,9 +117,9 @@ class TrainingTask:
     phase: Phase
     options: LocalizerSettings
     steps: int  # usual number
-    bayes: Sequence[BayesianLocalizer] = ()  # that it corrects
-    start: Weights | None = None  # to continue from
-    spread: float = 1.0  # factor on `AUGMENTATION`
+    bayes: Sequence[BayesianLocalizer] = ()  # Bayesian localizers that the residual network corrects
+    start: Weights | None = None  # weights of a trained member to continue from
+    augmentation_factor: float = 1.0  # on `AUGMENTATION`
     seconds: float | None = None  # limit in place of `steps`
 
 
@@ -270,8 +270,9 @@ class Training:
         self._batch, targets = min(options.batch, len(presses.inputs)), sampler.targets
         self._bounds = low, high = targets[:, :3].min(axis=0), targets[:, :3].max(axis=0)
         spacing = math.sqrt((high - low)[:2].prod() / len(np.unique(targets[:, :2], axis=0)))
-        with_depth = POSITION_AUGMENTATION, POSITION_AUGMENTATION, DEPTH_AUGMENTATION
-        self._std = np.float32(with_depth if sampler.depth_gain else (task.spread * AUGMENTATION * spacing,) * 2)
+        std_xy = (task.augmentation_factor * AUGMENTATION * spacing,) * 2
+        std_xy_depth = POSITION_AUGMENTATION, POSITION_AUGMENTATION, DEPTH_AUGMENTATION
+        self._std = np.float32(std_xy_depth if sampler.depth_gain else std_xy)
         self._force_per_depth = 0.0
         if sampler.depth_gain:
             centred = (targets - targets.mean(axis=0))[:, 2:]
@@ -317,7 +318,7 @@ class Training:
         return (loss + LOG_ERROR_WEIGHT * likelihood).mean()
 
     def _next_batch(self) -> tuple[Floats, Floats]:
-        """Return a new batch; every second time a recent one where Bayesian positions take most of the time."""
+        """Return a new batch, or every second time a recent one if Bayesian positions make new ones expensive."""
         if not self._reuses:
             return self.sample_batch()
         if self.n_steps % 2:
@@ -336,8 +337,8 @@ class Training:
         """Return the directions (I, n) in which inputs vary most, and the shares (n,) by which these are shrunk."""
         x = np.concatenate([self.sample_batch()[0][0] for _ in range(COMMON_BATCHES)]).astype(np.float64)
         n_inputs = x.shape[1]
-        largest = max(n_inputs - COMMON_DIRECTIONS, 0), n_inputs - 1
-        squares, directions = eigh(x.T @ x / len(x), subset_by_index=largest)
+        index_range = max(n_inputs - COMMON_DIRECTIONS, 0), n_inputs - 1  # of the largest eigenvalues
+        squares, directions = eigh(x.T @ x / len(x), subset_by_index=index_range)
         shrinkage = 1 - (1 + squares.clip(0) / COMMON_SQUARE) ** -0.5
         return torch.from_numpy(directions.astype(np.float32)), torch.from_numpy(shrinkage.astype(np.float32))
 
@@ -362,9 +363,9 @@ class Training:
         return np.concatenate([augmented, forces], axis=1).astype(np.float32)
 
 
-RETRAINING_STEPS = 150  # from a similar response; with 400, networks err no less and are overconfident
-RETRAINING_SPREAD = 1.4
-"""Factor on `AUGMENTATION`, since presses are few; without it an unchanged pad errs a tenth more."""
+RETRAINING_STEPS = 150  # few, since the response is similar; with 400, errors are as large and networks overconfident
+RETRAINING_AUGMENTATION = 1.4
+"""Factor on `AUGMENTATION`, since presses are few; without it errors on an unchanged pad grow by a tenth."""
 
 
 def retrain(
@@ -385,7 +386,7 @@ def retrain(
         table: its scaled response by position; shape (S, S, C, F + G).
         max_failures: maximum number of masked fibres.
         rng: draws the seeds of the networks.
-        bayes: that the residual network corrects.
+        bayes: Bayesian localizers that the residual network corrects.
 
     Returns:
         The retrained networks and residual network.
@@ -395,10 +396,9 @@ def retrain(
     starts = [(name, weights, PHASES[n_timed][name], ()) for name, weights in networks.items()]
     if residual_network:
         starts += [(RESIDUAL, residual_network, RESIDUAL_PHASE if n_timed else PHASES[0]["press"], bayes)]
-    tasks = [
-        TrainingTask(name, phase, options, round(RETRAINING_STEPS * phase.length), corrected, member, RETRAINING_SPREAD)
-        for name, weights, phase, corrected in starts
-        for member in unstack_members(weights)
-    ]
+    tasks = []
+    for name, weights, phase, corrected in starts:
+        shared = name, phase, options, round(RETRAINING_STEPS * phase.length), corrected
+        tasks += [TrainingTask(*shared, member, RETRAINING_AUGMENTATION) for member in unstack_members(weights)]
     trained, _ = run_trainings(tasks, presses, table, rng)
     return {name: trained[name] for name in networks}, trained.get(RESIDUAL, residual_network)

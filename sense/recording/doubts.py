@@ -10,10 +10,10 @@ from padforge.sense.arrays import Array, Mask
 from padforge.sense.recording.recording import Recording
 
 MIN_SPAN_MM = 2.0  # span of the presses on the smallest pad; positions in m have a smaller one
-MIN_RATE_HZ = 1.5  # rate of multimeters; 200 readings a second with times in ms, read as s, have 0.2 Hz
-MAX_RATE_HZ = 10_000.0  # rate of fast boards
+MIN_RATE_HZ = 1.5  # even multimeters are faster; 200 readings a second have 0.2 Hz if times in ms are read as s
+MAX_RATE_HZ = 10_000.0  # even fast boards are slower
 REFERENCE_V = 3.3  # reference of common boards
-MARGIN = 0.5  # distance, in spans of most presses, beyond which a press is far outside
+MARGIN = 0.5  # distance from most presses, relative to their span, beyond which a press is far outside
 MIN_PRESSES = 20  # minimum number of presses for an estimate of that span
 MAX_NAMED = 5  # presses in a message
 
@@ -42,8 +42,8 @@ def suggest_unit(
 ) -> str:
     """Return the probable unit of `time`, `positions` or `fibres`, and the entry of the mapping that states it.
 
-    The mapping is in the source of the recording, as `columns`. Readings that were read as V give the number of bits of
-    a converter, the rate of times that were read as s the choice of ms, us or ns.
+    The mapping is `columns` in the source of the recording. Readings that were taken as V show how many bits a
+    converter has; the rate of times that were taken as s decides between ms, us and ns.
     """
     columns = str(source.get("columns", ""))
     names = [piece.partition("=")[::2] for piece in columns.split(",")] if columns else []

@@ -22,9 +22,9 @@ def framed(recording: Recording) -> Recording:
     if is_as_read(rate_hz):
         return recording
     pauses_s = np.append(0.0, np.cumsum(_excess_s(np.diff(recording.times_s), rate_hz)))
-    clock_s = recording.times_s - pauses_s  # without the excess of pauses
+    clock_s = recording.times_s - pauses_s  # clock without the excess of pauses
     edges = reading_edges(clock_s)
-    # 1. Segments between commands; 1 frame or more if not empty.
+    # 1. Segments between commands; each has at least one frame unless it has no reading.
     commands = np.stack([recording.down_command, recording.up_command], axis=1).ravel()
     starts = np.concatenate([[0], commands, [len(recording.readings)]])
     start_s = edges[starts]
@@ -49,7 +49,7 @@ class FrameStream:
     def __init__(self, rate_hz: float, fibres: int) -> None:
         self._rate_hz = rate_hz
         self._start_s = np.nan  # of the next frame, by the clock without the excess of pauses
-        # Readings of incomplete frames, and the reading before them: time by that clock, excess until then, volts.
+        # The last reading of the latest frame and all later ones: time by that clock, total excess until then, volts.
         self._pending = np.empty((0, 2 + fibres))
 
     def feed(self, times_s: Array, readings: Array) -> tuple[Array, Array]:
@@ -76,9 +76,9 @@ class FrameStream:
 
 
 def _excess_s(intervals_s: Array, rate_hz: float) -> Array:
-    """Return the excess of intervals (n,) between readings over 1 s, or over 3 usual ones if these are longer; (n,), s.
+    """Return by how much intervals (n,) between readings exceed 1 s, or 3 usual intervals if these are longer; (n,), s.
 
-    A pause counts as no longer than that, so that a computer's sleep makes no frames.
+    Frames leave this excess out, so that hours in which a computer slept do not become frames.
     """
     return np.maximum(intervals_s - max(1.0, 3.0 / rate_hz), 0.0)
 
@@ -107,7 +107,7 @@ def time_means(edges: Array, readings: Array, frame_edges: Array) -> Array:
     """
     present = ~np.isnan(readings)
     # The means are subtracted from the readings, so that long sums keep their precision.
-    level = np.where(present, readings, 0.0).sum(axis=0) / np.maximum(present.sum(axis=0), 1)
+    mean = np.where(present, readings, 0.0).sum(axis=0) / np.maximum(present.sum(axis=0), 1)
     width = np.diff(edges)[:, None]
     row = np.clip(np.searchsorted(edges, frame_edges, side="right") - 1, 0, len(readings) - 1)
     fraction = ((frame_edges - edges[row]) / np.diff(edges)[row]).clip(0, 1)[:, None]
@@ -119,6 +119,6 @@ def time_means(edges: Array, readings: Array, frame_edges: Array) -> Array:
         return np.diff(sums[row] + fraction * areas[row], axis=0)
 
     present_s = integrate(present.astype(np.float64))
-    total = integrate(np.where(present, readings - level, 0.0))
+    total = integrate(np.where(present, readings - mean, 0.0))
     is_valid = present_s >= MIN_PRESENT * np.diff(frame_edges)[:, None]
-    return np.divide(total, present_s, out=np.full(total.shape, np.nan), where=is_valid) + level
+    return np.divide(total, present_s, out=np.full(total.shape, np.nan), where=is_valid) + mean

@@ -62,7 +62,7 @@ class PressPlan:
 
 
 def fit_pad_settings(pad: Morphology, pad_settings: PadSettings | None = None) -> PadSettings:
-    """Return `[pad]`, or the default, for the layout of a pad; InputError if keep-outs leave too little of it."""
+    """Return `[pad]`, or the default, for the layout of a pad; InputError if keep-outs leave too little to press."""
     pad_settings = or_default("size", pad_settings, PadSettings).for_layout(pad.layout)
     if pad_settings.keep_out_mm:
         import shapely
@@ -164,7 +164,7 @@ def _grid(corners_mm: Array, count: int, serpentine: bool) -> tuple[Array, Indic
     width, height = (high - low).tolist()
     if width == height:
         n_columns = n_rows = int(np.ceil(np.sqrt(count)))
-    else:  # equal steps along both axes: (1 + width / step) (1 + height / step) = count
+    else:  # equal steps 1 / per_mm along both axes, from (1 + per_mm width) (1 + per_mm height) = count
         per_mm = 2 * (count - 1) / (width + height + np.sqrt((width + height) ** 2 + 4 * width * height * (count - 1)))
         n_rows = round(1 + per_mm * height)
         n_columns = -(-count // n_rows)

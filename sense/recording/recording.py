@@ -91,7 +91,7 @@ class Recording:
         _check_presses(self)
         for name in _MEASURES:
             values = check_numbers(getattr(self, name), np.float64, name)
-            is_unknown = np.isnan(values).all()  # of any length, since `replace` may have changed the number of presses
+            is_unknown = np.isnan(values).all()  # of any length: `replace` may have changed the number of presses
             self._freeze(name, np.full(len(self.presses_mm), np.nan) if is_unknown else values)
             _check_measure(self, name)
 
@@ -140,7 +140,7 @@ class Recording:
 
     @property
     def mirrored(self) -> bool:
-        """Whether the pad lay with its tracks up, by `[rig]`, so that x pointed to the left of y seen from above."""
+        """Whether the pad lay with its tracks up, by `[rig]`: seen from above, x then points left if y points away."""
         return is_mirrored(self.source)
 
     @property
@@ -167,7 +167,8 @@ class Recording:
         """Hexadecimal SHA-256 of the readings and presses, without depths and forces."""
         digest = hashlib.sha256()
         for array in (getattr(self, name) for name in _ARRAYS):
-            normalised = np.where(np.isnan(array), np.nan, array) if array.dtype.kind == "f" else array  # bits of NaN
+            # NaN has several bit patterns
+            normalised = np.where(np.isnan(array), np.nan, array) if array.dtype.kind == "f" else array
             digest.update(repr(array.shape).encode() + normalised.tobytes())
         return digest.hexdigest()
 
@@ -214,10 +215,10 @@ class Recording:
         """Read a run directory, finished or not; `import_export.open_recording` reads files as well.
 
         Args:
-            path: the run directory. A torn end of its readings is ignored, with the presses in it.
+            path: the run directory. A torn end of its readings is omitted, with the presses in it.
 
         Raises:
-            InputError: there is other damage, or no run directory.
+            InputError: the path is no run directory, or is damaged otherwise.
         """
         path = check_path("path", path)
         fibres = read_fibres(path)
@@ -247,8 +248,8 @@ class Recording:
         Args:
             path: the run directory.
             provenance: provenance of the recording, JSON; by default versions of padforge and its dependencies.
-            replacing: whether to replace an existing simulated recording, see `check_replaceable`; any other one is
-                never overwritten.
+            replacing: whether to replace an existing recording, which must be a simulated one, see
+                `check_replaceable`.
         """
         provenance = origin("padforge.sense.Recording.save") if provenance is None else provenance
         check_target = check_replaceable if check_type("replacing", replacing, bool) else check_new_folder
@@ -320,7 +321,7 @@ def check_replaceable(path: Path) -> None:
     """
     advice = "choose another --out"
     if path.is_symlink():
-        raise InputError(f"{path}: is a link, and none is followed where a recording is replaced; {advice}")
+        raise InputError(f"{path}: is a link, expected a folder to replace; {advice}")
     if not path.exists():
         return
     if not path.is_dir():
@@ -345,8 +346,8 @@ def detect_commands(readings: Array, times_s: Array, source: Mapping[str, Any]) 
     Recording(readings, times_s, np.zeros((1, 2)), placeholder, placeholder + 1, source)  # checks the readings
     presses = detect_presses(readings, times_s)
     if len(presses.touched) == 0:
-        what = "no position or number tells of one, and none is detected in the readings"
-        hint = "; a line for each press is no recording" if len(readings) < 100 else ""
+        what = "none is given, and none is detected in the readings"
+        hint = "; a recording has many lines for each press" if len(readings) < 100 else ""
         raise InputError(f"has no press: {what}{hint}")
     return estimate_commands(presses, times_s)
 

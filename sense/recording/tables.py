@@ -31,7 +31,7 @@ FALLBACK = "cp1252"  # encoding of text that is not UTF-8: that of Windows in we
 _TRUTH = {"true": 1.0, "false": 0.0, "yes": 1.0, "no": 0.0, "on": 1.0, "off": 0.0}
 _BYTE_ORDER_MARKS = {codecs.BOM_UTF8: "utf-8-sig", codecs.BOM_UTF16_LE: "utf-16", codecs.BOM_UTF16_BE: "utf-16"}
 _N_SAMPLED = 400  # lines from which the dialect is detected
-_MAX_NAMED = 5
+_MAX_NAMED = 5  # lines in a message
 _MONITOR = re.compile(r"^(\d{1,2}:\d\d:\d\d(?:[.,]\d+)?) -> ?")  # time stamps of the Arduino IDE's monitor
 _GARBAGE = re.compile("^[\x00-\x08\x0e-\x1f\x7f-\xff\ufffd]*[\x00-\x08\x0e-\x1f\xfe\xff\ufffd]")  # sent while booting
 _CLOCK = re.compile(r"(\d{1,2}):(\d\d)(?::(\d\d(?:[.,]\d+)?))?")
@@ -90,7 +90,8 @@ class Table:
         dates: dict[int, list[str]] = {column: [] for column in columns if column in dialect.dates}
         words: dict[int, dict[int, str]] = {column: {} for column in columns}  # invalid cells by column and line
         torn: list[tuple[int, int]] = []  # lines with a wrong number of values, and that number
-        ends: list[tuple[int, int, list[str]]] = []  # of lines with too many: index of the row, line and last cells
+        # lines with too many values: the row that would follow, the number of the line, and its last `width` cells
+        ends: list[tuple[int, int, list[str]]] = []
         garbled: list[int] = []
         n_headers = last = 0
         for line, row in _split(_iterate_lines(self.path, self.encoding, garbled=garbled), dialect.separator):
@@ -98,8 +99,10 @@ class Table:
                 continue
             last = line
             cells = [cell.strip() for cell in row]
-            if len(cells) != width and not any(cells[width:]):  # drop empty cells, or fill columns of a wider header
-                cells = cells[:width] if len(cells) != dialect.width else cells + [""] * (width - dialect.width)
+            if len(cells) == dialect.width < width:  # fill the columns of a wider header
+                cells += [""] * (width - dialect.width)
+            elif not any(cells[width:]):  # drop empty cells at the end
+                cells = cells[:width]
             if len(cells) != width:
                 torn.append((line, len(cells)))
                 if width < len(cells) < 2 * width:
@@ -125,20 +128,20 @@ class Table:
         values, joined = self._insert_ends(values, columns, ends)
         self._report(words, [item for item in torn if item[0] not in joined], n_headers, last)
         if joined:
-            self.notes.append(f"{name_lines(joined)} left out up to where another line begins in it: one was cut off")
+            self.notes.append(f"{name_lines(joined)} read from where another line begins in it: one was cut off")
         if garbled:
-            self.notes.append(f"{name_lines(garbled)} read without bytes that are no text")
+            self.notes.append(f"{name_lines(garbled)} read without its bytes that are not text")
         if self.encoding == FALLBACK:
-            self.notes.append(f"its text is no UTF-8 and was read as {FALLBACK} (--encoding names another)")
+            self.notes.append(f"its text is not UTF-8 and was read as {FALLBACK} (--encoding names another)")
         return values
 
     def _insert_ends(
         self, values: Array, columns: Sequence[int], ends: list[tuple[int, int, list[str]]]
     ) -> tuple[Array, list[int]]:
-        """Insert the rows that follow in the same line after one that was cut off; return the values and these lines.
+        """Insert rows that were written into the line of a row that was cut off; return the values and these lines.
 
-        The first cell of such a row follows the last of the row before it without a separator. The place where it
-        begins is certain only in a column that ascends, if one number alone lies between those above and below.
+        No separator precedes the first cell of such a row. Where it begins is certain only if the first column ascends,
+        and one number alone fits between those above and below.
         """
         if not ends or 0 not in columns:
             return values, []
@@ -177,7 +180,7 @@ class Table:
                 what = f"column {short_repr(self.names[column])} holds no number but {short_repr(word)}"
                 if len(cells) > limit:
                     raise InputError(f"{self.path}: line {line}: {what}")
-                self.notes.append(f"{name_lines(list(cells))} a value missing: {what}")
+                self.notes.append(f"{name_lines(list(cells))} read with a value missing: {what}")
 
 
 def name_lines(lines: Sequence[int]) -> str:
@@ -268,10 +271,10 @@ def _split(lines: Iterator[tuple[int, str]], separator: str) -> Iterator[tuple[i
 def _find_dialect(sample: list[tuple[int, str]]) -> _Dialect:
     comments = [(number, line.lstrip("# ")) for number, line in sample if line.startswith("#")]
     lines = [(number, line) for number, line in sample if not line.startswith("#")]
-    separator, first = "", 0
+    separator, n_skipped = "", 0
     if lines and re.fullmatch(r"\W?sep=.\W*", lines[0][1]):  # Excel writes it, in quotes or not
-        separator, first = lines[0][1].strip('"')[4], 1
-    lines = lines[first:]
+        separator, n_skipped = lines[0][1].strip('"')[4], 1
+    lines = lines[n_skipped:]
     candidates = {candidate: list(_split(iter(lines), candidate)) for candidate in separator or SEPARATORS}
     separator = max(candidates, key=lambda candidate: _n_values([row for _, row in candidates[candidate]]))
     rows = [(number, [cell.strip() for cell in row]) for number, row in candidates[separator]]
@@ -279,11 +282,12 @@ def _find_dialect(sample: list[tuple[int, str]]) -> _Dialect:
     width = _width([row for _, row in rows])
     table = [row for _, row in rows if len(row) == width]
     shares = [np.mean([_is_value(cell) for cell in cells if cell] or [True]) for cells in zip(*table, strict=True)]
-    is_first = (len(row) == width and any(map(_is_number, row)) and _fits(row, shares) for _, row in rows)
-    start = next((i for i, is_data in enumerate(is_first) if is_data), len(rows))
-    number = rows[start][0] if start < len(rows) else (rows[-1][0] + 1 if rows else 1)
+    is_data = [len(row) == width and any(map(_is_number, row)) and _fits(row, shares) for _, row in rows]
+    start = is_data.index(True) if any(is_data) else len(rows)
+    first_line = rows[start][0] if start < len(rows) else (rows[-1][0] + 1 if rows else 1)
     # 2. Find the lines of names and units before it.
-    header, names, units = _find_names(rows[:start], width, [item for item in comments if item[0] < number], separator)
+    above = [(number, text) for number, text in comments if number < first_line]
+    header, names, units = _find_names(rows[:start], width, above, separator)
     unnamed = list(zip(*table, strict=True))[len(names) :]
     columns = list(zip(*[row for _, row in rows[start:] if len(row) == width], strict=True))
     measured = [_MEASURED.fullmatch(next(filter(None, cells), "")) for cells in columns]
@@ -295,25 +299,16 @@ def _find_dialect(sample: list[tuple[int, str]]) -> _Dialect:
     values = [match[2] for _, row in rows[start:] for cell in row if (match := _MEASURED.fullmatch(cell))]
     has_comma = any(re.fullmatch(r"[-+]?\d*,\d+", value) for value in values)
     has_point = any(re.fullmatch(r"[-+]?\d*\.\d+", value) for value in values)
-    dates = frozenset(
-        i for i, cells in enumerate(columns) if 2 * sum(bool(_DATE.fullmatch(c)) for c in cells) > len(cells)
-    )
-    return _Dialect(
-        separator,
-        has_comma and not has_point,
-        header,
-        number,
-        width,
-        names,
-        [*units, *[""] * (len(names) - len(units))],
-        dates,
-    )
+    date_shares = [np.mean([bool(_DATE.fullmatch(cell)) for cell in cells]) for cells in columns]
+    dates = frozenset(i for i, share in enumerate(date_shares) if share > 0.5)
+    units = [*units, *[""] * (len(names) - len(units))]
+    return _Dialect(separator, has_comma and not has_point, header, first_line, width, names, units, dates)
 
 
 def _find_names(
     rows: list[tuple[int, list[str]]], width: int, comments: list[tuple[int, str]], separator: str
 ) -> tuple[int, list[str], list[str]]:
-    """Return the number of the line of names above the values, or of the last comment, its names, and the units."""
+    """Return the number of the fullest line above the values, or else of the last comment, its names, and the units."""
     above = [(line, row) for line, row in rows if 2 * sum(map(bool, row)) >= width]
     while above and len(above[-1][1]) == width != len(above[0][1]):
         above.pop(0)
@@ -341,6 +336,7 @@ def _width(rows: list[list[str]]) -> int:
 
 
 def _fits(row: list[str], shares: Sequence[float]) -> bool:
+    """Return whether the cells of a row are values, or empty, in all columns that mostly hold values."""
     return all(not cell or _is_value(cell) for cell, share in zip(row, shares, strict=True) if share > 0.5)
 
 
@@ -409,9 +405,8 @@ def _parse_dates(texts: list[str], what: str) -> Array:
                 f"{what}: dates such as {texts[0]!r} need pandas: pip install 'padforge[formats]'"
             ) from error
         is_european = bool(re.match(r"\d{1,2}\.", texts[0]))
-        dates = pandas.to_datetime(
-            pandas.Series(texts), format="mixed", dayfirst=is_european, errors="coerce", utc=True
-        )
+        series = pandas.Series(texts)
+        dates = pandas.to_datetime(series, format="mixed", dayfirst=is_european, errors="coerce", utc=True)
         times = dates.dt.tz_localize(None).to_numpy("datetime64[ns]")
     seconds = times.astype(np.int64) / 1e9
     return np.where(np.isnat(times), np.nan, seconds)

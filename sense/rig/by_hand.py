@@ -47,10 +47,10 @@ UNTOUCHED = 0.25  # relative deviation below which it is not
 SINK_S = 0.4  # time after a touch when the finger has reached its depth
 RELEASE_S = 1.0  # time after a release when the pad has recovered, except for slow creep
 
-SETTLE_S = 2.0  # before the first press, to measure baseline and noise
-MIN_SHOWN_S = 0.6  # an earlier press after a target was shown was meant for the previous one, or is its echo
-MIN_HOLD = 0.8  # minimum duration of a press, in holds: people lift early
-MAX_HOLD = 4.0  # maximum duration, in holds
+SETTLE_S = 2.0  # time before the first press, in which baseline and noise are measured
+MIN_SHOWN_S = 0.6  # a touch sooner after a target is shown was meant for the previous one, or is the echo of it
+MIN_HOLD = 0.8  # minimum duration of a press, relative to `hold_s`, since people lift early
+MAX_HOLD = 4.0  # maximum duration of a press, relative to `hold_s`
 
 Position = tuple[float, float]
 OnView = Callable[[dict[str, Any]], None]
@@ -103,8 +103,8 @@ HandPhase = Literal["settle", "wait", "press", "hold", "lift", "done"]
 settle --ready--> press --touch--> hold --held for hold_s--> lift --release--> wait --ready--> press ... done
 
 The hands are off the pad in "settle", before the first press, and in "wait", while the pad recovers. A touch in these,
-or in "done", leads to "lift" and is rejected. Rejected are also presses that were held for too short or too long, were
-too weak, or moved.
+or in "done", leads to "lift" and is rejected. Presses that were held for too short or too long, were too weak, or
+moved are rejected as well.
 """
 
 
@@ -287,11 +287,11 @@ class HandSession:
         # Times begin at 0, or 1 s after the last reading of a resumed recording.
         self._start_s = max(recorder.last_s + 1, 0.0)
         self._zero_s: float | None = None
-        self._first = recorder.n_readings  # index in the recording of the session's first reading, which has index 0
+        self._first = recorder.n_readings  # index in the recording of reading 0 of the session
         self._number = max(recorder.done, default=-1) + 1
         self._sequence = PressSequence(targets_mm, hold_s, self._start_s)
         self._ring, self._now_s = RingBuffer(1 + recorder.fibres), self._start_s
-        self._detector: PressDetector | None = PressDetector(recorder.fibres)  # None: the pad is touched undetected
+        self._detector: PressDetector | None = PressDetector(recorder.fibres)  # None during a touch that it missed
         self._detector_start, self._validator = 0, PressValidator()
         self._touched = self._down_command = self._released = 0
         self._released_s = self._start_s

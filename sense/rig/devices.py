@@ -40,7 +40,7 @@ class ArmState:
     time_s: float  # host time of its arrival
     pose: Pose  # of the tool
     speed_mm_s: float  # of the tool, >= 0
-    force_n: float | None  # on the tool along z; None without a sensor, which `[rig] max_force_n` has to permit
+    force_n: float | None  # on the tool along z; None without a sensor, allowed if `[rig] max_force_n` is "unwatched"
     protective_stop: bool  # whether the controller has stopped the arm
     emergency_stop: bool  # whether a person has stopped the arm
     moving: bool  # whether the last move is in progress
@@ -64,8 +64,8 @@ class Arm(Protocol):
     def connect(self) -> Mapping[str, Any]:
         """Open the link and return the arm's identity (model, versions, rates) as JSON.
 
-        `serial` and, where the controller keeps the tool, `tcp` (the tip from the flange, mm and rad) are compared when
-        a recording is resumed. Raises RigFault("refused") if another program controls the arm.
+        When a recording is resumed, `serial` is compared, and `tcp` (the tip from the flange, mm and rad) if the
+        controller stores it. Raises RigFault("refused") if another program controls the arm.
         """
 
     def state(self) -> ArmState:

@@ -14,9 +14,9 @@ from padforge.sense.settings import RigSettings
 
 Status = Literal["ok", "warn", "fail"]
 
-OBSERVE_S = 2.0  # for which each device is observed
+OBSERVE_S = 2.0  # time for which each device is observed
 _DEAD_V = 0.02  # a channel closer than this to either end of the range is open, shorted or saturated
-_LATE_S = 0.1  # maximum latency, age or gap
+_LATE_S = 0.1  # latency of samples, age or gap of states from which on they are late
 
 
 @dataclass(frozen=True)

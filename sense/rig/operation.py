@@ -60,8 +60,8 @@ ADAPT_EVERY = 20  # presses between two evaluations of the localizer by an adapt
 class AdaptivePlanner:
     """Moves presses to the random candidates with the largest `acquisition`.
 
-    The localizer is of an earlier recording, `run` the directory of the current one, synced after every press, and
-    `free` tells which positions (n, 2), mm, may be pressed.
+    The localizer was trained on an earlier recording; `run` is the directory of the current one, synced after every
+    press; `free` returns which positions (n, 2), mm, may be pressed.
     """
 
     def __init__(self, localizer: LocalizerModel, run: Path, rng: np.random.Generator, free: PositionTest) -> None:
@@ -122,9 +122,9 @@ def record_simulated(
 
 
 def check_press_depths(pad: Morphology, rig: RigSettings, contact: Contact, folder: Path) -> None:
-    """Raise InputError for a press as deep as the pad is thick, by `[contact]` or by the mould in the pad's folder.
+    """Raise InputError for a press as deep as the pad is thick, as `[contact]` or the mould in the folder states it.
 
-    Warn if no press has the depth that the pad is designed for, by itself or else by `[contact]`.
+    Warn if no press has the depth that the pad was designed for, as its provenance or else `[contact]` states it.
     """
     depths_mm = planned_depths_mm(rig)
     if contact.model == "layer":
@@ -205,8 +205,8 @@ def diagnose(kind: str, config: RigConfig, inputs: Sequence[int]) -> list[Diagno
     """Diagnose a rig before a long run, without moving it.
 
     Each device is examined even if the other one fails, and a printer even if the pose of the pad is unknown. `kind` is
-    the name of the arm, or "hand" for the board alone, whose lack raises RigFault; `inputs` are those of the board to
-    read, () for all.
+    the name of the arm, or "hand" for the board alone, which then raises RigFault if it is missing; `inputs` are those
+    of the board to read, () for all.
     """
     ports = [f"{port.device} ({port.description})" for port in host_ports() if port.vid is not None]
     diagnoses = [Diagnosis("ports", "ok", ", ".join(ports) or "no board seen on USB")]

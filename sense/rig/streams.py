@@ -126,10 +126,9 @@ def stream_recording(recording: Recording, speed: float) -> ReadingStream:
 
 
 def is_pad_mirrored(model: Path, rig: RigSettings) -> bool:
-    """Return whether the pad lies with its tracks up, so that x, y of its plan and z into it are right-handed.
+    """Return whether the pad lies with its tracks up, so that x and y of its plan are right-handed with z into it.
 
-    If `[rig]` does not say, the pad lies as in the training recording, perhaps in a holder, which only the recording
-    mentions; InputError if that is damaged.
+    If `[rig]` does not state it, the pad is assumed to lie as in the training recording; InputError if that is damaged.
     """
     if rig.mirrored is not None:
         return rig.mirrored

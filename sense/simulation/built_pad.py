@@ -1,9 +1,9 @@
 """A simulated pad as it comes out of the mould: fibres beside their plan, with a sensitivity that varies along them.
 
 The response to a press has four parts: held, that of the contact; onset, while the probe moves; creep, by which the
-held part relaxes; and the residue after the release. The others are as wide as `[rig]` says, and each has its own
-sensitivity along the fibres. A trace therefore depends on the position in more ways than any one of its readings, as
-that of a built pad does.
+held part relaxes; and the residue after the release. `[rig]` states the widths of the last three, and each part has its
+own sensitivity along the fibres. The readings of one press therefore differ in how they depend on the position, as on a
+built pad.
 """
 
 from dataclasses import dataclass
@@ -20,7 +20,7 @@ from padforge.sense.arrays import Array
 from padforge.sense.settings import RigSettings
 
 T = TypeVar("T")
-SMOOTH_MM = 8.0  # half of the shortest wavelength of the sensitivity along a fibre and of the deviation of its path
+SMOOTH_MM = 8.0  # half of the shortest wavelength in the sensitivity along a fibre, and in the deviation of its path
 SAMPLES = 65  # samples of the sensitivity along the axis of a fibre
 KNOTS_PER_WAVE = 8  # knots of an as-built path in each half wave
 
@@ -35,7 +35,7 @@ class PressParts(NamedTuple, Generic[T]):
 
 
 def build_pad(plan: Morphology, rig: RigSettings) -> "BuiltPad":
-    """Return the pad as built by a plan and `[rig]`, the same for the same seed."""
+    """Build a pad by a plan and `[rig]`; the same seed gives the same pad."""
     return BuiltPad.sample(plan, rig, np.random.default_rng([2, rig.seed]))
 
 
@@ -56,9 +56,9 @@ class BuiltPad:
         paths = _deviate(plan, rig.path_mm, rng) if rig.path_mm else plan
         if not (rig.sensitivity or rig.own_sensitivity):
             return cls(paths)
-        held, *others = (_log_sensitivity(plan, rng) for _ in PressParts._fields)
-        logarithms = [held := rig.sensitivity * held, *(held + rig.own_sensitivity * each for each in others)]
-        factors = [np.exp(each) for each in logarithms]
+        common, *others = (_log_sensitivity(plan, rng) for _ in PressParts._fields)
+        own = (np.zeros_like(common), *others)  # what a part adds to the sensitivity that all have in common
+        factors = [np.exp(rig.sensitivity * common + rig.own_sensitivity * each) for each in own]
         return cls(paths, PressParts(*(each / each.mean(axis=1, keepdims=True) for each in factors)))
 
     def stretch(self, positions_mm: Array, contacts: PressParts[Contact]) -> PressParts[Array]:
@@ -76,7 +76,7 @@ def press_contacts(contact: Contact, rig: RigSettings) -> PressParts[Contact]:
 
 
 def _deviate(plan: Morphology, deviation_mm: float, rng: np.random.Generator) -> Morphology:
-    """Return a pad whose paths deviate across their axes by this standard deviation; ends and sides stay."""
+    """Return a pad whose paths deviate across their axes by a standard deviation; fibre ends stay where they are."""
     from scipy.interpolate import PchipInterpolator
 
     horizontals, knots = plan.layout.counts[0], []
@@ -104,4 +104,5 @@ def _log_sensitivity(plan: Morphology, rng: np.random.Generator) -> Array:
 
 
 def _waves(extent_mm: float) -> int:
+    """Return the number of half waves of at least `SMOOTH_MM` in an extent."""
     return max(int(extent_mm / SMOOTH_MM), 1)

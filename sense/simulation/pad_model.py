@@ -1,10 +1,10 @@
 """Physical model of a simulated pad: what an ADC reads from each fibre while a probe presses.
 
-The response of a fibre is the change of its resistance by the contact model. Effects of a built pad are added, whose
-sizes in the published recording are the defaults of `[rig]`: responses scatter from press to press, follow the probe
-with a lag, creep, and have hysteresis (after a release a fibre overshoots its rest and recovers within seconds, or when
-it is pressed there again); the rest drifts over minutes. An ADC with white noise reads the voltage between the fibre
-and a fixed resistor.
+The response of a fibre is the change of its resistance by the contact model. Effects of a built pad are added; their
+sizes in the published recording are the defaults of `[rig]`. Responses scatter from press to press, follow the probe
+with a lag, and creep. They have hysteresis: after a release a fibre overshoots its rest, and recovers within seconds,
+or when it is pressed there again. The rest drifts over minutes. An ADC with white noise reads the voltage between the
+fibre and a fixed resistor.
 """
 
 import math
@@ -20,20 +20,20 @@ from padforge.sense.arrays import Array
 from padforge.sense.settings import RigSettings
 from padforge.sense.simulation.built_pad import BuiltPad, PressParts, build_pad, press_contacts
 
-SUPPLY_V, ADC_STEPS = 3.3, 2**12 - 1  # of the simulated board and its converter
+SUPPLY_V, ADC_STEPS = 3.3, 2**12 - 1  # supply of the simulated board, and steps of its converter
 GAUGE_FACTOR = 0.65  # relative change of a fibre's resistance per strain in a layer
-WEIGHT_GAUGE_FACTOR = 0.4  # the same per relative stretch of a contact with weights about 1, FULL_DEPTH_MM deep
-FULL_DEPTH_MM = 5.0
+WEIGHT_GAUGE_FACTOR = 0.4  # the same per relative stretch by other contacts, whose weights are about 1, at full depth
+FULL_DEPTH_MM = 5.0  # depth at which a contact without depth, or a twin, responds in full
 TRAVEL_S = 0.1  # time that the probe takes from the surface to its depth, and back
 DELAY_S = (0.04, 0.22)  # range of the time from the command to the touch
 RELEASE_S = (0.0, 0.06)  # range of the time from the command to the start of the release
 ONSET_S = 0.15  # time constant of the change from the onset response to the held one
 CREEP_S = 1.0  # time constant of creep
 DRIFT_S = 600.0  # correlation time of the drift
-SURFACE_MM, SURFACE_WAVES = 10.0, 8  # length over which the height of a pad changes, and number of waves in it
-MAX_LAG = 32  # number of earlier presses whose residues count
+SURFACE_MM, SURFACE_WAVES = 10.0, 8  # length over which the height of a pad changes, and number of waves that add up
+MAX_LAG = 32  # maximum number of earlier presses whose residues count
 RETURNED = 0.4  # fraction of a removed residue that returns when the press ends
-REST_V = (1.7, 2.1)  # range of the voltages at rest; the divider is matched to half the supply only roughly
+REST_V = (1.7, 2.1)  # range of the voltages at rest, which are half of the supply only roughly
 
 
 @dataclass(frozen=True)
@@ -98,7 +98,7 @@ def replaced_residues(
 
 
 class Gains:
-    """Random factors of the responses of successive presses: scatter of each press, and slow wander."""
+    """Random factors on the responses of successive presses: scatter of each press, times slow wander."""
 
     def __init__(self, interval_s: float, channels: int, rig: RigSettings, rng: np.random.Generator) -> None:
         self._channels, self._rig, self._rng = channels, rig, rng
@@ -181,7 +181,7 @@ class Viscoelasticity:
         self._states: tuple[Array, Array] | None = None  # of the two filters
 
     def __call__(self, strain: Strain) -> Array:
-        """Compute the response (R, C) to further strain; the first one is settled."""
+        """Compute the response (R, C) to further strain; before the first strain, creep is in equilibrium with it."""
         creep_decay, residue_decay = self._creep_decay, self._residue_decay
         states = self._states or (creep_decay * strain.creeping[:1], np.zeros_like(strain.residue[:1]))
         creep, creep_state = lfilter([1 - creep_decay], [1.0, -creep_decay], strain.creeping, axis=0, zi=states[0])
@@ -217,7 +217,7 @@ def adc_volts(volts: Array) -> Array:
 
 
 class Divider:
-    """Fibres in their dividers, read by an ADC; strain is a relative change of resistance, or in V if `linear`."""
+    """Fibres in voltage dividers, read by an ADC; strain is a relative change of resistance, or in V if `linear`."""
 
     def __init__(
         self, fibres: int, rate_hz: float, rig: RigSettings, rng: np.random.Generator, linear: bool = False
@@ -232,8 +232,8 @@ class Divider:
         """Read the voltages (R, C) of further strain."""
         if not len(strain.pressed):
             return strain.pressed
-        visible = self._viscoelasticity(strain)
-        volts = self._rest_v + visible if self._linear else divider_voltage(self._rest_v, visible)
+        response = self._viscoelasticity(strain)
+        volts = self._rest_v + response if self._linear else divider_voltage(self._rest_v, response)
         volts += self._rig.drift_mv * 1e-3 * self._drift(len(volts))
         volts += self._rig.noise_mv * 1e-3 * self._rng.standard_normal(volts.shape)
         return adc_volts(volts)
@@ -253,7 +253,7 @@ def simulate_readings(
     of held presses have noise of that standard deviation, whatever their size.
     """
     presses, channels = responses.held.shape
-    # The divider draws first, as in `LivePad`: with the same seed fibres have the same rests there.
+    # The divider samples first, as in `LivePad`, so that fibres have the same rests there with the same seed.
     divider = Divider(channels, cycle.rate_hz, rig, rng, linear=noise_v is not None)
     interval_s = cycle.readings / cycle.rate_hz
     touch_s = interval_s * np.arange(presses)
@@ -271,7 +271,7 @@ def simulate_readings(
 
 
 def _reading_noise_v(cycle: Cycle, rig: RigSettings) -> float:
-    """Return the standard deviation, V, of a held press minus the rest before it by white noise and drift alone."""
+    """Return the standard deviation, V, that white noise and drift give to a held press minus the rest before it."""
     held = np.arange(cycle.held_index, cycle.readings)
     before = np.arange(cycle.down_index // 2, cycle.down_index)
     times_s = np.append(held, before) / cycle.rate_hz
@@ -306,11 +306,12 @@ class LivePad:
         self._solve(positions_mm[depths_mm > 0])
         for row, depth in enumerate(np.maximum(depths_mm / self._depth_mm, 0).tolist()):
             step, self._depth = depth - self._depth, depth
-            if not (depth or step):
+            time_s = (self._n_read + row) / self._rate_hz
+            if depth == step == 0:  # the tip stays above the pad
                 continue
-            if depth and step == depth:
-                self._touch(positions_mm[row], (self._n_read + row) / self._rate_hz)
-            press, time_s = self._presses[-1], (self._n_read + row) / self._rate_hz
+            if step == depth:  # it was above the pad before
+                self._touch(positions_mm[row], time_s)
+            press = self._presses[-1]
             moved = np.zeros_like(press.replaced)
             if depth:
                 press.release_s = time_s

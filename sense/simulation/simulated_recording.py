@@ -37,8 +37,8 @@ from padforge.sense.settings import RigSettings
 from padforge.sense.simulation.built_pad import PressParts, build_pad
 from padforge.sense.simulation.pad_model import DRIFT_S, FULL_DEPTH_MM, Cycle, resistance_changes, simulate_readings
 
-MIN_SINGULAR = 0.3  # relative singular value; both sides of a pad that is turned by over 28 degrees count as equal
-JITTER = 0.1  # standard deviation of the interval between readings over its mean
+MIN_SINGULAR = 0.3  # relative singular value below which both sides count as equal: on a pad turned by over 28 degrees
+JITTER = 0.1  # standard deviation of the interval between readings, relative to its mean
 MIN_PRESSES = 100  # minimum number of presses for a measurement of noise, drift and hysteresis
 REST_S = 0.7  # time before a press in which fibres rest
 
@@ -190,14 +190,14 @@ def simulate(
             them.
         contact: contact model; that of a twin replaces it.
         size: pressed area and keep-outs of the pad; for a twin only the keep-outs.
-        like: twin of another pad, with the sensitivity, gain and noise of which `pad` responds.
+        like: twin of another pad, whose sensitivity, gain and noise `pad` takes over.
 
     Returns:
         The recording, the same for the same arguments.
 
     Raises:
-        InputError: more fibres than a recording may have, presses beyond the pad or in its keep-outs, a
-            plan that is adaptive or no file of positions, or a twin of which no channel reads a fibre.
+        InputError: more fibres than a recording may have, presses beyond the pad or in its keep-outs, an adaptive plan
+            or a plan file without positions, or a twin of which no channel reads a fibre.
     """
     contact, rig = or_default("contact", contact, Contact), or_default("rig", rig, RigSettings)
     channels = len(pad.channels) if isinstance(pad, Twin) else len(pad.knots)

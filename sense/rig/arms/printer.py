@@ -41,7 +41,7 @@ SETTINGS = ("G21", "G90", "M220 S100", "M211 S1", "M84 S0")
 """Millimetres, absolute positions, speeds at 100 %, software endstops on, motors always energized."""
 
 _POLL_S = 0.03  # pause between two requests for the position
-_TOLERANCE_MM = 0.05  # of a position at rest: its last decimal and one motor step
+_TOLERANCE_MM = 0.05  # tolerance of a position at rest: its last decimal and one motor step
 _START_S = 0.1  # time for which a firmware waits for further moves before it starts the first
 _MAX_IMPLAUSIBLE = 3  # implausible positions in a row; fewer are noise
 
@@ -54,7 +54,7 @@ class NozzleThread(threading.Thread):
     ) -> None:
         super().__init__(name="printer", daemon=True)
         self._link, self._rig, self._max_mm_s, self._max_mm_s2 = link, rig, max_mm_s, max_mm_s2
-        self._position = self._reported = position  # at rest, and reported last
+        self._position = self._reported = position  # the last one at rest, and the last one reported
         self._move: StraightMove | None = None
         self._move_start_s, self._acceleration, self._n_implausible = 0.0, 0.0, 0
         self._commands: queue.Queue[tuple[Callable[[], None], Future[None]]] = queue.Queue()

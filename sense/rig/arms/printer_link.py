@@ -92,7 +92,7 @@ class MarlinLink:
         self._number = 0
         self._history: deque[bytes] = deque(maxlen=8)  # lines that can be sent again
         self._connected = False
-        self.halted = False  # or restarted: the printer takes no moves any more
+        self.halted = False  # whether the printer has halted or restarted, so that it takes no further moves
 
     def handshake(self, timeout_s: float) -> None:
         """Wait until the printer answers, and reset its line number to 0; RigFault("refused") if none answers."""
@@ -137,7 +137,7 @@ class MarlinLink:
                     if n_sent > 1:
                         list(self._read_until_silent())
                     return answer
-            if n_bad_resends >= 4:  # fewer are noise
+            if n_bad_resends >= 4:  # noise alone causes fewer
                 message = f"{self._port}: the printer asks for line {requested}, not {self._number}"
                 raise RigFault("lost", message, HOMING_ADVICE)
         advice = "it may be busy: look at its display"

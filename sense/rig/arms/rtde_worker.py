@@ -32,7 +32,7 @@ ANSWER_S = 1.0  # longest wait for an answer of the arm while connecting
 SESSION_END_S = 1.0  # longest wait for the end of another session, whose watchdog takes 0.25 s
 STOP_M_S2 = 5.0  # deceleration of a stop
 ARM_STATE = ("time_s", "pose", "speed_mm_s", "force_n", "sideways_n", "protective_stop", "emergency_stop")
-"""Fields of an `ArmState` that the controller states."""
+"""Fields of an `ArmState` that the controller reports."""
 UNLOCK_ADVICE = "look at the arm, unlock it at the pendant, then connect again"
 
 

@@ -77,7 +77,7 @@ def test_assemble_recording_detects_presses_in_the_readings(recording: Recording
 @pytest.mark.parametrize(
     ("arrays", "message"),
     [
-        ({"fibres": np.ones((11, 2))}, r"fibres have shape \(11, 2\), expected \(12, C\) or \(C, 12\), as time has it"),
+        ({"fibres": np.ones((11, 2))}, r"fibres have shape \(11, 2\), expected \(12, C\) or \(C, 12\), 12 as in time"),
         ({"press": np.where(PRESSED, 1, np.where(TIMES > 1, -1, 0))}, "press is missing or negative in row 11 and 0"),
         ({"press": 1 + PRESSED}, "press is nowhere 0, missing or negative"),
         (COMMANDS | {"positions": np.ones((3, 2))}, "positions are 3, expected one for each of 2 presses or 12"),

@@ -278,7 +278,7 @@ def test_import_csv_reads_the_line_that_follows_a_torn_one_in_the_same_line(
     recording = import_csv(tmp_path / "lab.csv", f"time=t:{unit},fibres=c*")
     np.testing.assert_allclose(recording.readings, np.delete(VOLTS, 70, axis=0), atol=1e-9)
     np.testing.assert_allclose(np.diff(recording.times_s)[69:71], [0.1, 0.05])
-    note = "line 72 is left out up to where another line begins in it: one was cut off"
+    note = "line 72 is read from where another line begins in it: one was cut off"
     assert str(recording.source["note"]).startswith(note)
 
 

@@ -67,6 +67,8 @@ def follow(model: LocalizerModel, trials: list[list[Touch]], seed: int = 5) -> l
     times_s, events, swings, moved_v = np.arange(len(readings)) / RIG.rate_hz, [], [], []
     for begin, touch in pairwise([Touch(np.zeros(2), 0, 0), *sorted(touches, key=lambda touch: touch.up)]):
         events += live.update(times_s[begin.up : touch.up], readings[begin.up : touch.up])
+        over = {event.press for event in events if isinstance(event, Estimate) and event.final}
+        assert all(estimate.final == (estimate.press in over) for estimate in live.presses)
         rest = max(start for start in starts if start < touch.up)
         swings.append([fibre["swing"] for fibre in live.view()["fibres"]])
         moved_v.append(readings[touch.up - 1] - readings[rest - 5 : rest].mean(axis=0))

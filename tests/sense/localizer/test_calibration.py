@@ -141,7 +141,7 @@ def test_calibrate_learns_depth_and_force(deep_recording: Recording, deeply_cali
         ({"forces_n": np.empty(0)}, ["depth_mm"], []),
         ({"depths_mm": np.empty(0)}, [], []),
         ({"depths_mm": np.full(400, 5.0)}, [], []),
-        ({"depths_mm": np.nan}, [], ["depth is not learnt: it is known of 398 of 399 presses, needed is of all"]),
+        ({"depths_mm": np.nan}, [], ["depth is not learnt: it is known of 398 of 399 presses, expected all"]),
         ({"reached_mm": 0.0}, [], ["depth is not learnt: 1 of 399 presses reached 0 mm or less"]),
     ],
 )
