@@ -72,7 +72,8 @@ def follow(model: LocalizerModel, trials: list[list[Touch]], seed: int = 5) -> l
         rest = max(start for start in starts if start < touch.up)
         swings.append([fibre["swing"] for fibre in live.view()["fibres"]])
         moved_v.append(readings[touch.up - 1] - readings[rest - 5 : rest].mean(axis=0))
-    events += live.update(times_s[touch.up :], readings[touch.up :])
+    last = max(touch.up for touch in touches)
+    events += live.update(times_s[last:], readings[last:])
     assert not live.pressed
     # however many fingers are on it, the view shows each fibre's change from its rest, on one scale
     scale = np.median(np.divide(swings, moved_v), axis=0)

@@ -187,7 +187,7 @@ def test_calibrate_uncertainty_corrects_overconfidence(
     with mock.patch("padforge.sense.localizer.calibration.conformal", wraps=conformal) as radii:
         calibrate_uncertainty(proud, moments, recording.presses_mm[test], 2, n_trained=300)
     shares = [0, 1 / recording.fibres]
-    usual = [[Experience.at(n + 1).ratio(300, share) for share in shares] for n in range(N_TIMED)]
+    usual = [[Experience.at_moment(n + 1).ratio(300, share) for share in shares] for n in range(N_TIMED)]
     ratios = np.reshape([call.args[3] for call in radii.call_args_list], (N_TIMED, 2)) / usual
     np.testing.assert_allclose(ratios, np.full_like(ratios, ratios[0, 0]))
 
