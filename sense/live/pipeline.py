@@ -374,7 +374,7 @@ class Live:
         return [event for press in list(presses) for event in self._follow(press, end)]
 
     def _end(self, released: int) -> list[Event]:
-        """End the press whose release shows at a reading; of two, `_release_lifted` finds later which one it was."""
+        """End the press whose release shows at a reading; of two, `_release_one_or_both` finds which one later."""
         self._candidate, held = None, self._held
         if not held or self._lift is not None:
             return []
@@ -420,7 +420,7 @@ class Live:
         """Return the events at the latest reading."""
         events: list[Event] = []
         if self._lift is not None and self._buffer.end >= self._lift + RELEASE_WINDOWS[LIFT_WINDOWS[-1]][1]:
-            events += self._release_lifted(self._lift)
+            events += self._release_one_or_both(self._lift)
             self._lift = None
         elif self._candidate is not None:
             events += self._judge(*self._candidate)
@@ -448,7 +448,7 @@ class Live:
             self._candidate = None
         return []
 
-    def _release_lifted(self, lift: int) -> list[Event]:
+    def _release_one_or_both(self, lift: int) -> list[Event]:
         """Release that one of two fingers, or both, whose expected release best explains the change since a reading."""
         held, events = self._held, list[Event]()
         for press in held:
@@ -460,23 +460,23 @@ class Live:
         after, before = (self._mean(lift + first, lift + end) for first, end in (window, (-3, 0)))
         expected = np.array([course.changes_by_release[list(LIFT_WINDOWS)].mean(axis=0) for course in courses])
         sets, mask = ([0], [1], [0, 1]), courses[0].fibre_mask & courses[1].fibre_mask
-        errors = [float((((after - before) - expected[lifted].sum(axis=0))[mask] ** 2).sum()) for lifted in sets]
+        errors = [float((((after - before) - expected[released].sum(axis=0))[mask] ** 2).sum()) for released in sets]
         best, second_best = np.argsort(errors)[:2]
-        lifted = sets[best]
+        released = sets[best]
         if errors[best] > MAX_ERROR_RATIO * errors[second_best]:
-            lifted = [1]  # a guess: either may be the one that is still held, so both positions become unknown
+            released = [1]  # a guess: either may be the one that is still held, so both positions become unknown
             names, anywhere_mm = ("std_x_mm", "std_y_mm", "r50_mm", "r90_mm"), np.array(UNIFORM)[[0, 0, 1, 2]]
             radii_mm = dict(zip(names, (self._localizer.scaler.scale_mm * anywhere_mm).tolist(), strict=True))
             for press in held:
                 if press.fixed is not None:
                     press.fixed = replace(press.fixed, unlike=True, **radii_mm)
                     events.append(self._show(press.fixed))
-        elif lifted == [1]:
+        elif released == [1]:
             held[1].fixed = None  # only its own release changes the readings now, and locates it better
-        for number in lifted:
+        for number in released:
             held[number].release(lift, self._buffer)
-        if len(lifted) == 1:
-            self._detector.hold(courses[1 - lifted[0]].pressed[-1])
+        if len(released) == 1:
+            self._detector.hold(courses[1 - released[0]].pressed[-1])
         return events
 
     def _mean(self, first: int, end: int) -> Array:

@@ -57,8 +57,8 @@ class BuiltPad:
         if not (rig.sensitivity or rig.own_sensitivity):
             return cls(paths)
         common, *others = (_log_sensitivity(plan, rng) for _ in PressParts._fields)
-        own = (np.zeros_like(common), *others)  # what a part adds to the sensitivity that all have in common
-        factors = [np.exp(rig.sensitivity * common + rig.own_sensitivity * each) for each in own]
+        of_parts = (np.zeros_like(common), *others)  # what a part adds to the sensitivity that all have in common
+        factors = [np.exp(rig.sensitivity * common + rig.own_sensitivity * each) for each in of_parts]
         return cls(paths, PressParts(*(each / each.mean(axis=1, keepdims=True) for each in factors)))
 
     def stretch(self, positions_mm: Array, contacts: PressParts[Contact]) -> PressParts[Array]:
