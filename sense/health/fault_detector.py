@@ -84,6 +84,7 @@ class FibreFault:
 
 
 class _PressRecord(NamedTuple):
+    press: int  # index of the press; a live pad may leave out some presses
     trace: Array  # shape (L, TRACE)
     inputs: Floats  # shape (L, N)
     targets: Array  # shape (L, T)
@@ -151,7 +152,7 @@ class FaultMonitor:
         trace = extract_trace(readings[:, self.model.living], down_command, up_command, 0, len(readings))
         level, is_warm = self._history.level, self._history.n_presses >= WARM_UP
         inputs, targets = self.model.pca.scale(*self.model.pca.project(trace, self._history))
-        self._recent.append(_PressRecord(trace, inputs, targets, level, is_warm))
+        self._recent.append(_PressRecord(self.n_presses, trace, inputs, targets, level, is_warm))
         llr_continuing, llr_onset = self._llrs(list(self._recent)[-2:], self._failed)
         self._update_sums(llr_continuing[-1], llr_onset[-1], self.n_presses)
         faults = self._find_missing(trace)
@@ -177,8 +178,8 @@ class FaultMonitor:
         self._n_missing = np.where(np.isfinite(trace).mean(axis=1) >= MIN_PRESENT, 0, self._n_missing + 1)
         missing = ~self._failed & (self._n_missing == MAX_MISSING)
         self._failed |= missing
-        since = self.n_presses - MAX_MISSING + 1
         fibres = self.model.living[missing].tolist()
+        since = self._recent[-MAX_MISSING].press if fibres else 0
         return [FibreFault(self.n_presses, since, (fibre,), "missing", MAX_SCORE) for fibre in fibres]
 
     def _neg_log_p(self, failed: Mask) -> Array:
@@ -193,7 +194,7 @@ class FaultMonitor:
 
     def _predict(self, records: Sequence[_PressRecord], failed: Mask) -> tuple[Array, Array, Array, Array]:
         """Return traces, targets, and means and deviations predicted without failed fibres; shape (Q, L, ...) each."""
-        traces, inputs, targets, _, is_warm = (np.stack(part) for part in zip(*records, strict=True))
+        _, traces, inputs, targets, _, is_warm = (np.stack(part) for part in zip(*records, strict=True))
         mean, std = predict_fibres(self.model.weights, inputs, ~failed & np.isfinite(traces).all(axis=2))
         # A rest has no level to be compared with before some presses have defined one.
         targets[:, :, -1] = np.where(is_warm, targets[:, :, -1], np.nan)
@@ -205,11 +206,12 @@ class FaultMonitor:
     def _replay(self, first: int, failed: Mask) -> None:
         """Compute the sums again over the recent presses from index `first` on, without the failed fibres."""
         self._height, self._onset = np.zeros_like(self._height), np.zeros_like(self._onset)
-        for press, llrs in enumerate(zip(*self._llrs(self._records_since(first), failed), strict=True), first):
-            self._update_sums(*llrs, press)
+        records = self._records_since(first)
+        for record, continuing, onset in zip(records, *self._llrs(records, failed), strict=True):
+            self._update_sums(continuing, onset, record.press)
 
     def _records_since(self, first: int) -> list[_PressRecord]:
-        return list(self._recent)[first - self.n_presses - 1 :]
+        return [record for record in self._recent if record.press >= first]
 
     def _identify(self) -> FibreFault:
         """Identify the faulty fibre, mask it, and recompute the sums without it from the earliest onset on.
@@ -222,8 +224,7 @@ class FaultMonitor:
         largest, threshold = neg_log_p.max(axis=1), self.model.threshold
         ranked = np.argsort(-largest, kind="stable")[: min(MAX_SUSPECTS, int((~self._failed).sum()))]
         suspects = ranked[largest[ranked] > threshold / 2]
-        first_onset = int(onset[suspects, neg_log_p[suspects].argmax(axis=1)].min())
-        first = max(first_onset, self.n_presses + 1 - len(self._recent))
+        first = int(onset[suspects, neg_log_p[suspects].argmax(axis=1)].min())
         # 2. A swapped pair or an inverted fibre is the fault if it makes the readings far more likely.
         pairs = [pair for pair in combinations(sorted(ranked.tolist()), 2) if (largest[list(pair)] > threshold).any()]
         wirings = [*self._swapped(pairs, first), *self._inverted(first)]
@@ -285,7 +286,7 @@ class FaultMonitor:
 
     def _classify(self, fibre: int, hypothesis: int, since: int) -> str:
         """Return the kind of fault, by the last presses of the fibre."""
-        records = self._records_since(max(since, self.n_presses + 1 - len(self._recent)))
+        records = self._records_since(since)
         rests = np.array([record.trace[fibre, :REST].mean() for record in records])
         last = self._recent[-1].trace[fibre]
         low, high = self.model.rest_range_v[:, fibre]

@@ -171,7 +171,7 @@ def record(
     with closing(make_board(rig, inputs)) as board, closing(arm):
         with Interrupts() as interrupts:
             plan = load_or_make_plan(config, resume)
-            planner = _make_planner(config, model)
+            planner = make_planner(config, model)
             check_plan(plan, rig)
             if resume and (notice := plan_notice(config)):
                 _log.warning(notice)
@@ -192,7 +192,8 @@ def record(
             return None if dry else Recording.open(out)
 
 
-def _make_planner(config: RigConfig, model: Path | None) -> AdaptivePlanner | None:
+def make_planner(config: RigConfig, model: Path | None) -> AdaptivePlanner | None:
+    """Return the planner of an adaptive plan, by the localizer in the folder `model`; None for any other plan."""
     if config.rig.plan != "adaptive":
         return None
     if model is None:

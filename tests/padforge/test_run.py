@@ -96,8 +96,8 @@ def test_resume_reuses_finished_run_of_the_same_search(folder: Path, monkeypatch
 
 
 def test_resume_repeats_stages_of_changed_settings(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """One setting of each section after another, the first of which really changes what is made."""
-    out, text, before = folder / "out" / "pad", SMALL, digests(folder)
+    """One setting of each section after another, the first of which really changes what is made; and of the seed."""
+    out, text, before, asked = folder / "out" / "pad", SMALL, digests(folder), list[Any]()
 
     def read(name: str) -> dict[str, Any]:
         return json.loads((out / f"{name}.json").read_text())
@@ -130,7 +130,11 @@ def test_resume_repeats_stages_of_changed_settings(folder: Path, monkeypatch: py
             after = digests(folder)
             assert [name for name in ("mould.stl", "recording") if after[name] != before[name]] == ["mould.stl"]
             for name, result in as_before.items():
-                monkeypatch.setattr(f"padforge.{name}", lambda *_, result=result, **__: result())
+                monkeypatch.setattr(f"padforge.{name}", lambda *ask, make=result, **_: asked.append(ask) or make())
+    asked.clear()
+    assert resumed(folder, "--seed", "7") == ""
+    design, _, recording, contacts, calibration = asked
+    assert (design[2], recording[3], contacts[3], calibration[2].seed) == ({"seed": 7}, {"seed": 7}, 7, 7)
 
 
 def test_resume_repeats_stages_of_changed_files(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:

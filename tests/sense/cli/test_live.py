@@ -33,7 +33,7 @@ def replay(few) -> Callable[..., tuple[int, str, str]]:
     return lambda *words: few(*command, *words)
 
 
-def test_live_says_that_another_pad_is_pressed(enough, views: list[dict], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_live_says_that_another_pad_is_pressed(enough, monkeypatch: pytest.MonkeyPatch) -> None:
     """As early as after eight presses."""
     for module in ("live.pipeline", "localizer.single_press"):
         monkeypatch.setattr(f"padforge.sense.{module}.MIN_PRESSES", 8)
@@ -46,8 +46,6 @@ def test_live_says_that_another_pad_is_pressed(enough, views: list[dict], monkey
     assert said["press"] >= 7
     later = events[events.index(said) + 1 :]
     assert {(event["event"], *event["failed"]) for event in later} == {("estimate",)}
-    assert {event["unlike"] for event in events if event["event"] == "estimate"} <= {True, False}
-    assert views[-1]["faults"] == [OTHER_PAD]
 
 
 @pytest.fixture
@@ -63,7 +61,6 @@ def test_live_replays_a_recording(replay, views: list[dict]) -> None:
     assert code == 0, err
     told = [json.loads(line) for line in out.splitlines()]
     assert {each["event"] for each in told} == {"estimate"}
-    assert not [key for key in told[0] if key.startswith(("depth", "force"))]
     final = [each["press"] for each in told if each["final"]]
     assert final == list(range(len(final)))
     assert 3 <= len(final) <= 4

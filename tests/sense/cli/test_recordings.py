@@ -15,12 +15,9 @@ from padforge.sense.cli import options
 
 def test_import_reads_csv(padforge_sense, brief: Recording) -> None:
     export_csv(brief, "r.csv")
-    code, out, _ = padforge_sense("import", "r.csv")
-    assert code == 0
-    assert out.endswith(" -> out/r/recording\n")
+    assert padforge_sense("import", "r.csv")[0] == 0
     assert Recording.open("out/r/recording") == brief
     start = json.loads(Path("out/r/recording/start.json").read_text())
-    assert start["format"] == "padforge-recording/1"
     assert set(start["provenance"]["inputs"]) == {"r.csv"}
 
 

@@ -181,7 +181,7 @@ def test_record_says_and_keeps_what_an_arm_did(bench: Bench, golden) -> None:
     def press_back(arm: FakeArm) -> None:
         """A spring that shakes, so that its mean is above its median."""
         arm.force_n = -3.0 * max(50.0 - arm.pose[2], 0.0) * (1 + (7 * arm.time() % 1) ** 6)
-        bench.board.lose = 35 if 101.0 < arm.time() < 101.05 else 0
+        bench.board.lose = 35 if 100.3 < arm.time() < 100.35 else 0
 
     bench.arm.hook = press_back
     bench(*RECORD, "--resume", "--presses", "5", "--seed", "4", title="resumed by another plan, which does not count")

@@ -1,6 +1,6 @@
 """Planted faults are detected with their kind, healthy pads give no alarm; the estimator and the monitor."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -18,9 +18,14 @@ from tests.helpers.refusals import refusal_table
 from tests.sense.health.pads import BAD_FROM, FEW, PRESSES, TRAINED, detect, detect_later, faulty, fit, part_of, plant
 
 
-def update_later(monitor: FaultMonitor, readings: np.ndarray, pad: Recording) -> Iterator[FibreFault]:
-    """Faults in the presses that the model was not trained on, press by press."""
+def update_later(
+    monitor: FaultMonitor, readings: np.ndarray, pad: Recording, unseen: Sequence[int] = ()
+) -> Iterator[FibreFault]:
+    """Faults in the presses that the model was not trained on, press by press; `unseen` ones are only counted."""
     for press in range(TRAINED, PRESSES):
+        if press in unseen:
+            monitor.n_presses += 1
+            continue
         first = pad.down_command[press] - 10
         last = pad.down_command[press + 1] if press + 1 < PRESSES else len(readings)
         yield from monitor.update(readings[first:last], 10, int(pad.up_command[press] - first))
@@ -54,10 +59,8 @@ def test_most_fibres_at_fault_are_a_misfit_and_not_masked(pad: Recording, model:
     readings = pad.readings.copy()
     readings[:, bad] = 3.3 - readings[:, bad]
     (misfit,) = faults = detect_later(model, readings, pad)
-    assert misfit.fibres == tuple(bad)
-    assert misfit.text.startswith("fibres 1, 2, 3 and 5 respond otherwise than in the calibration, which does not fit")
+    assert (misfit.kind, misfit.fibres) == ("misfit", tuple(bad))
     assert mask_faults(faults, PRESSES - TRAINED, 6).all()
-    assert fault_lines(faults, 6)[1] == "sound fibres: 4, 6"
     monitor, kinds, failed = FaultMonitor(model), list[str](), list[int]()
     for fault in update_later(monitor, readings, pad):
         kinds.append(fault.kind)
@@ -97,6 +100,11 @@ def test_monitor_detects_the_same_press_by_press(pad: Recording, model: HealthMo
     assert list(update_later(monitor, readings, pad)) == detect_later(model, readings, pad)
     assert monitor.failed == (1,)
     assert monitor.n_presses == PRESSES - TRAINED
+    # faults of three fibres begin just before presses that it is not shown, as those of two fingers on a live pad
+    readings[pad.down_command[BAD_FROM + 1] :, 2], readings[pad.down_command[BAD_FROM] :, 3] = 0.0, np.nan
+    faults = update_later(FaultMonitor(model), readings, pad, range(BAD_FROM + 2, BAD_FROM + 22))
+    since = {fault.kind: fault.since + TRAINED for fault in faults}
+    assert (since.keys(), since["noisy"], since["missing"]) == ({"open", "noisy", "missing"}, BAD_FROM, BAD_FROM)
 
 
 def test_fibre_is_missing_after_twenty_successive_presses_without_a_quarter_of_50_readings(
@@ -156,9 +164,6 @@ def test_findings_are_told_whole(golden: Any) -> None:
     golden("sense/health.txt", "\n".join([*lines, *(shift.text for shift in shifts)]))
     # every hypothesis has a text
     assert {name for name in HYPOTHESES if not name.startswith("offset")} <= set(TEXTS)
-    masked = mask_faults(faults, 40, 6)
-    assert masked[:21].all()
-    assert not masked[21:].any()
 
 
 @pytest.mark.slow

@@ -91,10 +91,10 @@ def test_sensor_reads_what_the_pipeline_says(boards, sensor: PadSensor, few: Rec
 
 @pytest.mark.parametrize("rests", [False, True])
 def test_a_position_from_before_is_not_that_of_a_press_under_way(boards, sensor, monkeypatch, rests: bool) -> None:
-    """A model of method `published` estimates a press once it is over; a finger that `rests` outlasts a second one."""
+    """A model of method `published` estimates a press once it is over; of two that `rest` the later counts."""
     monkeypatch.setattr(Live, "pressed", True)
     if rests:
-        shown = property(lambda live: [replace(live.presses[0], final=False, x_mm=7.0)])
+        shown = property(lambda live: [replace(live.presses[0], final=False, x_mm=x_mm) for x_mm in (3.0, 7.0)])
         monkeypatch.setattr(Live, "shown_presses", shown)
     sensor.connect()
     assert [sensor.read()[name] for name in ("pressed", "valid", "x_mm")] == [1, rests, 7 * rests]

@@ -1,7 +1,8 @@
 """A second finger that lands while the first one rests is localized from the change; fingers lift one by one."""
 
 from itertools import pairwise
-from typing import NamedTuple
+from typing import Any, NamedTuple
+from unittest.mock import Mock, patch
 
 import numpy as np
 import pytest
@@ -63,7 +64,10 @@ def follow(model: LocalizerModel, trials: list[list[Touch]], seed: int = 5) -> l
         starts.append(REST + max((touch.up for touch in touches), default=0))
         touches += [touch._replace(down=starts[-1] + touch.down, up=starts[-1] + touch.up) for touch in trial]
     readings = simulate_fingers(pad, touches, seed)
-    live = Live(model, rate_hz=RIG.rate_hz)
+    health: Any = model  # a stand-in, of the same pad
+    monitor = Mock(model=Mock(dead=()), failed=(), n_presses=0, update=Mock(return_value=[]))
+    with patch.object(pipeline, "FaultMonitor", return_value=monitor):
+        live = Live(model, rate_hz=RIG.rate_hz, health=health)
     times_s, events, swings, moved_v = np.arange(len(readings)) / RIG.rate_hz, [], [], []
     for begin, touch in pairwise([Touch(np.zeros(2), 0, 0), *sorted(touches, key=lambda touch: touch.up)]):
         events += live.update(times_s[begin.up : touch.up], readings[begin.up : touch.up])
@@ -79,6 +83,8 @@ def follow(model: LocalizerModel, trials: list[list[Touch]], seed: int = 5) -> l
     scale = np.median(np.divide(swings, moved_v), axis=0)
     np.testing.assert_allclose(swings, scale * moved_v, atol=0.1)
     estimates = [event for event in events if isinstance(event, Estimate)]
+    # the monitor of the fibres counts the presses that it is not shown
+    assert monitor.update.call_count + monitor.n_presses == 1 + max(estimate.press for estimate in estimates)
     firsts = [start - REST / 2 for start in starts[WARM_UP:]]
     numbers = np.searchsorted(firsts, [estimate.time_s * RIG.rate_hz for estimate in estimates]) - 1
     return [[estimates[row] for row in np.flatnonzero(numbers == trial)] for trial in range(len(trials))]
@@ -118,7 +124,6 @@ def test_a_second_finger_is_localized_and_lifts_are_told_apart(example: Localize
             errors_mm += [error_mm(ends[finger], touch) for finger, touch in enumerate(trial, 1)]
             is_within += [error_mm(ends[finger], touch) <= ends[finger].r90_mm for finger, touch in enumerate(trial, 1)]
             assert ends[2].press == ends[1].press + 1
-            assert "second finger" in ends[2].text
     assert told >= 0.8 * TRIALS
     assert np.mean(errors_mm) < 4
     assert np.mean(is_within) > 0.6

@@ -121,7 +121,7 @@ def test_foxglove(golden: Golden) -> None:
             output.send(message)
         client = FoxgloveClient(int(output.url.rpartition(":")[2]))
         received = client.messages({SCENE, *(message.topic for message in sent)})
-        lines = [str(next(received)[0]["topic"])]  # the health at first, though it was sent before
+        lines = ["at first " + next(received)[1].decode()]  # the latest health, though it was sent before
         for message in sent:
             output.send(message)
         for _ in range(len(sent) + 3):  # a scene with each touch

@@ -131,7 +131,7 @@ class FakeBoard:
         self.arm, self.rig, self.frame = arm, rig, RobotFrame.from_settings(rig)
         self.volts = FakePad().volts
         self.rate_hz, self.taken_s = rig.board_rate_hz, arm.time()
-        self.lose = 0
+        self.lose = self._unreported = 0
         self.lost = self.stalled = False
 
     def connect(self) -> dict[str, Any]:
@@ -145,11 +145,12 @@ class FakeBoard:
         count = 0 if self.stalled else int((self.arm.time() - self.taken_s) * self.rate_hz)
         skipped = min(self.lose, count)
         self.lose -= skipped
+        self._unreported += skipped  # until the next sample arrives
         times = self.taken_s + np.arange(1 + skipped, count + 1) / self.rate_hz
         self.taken_s += count / self.rate_hz
         missing = np.zeros(len(times), np.int64)
         if len(times):
-            missing[0] = skipped
+            missing[0], self._unreported = self._unreported, 0
         positions, depths = self.frame.tip(self.arm.pose_at(times))
         return BoardSamples(times, self.volts(positions, depths), missing)
 

@@ -2,16 +2,20 @@
 
 import json
 from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 
 from padforge.common.files import sha256
 from padforge.common.settings import Spec
+from padforge.design import Contact
+from padforge.design.settings import PadSettings
+from padforge.sense.localizer.model import LocalizerModel
 from padforge.sense.recording.press_plan import PressPlan
 from padforge.sense.recording.recording import Recording
 from padforge.sense.recording.run_directory import Recorder
-from padforge.sense.rig.operation import ADAPT_EVERY, AdaptivePlanner, acquisition, record_simulated
+from padforge.sense.rig.config import RigConfig
+from padforge.sense.rig.operation import ADAPT_EVERY, acquisition, make_planner, record_simulated
+from padforge.sense.settings import RigSettings
 from tests.sense.rig.fakes import FIBRES, PAD
 
 
@@ -27,8 +31,8 @@ def test_acquisition_is_mean_error_of_five_times_distance():
     np.testing.assert_allclose(few, [1.5 * 0.5])
 
 
-def test_adaptive_planner_presses_where_the_localizer_is_poor(tmp_path):
-    """It errs by 10 mm in the right half, and hardly in the left; presses already made are left alone."""
+def test_adaptive_planner_presses_where_the_localizer_is_poor(tmp_path, monkeypatch):
+    """It errs by 10 mm in the right half, and hardly in the left; presses already made are left alone, and holes."""
     rng = np.random.default_rng(3)
     plan = PressPlan(rng.uniform(-10, 10, (2 * ADAPT_EVERY + 5, 2)), np.resize([1.0, 2.0, 4.0], 2 * ADAPT_EVERY + 5))
     with Recorder(tmp_path / "run", FIBRES, {}, {}) as recorder:
@@ -41,13 +45,19 @@ def test_adaptive_planner_presses_where_the_localizer_is_poor(tmp_path):
         error_mm = np.where(recording.presses_mm[:, :1] > 0, [10.0, 0.0], [0.1, 0.0])
         return SimpleNamespace(positions_mm=recording.presses_mm + error_mm)
 
-    localizer: Any = SimpleNamespace(predict=located)
-    planner = AdaptivePlanner(
-        localizer, tmp_path / "run", np.random.default_rng(5), lambda positions_mm: positions_mm[:, 1] > -5
-    )
+    monkeypatch.setattr(LocalizerModel, "load", lambda folder: SimpleNamespace(predict=located))
+    hole = PadSettings(keep_out_mm=(((-15, -15), (15, -15), (15, -5), (-15, -5)),))
+    configs = [
+        RigConfig(PAD, Contact(), RigSettings(plan="adaptive", seed=seed), tmp_path / "run", "test", pad_settings=hole)
+        for seed in (5, 6)
+    ]
+    planner, other = (make_planner(config, tmp_path) for config in configs)
+    assert planner
+    assert other
     assert planner(plan, 0) is planner(plan, ADAPT_EVERY + 1) is plan
     moved = planner(plan, ADAPT_EVERY)
     chosen_mm = moved.positions_mm[ADAPT_EVERY : 2 * ADAPT_EVERY]
+    assert not np.isin(other(plan, ADAPT_EVERY).positions_mm[ADAPT_EVERY : 2 * ADAPT_EVERY], chosen_mm).any()
     for same in (slice(ADAPT_EVERY), slice(2 * ADAPT_EVERY, None)):
         np.testing.assert_array_equal(moved.positions_mm[same], plan.positions_mm[same])
     np.testing.assert_array_equal(moved.depths_mm, plan.depths_mm)
