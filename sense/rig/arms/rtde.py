@@ -107,7 +107,7 @@ class RtdeReader:
             if state is not None:
                 return state
             if time.monotonic() > deadline:
-                raise TimeoutError
+                raise TimeoutError(f"no new state for {timeout_s:g} s")
             time.sleep(POLL_S)
         raise ConnectionError("the controller closed the link")
 

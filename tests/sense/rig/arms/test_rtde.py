@@ -54,7 +54,7 @@ def test_reader_converts_state(library: MagicMock) -> None:
 def test_reader_returns_each_state_once_and_as_a_whole(library: MagicMock) -> None:
     reader = RtdeReader("arm", 3)
     reader.read(0.0)
-    with pytest.raises(TimeoutError):
+    with pytest.raises(TimeoutError, match=r"no new state for 0\.002 s"):
         reader.read(0.002)
     # another state arrives while the first is read
     library.getTimestamp.side_effect = [2.0, 3.0, 3.0, 3.0]
