@@ -14,8 +14,8 @@ from typing import Any, Literal, Protocol
 import numpy as np
 from numpy.typing import ArrayLike
 
-from padforge.common.validation import InputError
-from padforge.sense.arrays import Array, Indices, Mask, check_stream
+from padforge.common.validation import InputError, check_float
+from padforge.sense.arrays import MAX_RATE_HZ, MIN_RATE_HZ, Array, Indices, Mask, check_stream
 from padforge.sense.health.fault_detector import FaultMonitor, FibreFault
 from padforge.sense.health.health_model import HealthModel
 from padforge.sense.health.trace_model import RELEASED
@@ -220,7 +220,7 @@ class Live:
         is_other_pad: whether the latest presses are those of another pad; then no fibre is masked.
 
     Raises:
-        InputError: the localizer was fitted to arrays, or `check_same_pad` refuses a model.
+        InputError: a rate out of range, a localizer that was fitted to arrays, or `check_same_pad` refuses a model.
     """
 
     def __init__(
@@ -231,6 +231,7 @@ class Live:
         fibres: int | None = None,
         health: HealthModel | None = None,
     ) -> None:
+        rate_hz = check_float("rate_hz", rate_hz, MIN_RATE_HZ, MAX_RATE_HZ)
         if not isinstance(localizer, LocalizerModel):
             localizer = localizer.model_
         fibres = localizer.fibres if fibres is None else fibres

@@ -97,6 +97,7 @@ def test_what_programs_ask_of_signals_and_localizers_in_vain(
         "a graph of the published method": lambda: export_onnx(published, "", tmp_path / "l.onnx"),
         "a graph of arrays": lambda: export_onnx(of_arrays.model_, "", tmp_path / "l.onnx"),
         "few readings a second, live": lambda: Live(localizer, rate_hz=9.9),
+        "no rate, live": lambda: Live(localizer, rate_hz=float("nan")),
         "other fibres, live": lambda: Live(localizer, rate_hz=20.0, fibres=3),
         "arrays, live": lambda: of_arrays.live(20.0),
         "a localizer before its fit, live": lambda: Localizer().live(20.0),
