@@ -172,7 +172,6 @@ def check_run(run: Run) -> None:
 
     check_settings(run.spec)
     require_formats(run.formats)
-    metadata.version("torch")  # if it is missing, this raises now and not after the search
     pad, rig = run.spec.section(PadSettings), read_rig(run.spec, seed=run.seed)
     FabricationSettings.from_spec(run.spec).require_consistent(pad.layout)
     rig.inputs(pad.layout.fibres)
@@ -183,6 +182,8 @@ def check_run(run: Run) -> None:
     for notice in filter(None, (describe_other_depth(plan.depths_mm, contact), describe_large_strain(contact))):
         _log.warning(notice)
     localizer = run.spec.section(LocalizerSettings)
+    if localizer.method == "published":
+        metadata.version("torch")  # if it is missing, this raises now and not after the search
     if run.time_budget is not None and localizer.method == "published":
         reason = "allowed is ensemble: the published training has no time limit"
         raise InputError(f"[localizer] method: got published with --time-budget, {reason}")

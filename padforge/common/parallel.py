@@ -8,6 +8,7 @@ import io
 import json
 import os
 import re
+import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, CancelledError, Executor, Future, ThreadPoolExecutor, wait
 from contextlib import ExitStack, contextmanager, suppress
@@ -24,6 +25,7 @@ from padforge.common.validation import Fault, InputError, short_repr
 
 State = dict[str, NDArray[Any]]
 Key = TypeVar("Key")
+Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 FORMAT = "padforge-search/1"
@@ -127,14 +129,19 @@ def cluster(address: str | None) -> Iterator[Executor | None]:
             raise Fault(f"the cluster at {address} {reason}; {advice}") from error
 
 
+def map_threads(work: Callable[[Item], Result], items: Sequence[Item]) -> Iterator[Result]:
+    """Yield work(item) for each of the items in their order, computed with one thread a core."""
+    with ThreadPoolExecutor(max(1, min(os.cpu_count() or 1, len(items)))) as pool:
+        yield from pool.map(work, items)
+
+
 def map_chunks(work: Callable[[int, int], Result], count: int, min_chunk: int) -> list[Result]:
     """Return work(begin, end) for chunks, of at least `min_chunk`, of range(count), with one thread a core."""
     n_chunks = max(1, min(os.cpu_count() or 1, count // min_chunk))
     if n_chunks == 1:
         return [work(0, count)]
     edges = np.linspace(0, count, n_chunks + 1).astype(int).tolist()
-    with ThreadPoolExecutor(n_chunks) as pool:
-        return list(pool.map(lambda bounds: work(*bounds), pairwise(edges)))
+    return list(map_threads(lambda bounds: work(*bounds), list(pairwise(edges))))
 
 
 # The number of threads of torch and BLAS is global: the last body of `one_thread` to end restores it.
@@ -151,14 +158,14 @@ def one_thread() -> Iterator[None]:
     spin while they wait: beside other programs, the calibration of uncertainty took six times the processor time.
     """
     global _n_bodies
-    import torch
     from threadpoolctl import threadpool_limits
 
     with _limits_lock:
         if not _n_bodies:
-            _limits.callback(torch.set_num_threads, torch.get_num_threads())
+            if torch := sys.modules.get("torch"):  # which takes a second to import
+                _limits.callback(torch.set_num_threads, torch.get_num_threads())
+                torch.set_num_threads(1)
             _limits.enter_context(threadpool_limits(1, "blas"))
-            torch.set_num_threads(1)
         _n_bodies += 1
     try:
         yield

@@ -36,9 +36,8 @@ from padforge.sense.localizer.features import (
     windows_from_rest,
 )
 from padforge.sense.localizer.model import MEASURE_COLUMNS, UNIFORM, LocalizerModel
-from padforge.sense.localizer.network import Weights, combine_members, network_inputs
+from padforge.sense.localizer.network import Weights, combine_members, forward, network_inputs
 from padforge.sense.localizer.scaler import MAX_INPUT
-from padforge.sense.localizer.torch_network import EnsembleMlp
 from padforge.sense.recording.frames import frame_rate_hz, framed
 from padforge.sense.recording.recording import Recording
 
@@ -102,12 +101,26 @@ class _FeatureModule(nn.Module):
         return scaled, moments.complete_windows(down_command, up_command, until, torch)
 
 
+class _NetworkModule(nn.Module):
+    """An ensemble of networks in torch."""
+
+    def __init__(self, weights: Weights) -> None:
+        super().__init__()
+        self.names = list(weights)
+        for name, weight in weights.items():
+            self.register_buffer(name.replace(".", "_"), torch.from_numpy(weight))
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Return the outputs (E, Q, 2 N) for (Q, I) inputs."""
+        return forward({name: getattr(self, name.replace(".", "_")) for name in self.names}, x, torch)
+
+
 class _BayesModule(nn.Module):
     """The Bayesian localizers with the network that corrects them, in torch."""
 
     def __init__(self, stages: Sequence[BayesianLocalizer], residual_network: Weights) -> None:
         super().__init__()
-        self.residual, self.n_stages = EnsembleMlp.from_numpy(residual_network), len(stages)
+        self.residual, self.n_stages = _NetworkModule(residual_network), len(stages)
         for number, stage in enumerate(stages):
             for name, array in vars(stage.map_arrays(torch.from_numpy)).items():
                 self.register_buffer(f"bayes_{number}_{name}", array)
@@ -119,7 +132,7 @@ class _BayesModule(nn.Module):
             later = self._predict(number, scaled, fibre_mask)
             is_later = (n_complete >= moments.BAYES_STAGES[number])[:, None]
             position, summary = (torch.where(is_later, *pair) for pair in zip(later, (position, summary), strict=True))
-        corrected = self.residual(torch.cat([x, summary], dim=1)[None])
+        corrected = self.residual(torch.cat([x, summary], dim=1))
         return corrected + functional.pad(position, (0, 2))
 
     def _predict(self, number: int, scaled: Tensor, fibre_mask: Tensor) -> tuple[Tensor, Tensor]:
@@ -136,7 +149,7 @@ class _LocalizerModule(nn.Module):
         super().__init__()
         scaler = model.scaler
         self.features = _FeatureModule(model)
-        self.networks = nn.ModuleDict({name: EnsembleMlp.from_numpy(each) for name, each in model.networks.items()})
+        self.networks = nn.ModuleDict({name: _NetworkModule(each) for name, each in model.networks.items()})
         self.bayes = _BayesModule(*model.corrected) if model.bayes else None
         for name, array in zip(("now_factor", "now_offset"), scaler.latest_window_map(moments.N_TIMED), strict=True):
             self.register_buffer(name, torch.from_numpy(array))
@@ -181,7 +194,7 @@ class _LocalizerModule(nn.Module):
         for name, phase in moments.PHASES[moments.N_TIMED].items():
             network = self.networks[name]
             answers = (n_complete >= phase.first) & (n_complete < phase.first + len(phase.shares))
-            outputs = torch.where(answers[:, None], network(x.expand(network.n_members, -1, -1)), outputs)
+            outputs = torch.where(answers[:, None], network(x), outputs)
         combined = combine_members(outputs, torch)
         if self.bayes is None:
             return combined
@@ -196,7 +209,7 @@ class _LocalizerModule(nn.Module):
 
         def predict_from(scaled: Tensor, n_complete: int) -> tuple[Tensor, Tensor]:
             x = network_inputs(scaled, fibre_mask, complete & (torch.arange(n_timed) < n_complete), torch)
-            return combine_members(network(x.expand(network.n_members, -1, -1)), torch)
+            return combine_members(network(x), torch)
 
         targets, std = predict_from(scaled, moments.N_PRESS_WINDOWS)
         now = [

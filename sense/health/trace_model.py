@@ -14,6 +14,7 @@ import numpy as np
 from padforge.common.parallel import one_thread
 from padforge.sense.arrays import MIN_SCALE_V, Array, Floats, Indices, Mask, press_bounds
 from padforge.sense.localizer import moments
+from padforge.sense.localizer.optimizer import Parameters, fit_network
 
 Weights = Mapping[str, Floats]
 """`first.w` (E, L, N, H), `first.mask` (E, L, H), `first.b` (E, H), `hidden.w` (E, H, H), `hidden.b` (E, H), `last.w`
@@ -160,48 +161,87 @@ def _silu(x: Floats) -> Floats:
 
 def train_networks(inputs: Floats, targets: Array, rows: list[Indices], rng: np.random.Generator) -> dict[str, Floats]:
     """Train one member on each set of presses (`rows`), of scaled inputs (Q, L, N) and targets (Q, L, T)."""
-    import torch
-    from torch.nn.functional import silu
+    members, (_, fibres, size), n_outputs = len(rows), inputs.shape, 2 * targets.shape[2]
+    y = targets.astype(np.float32)
 
-    from padforge.sense.localizer.optimizer import fit_network
+    def normal(*shape: int, fan_in: int, gain: float = 1.0) -> Floats:
+        return rng.standard_normal(shape, np.float32) * np.float32(gain / fan_in**0.5)
 
-    generator = torch.Generator().manual_seed(int(rng.integers(2**63)))
-    x, y = torch.from_numpy(inputs), torch.from_numpy(targets.astype(np.float32))
-    members, (_, fibres, numbers), outputs = len(rows), x.shape, y.shape[2]
+    parameters = Parameters(
+        {
+            "first.w": normal(members, fibres * size, HIDDEN, fan_in=fibres * size),
+            "first.mask": normal(members, fibres, HIDDEN, fan_in=fibres * size),
+            "first.b": np.zeros((members, 1, HIDDEN), np.float32),
+            "hidden.w": normal(members, HIDDEN, HIDDEN, fan_in=HIDDEN),
+            "hidden.b": np.zeros((members, 1, HIDDEN), np.float32),
+            "last.w": normal(members, HIDDEN, fibres * n_outputs, fan_in=HIDDEN, gain=0.1),
+            "last.b": np.zeros((members, 1, fibres * n_outputs), np.float32),
+        }
+    )
+    max_dropped = len(DROPOUT[: max(fibres - 1, 1)])
+    probabilities = np.divide(DROPOUT[:max_dropped], sum(DROPOUT[:max_dropped]))
 
-    def normal(*shape: int, fan_in: int, gain: float = 1.0) -> torch.Tensor:
-        return (torch.randn(*shape, generator=generator) * gain / fan_in**0.5).requires_grad_()
-
-    weights = {
-        "first.w": normal(members, fibres, numbers, HIDDEN, fan_in=fibres * numbers),
-        "first.mask": normal(members, fibres, HIDDEN, fan_in=fibres * numbers),
-        "first.b": torch.zeros(members, HIDDEN, requires_grad=True),
-        "hidden.w": normal(members, HIDDEN, HIDDEN, fan_in=HIDDEN),
-        "hidden.b": torch.zeros(members, HIDDEN, requires_grad=True),
-        "last.w": normal(members, fibres, HIDDEN, 2 * outputs, fan_in=HIDDEN, gain=0.1),
-        "last.b": torch.zeros(members, fibres, 2 * outputs, requires_grad=True),
-    }
-    member_rows = [torch.from_numpy(row) for row in rows]
-    probabilities = torch.tensor(DROPOUT[: max(fibres - 1, 1)])
-
-    def loss_of_batch() -> torch.Tensor:
-        batch = torch.stack([r[torch.randint(len(r), (BATCH,), generator=generator)] for r in member_rows])
-        count = 1 + torch.multinomial(probabilities, members * BATCH, replacement=True, generator=generator)
-        order = torch.rand(members, BATCH, fibres, generator=generator).argsort(dim=2)
-        dropped = (order < count.view(members, BATCH, 1)).to(x.dtype)[..., None]
-        noisy = x[batch] + INPUT_NOISE * torch.randn(members, BATCH, fibres, numbers, generator=generator)
-        h = torch.einsum("ebcn,ecnh->ebh", noisy * (1 - dropped), weights["first.w"])
-        h = h + torch.einsum("ebc,ech->ebh", 1 - dropped[..., 0], weights["first.mask"])
-        h = silu(h + weights["first.b"][:, None])
-        h = silu(torch.baddbmm(weights["hidden.b"][:, None], h, weights["hidden.w"]))
-        out = torch.einsum("ebh,echt->ebct", h, weights["last.w"]) + weights["last.b"][:, None]
-        mean, log_std = out.split(outputs, dim=3)
-        log_std = log_std.clamp(*LOG_STD)
-        square = (y[batch] - mean) ** 2
-        nll = (T_DEGREES + 1) / 2 * torch.log1p(square * torch.exp(-2 * log_std) / T_DEGREES) + log_std
-        # The square error adds a gradient of the mean where a large standard deviation flattens the likelihood.
-        loss = ((nll + square / 4) * dropped).sum(dim=(1, 2, 3)) / dropped.sum(dim=(1, 2, 3))
-        return loss.sum()
+    def train_batch() -> None:
+        """Draw a batch for each member; some fibres of each press are dropped, and predicted from the others."""
+        batch = np.stack([row[rng.integers(len(row), size=BATCH)] for row in rows])
+        count = 1 + rng.choice(max_dropped, (members, BATCH, 1), p=probabilities)
+        dropped = (rng.random((members, BATCH, fibres)).argsort(axis=2) < count).astype(np.float32)
+        noise = np.float32(INPUT_NOISE) * rng.standard_normal((members, BATCH, fibres, size), np.float32)
+        backpropagate(parameters, inputs[batch] + noise, y[batch], dropped)
 
     with one_thread():
-        return fit_network(weights, loss_of_batch, min(MAX_STEPS, len(x)), LEARNING_RATE, weight_decay=WEIGHT_DECAY)
+        steps = min(MAX_STEPS, len(inputs))
+        fitted = fit_network(parameters, train_batch, steps, LEARNING_RATE, weight_decay=WEIGHT_DECAY)
+    last_w = fitted["last.w"].reshape(members, HIDDEN, fibres, n_outputs).swapaxes(1, 2)
+    return {
+        "first.w": fitted["first.w"].reshape(members, fibres, size, HIDDEN),
+        "first.mask": fitted["first.mask"],
+        "first.b": fitted["first.b"][:, 0],
+        "hidden.w": fitted["hidden.w"],
+        "hidden.b": fitted["hidden.b"][:, 0],
+        "last.w": np.ascontiguousarray(last_w),
+        "last.b": fitted["last.b"].reshape(members, fibres, n_outputs),
+    }
+
+
+def backpropagate(parameters: Parameters, inputs: Floats, targets: Floats, dropped: Floats) -> None:
+    """Write the gradient of the loss of scaled inputs (E, B, L, N) and targets (E, B, L, T); dropped (E, B, L) is 1."""
+    weights, gradient, (members, batch, fibres, _) = parameters.weights, parameters.gradient, inputs.shape
+    # 1. Forward
+    valid = 1 - dropped
+    x = (inputs * valid[..., None]).reshape(members, batch, -1)
+    first = x @ weights["first.w"] + valid @ weights["first.mask"] + weights["first.b"]
+    first_active, first_slope = _silu_and_slope(first)
+    hidden_active, hidden_slope = _silu_and_slope(first_active @ weights["hidden.w"] + weights["hidden.b"])
+    outputs = hidden_active @ weights["last.w"] + weights["last.b"]
+    # 2. Backward
+    grad_outputs = _loss_gradient(outputs.reshape(members, batch, fibres, -1), targets, dropped).reshape(outputs.shape)
+    grad_hidden = grad_outputs @ weights["last.w"].mT * hidden_slope
+    grad_first = grad_hidden @ weights["hidden.w"].mT * first_slope
+    np.matmul(x.mT, grad_first, out=gradient["first.w"])
+    np.matmul(valid.mT, grad_first, out=gradient["first.mask"])
+    np.matmul(first_active.mT, grad_hidden, out=gradient["hidden.w"])
+    np.matmul(hidden_active.mT, grad_outputs, out=gradient["last.w"])
+    for name, each in ("first.b", grad_first), ("hidden.b", grad_hidden), ("last.b", grad_outputs):
+        np.sum(each, axis=1, keepdims=True, out=gradient[name])
+
+
+def _silu_and_slope(x: Floats) -> tuple[Floats, Floats]:
+    sigmoid = np.float32(0.5) * (1 + np.tanh(np.float32(0.5) * x))
+    return x * sigmoid, sigmoid * (1 + x * (1 - sigmoid))
+
+
+def _loss_gradient(outputs: Floats, targets: Floats, dropped: Floats) -> Floats:
+    """Return the gradient of the loss by the outputs (E, B, L, 2 T), given targets (E, B, L, T) and dropped (E, B, L).
+
+    With the error e, the standard deviation s and n degrees of freedom, the loss of a dropped fibre is the sum of
+    (n + 1) / 2 log(1 + e^2 / (n s^2)) + log s + e^2 / 4, and that of a member the mean over its dropped fibres. The
+    last term adds a gradient of the mean where a large standard deviation flattens the likelihood of Student's t.
+    """
+    mean, log_std = np.split(outputs, 2, axis=3)
+    clipped, error = log_std.clip(*LOG_STD), mean - targets
+    weight = (dropped / dropped.sum(axis=(1, 2), keepdims=True))[..., None]
+    precision = np.exp(-2 * clipped) / T_DEGREES
+    slope = (T_DEGREES + 1) * precision / (1 + precision * error**2)
+    grad_log_std = (1 - slope * error**2) * (log_std == clipped)
+    return np.concatenate([(slope + 0.5) * error, grad_log_std], axis=3) * weight

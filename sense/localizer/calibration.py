@@ -6,11 +6,12 @@ early stopping.
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 
 from padforge.common.files import provenance
-from padforge.common.parallel import one_thread
+from padforge.common.parallel import map_threads, one_thread
 from padforge.common.profiling import stage
 from padforge.common.progress import OnProgress, ignore_progress
 from padforge.common.settings import or_default
@@ -317,7 +318,8 @@ def calibrate_uncertainty(
     predictions: list[list[list[Localization]]] = []  # by moment, then by number of failed fibres
     for features in moments:
         on_progress(len(predictions), len(moments), "radii")
-        predictions.append([[uncalibrated.predict_features(features, failed) for failed in sets] for sets in subsets])
+        predict = partial(uncalibrated.predict_features, features)
+        predictions.append([list(map_threads(predict, sets)) for sets in subsets])
     prior_ratios = None
     if n_trained:
         failed_shares = np.arange(levels) / model.fibres

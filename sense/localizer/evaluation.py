@@ -3,11 +3,13 @@
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy.special import gammaincinv
 
+from padforge.common.parallel import map_threads
 from padforge.common.progress import OnProgress, ignore_progress
 from padforge.common.validation import InputError, check_int, check_type
 from padforge.design.objectives.fibre_loss import failure_subsets
@@ -220,10 +222,10 @@ def errors_by_loss(
     by_level = [failure_subsets(fibres, check_int("n_failed", level, 0, fibres - 1)) for level in levels]
     total = sum(map(len, by_level))
     for subsets in by_level:
-        predictions = []
-        for subset in subsets:
+        predictions: list[Localization] = []
+        for prediction in map_threads(predict, subsets):
             on_progress(len(by_subset) + len(predictions), total, "sets of failed fibres")
-            predictions.append(predict(subset))
+            predictions.append(prediction)
         rows.append(error_row(len(subsets[0]), predictions, positions_mm, measures))
         by_subset += [
             {"failed": list(subset), "mean_mm": float(distances(each.positions_mm, positions_mm).mean())}
@@ -260,7 +262,7 @@ def errors_by_moment(
         intact.append((at, model.predict_features(features)))
         for n_failed in levels:
             subsets = failure_subsets(model.fibres, n_failed, MOMENT_SETS)
-            predictions = [model.predict_features(features, subset) for subset in subsets]
+            predictions = list(map_threads(partial(model.predict_features, features), subsets))
             rows.append(at | error_row(n_failed, predictions, positions_mm, measures))
     errors = distances(intact[-1][1].positions_mm, positions_mm)
     press = int(np.argsort(errors)[len(errors) // 2])

@@ -1,4 +1,4 @@
-"""Networks of the localizer in NumPy, for inference; `torch_network` is the same ensemble in torch, for training.
+"""Networks of the localizer: their outputs; `backpropagation` computes the gradient for their training.
 
 Method "ensemble" is a heteroscedastic ensemble of residual MLPs. Their inputs are masked features and the masks, so
 that one network serves every set of failed fibres. Residual layers are h + relu(layer_norm(h)) W + b. Outputs are the
@@ -62,15 +62,18 @@ def network_inputs(features: Any, fibre_mask: Any, complete: Any, xp: Any = np) 
     return xp.concat([masked, fibre_mask, complete], axis=1)
 
 
-def forward(weights: Weights, x: Floats) -> Floats:
-    """Return (E, Q, 2 N) targets and log errors for (Q, I) inputs; log errors of the published network are 0."""
+def forward(weights: Mapping[str, Any], x: Any, xp: Any = np) -> Any:
+    """Return (E, Q, 2 N) targets and log errors for (Q, I) inputs; log errors of the published network are 0.
+
+    All arrays are of the module `xp`, numpy or torch.
+    """
     h = x @ weights["first.w"] + weights["first.b"]
     if "hidden.w" not in weights:
-        targets = np.tanh(h) @ weights["last.w"] + weights["last.b"]
-        return np.concatenate([targets, np.zeros_like(targets)], axis=2)
-    for w, b in zip(weights["hidden.w"], weights["hidden.b"], strict=True):
-        h = h + _activate(h) @ w + b
-    return _activate(h) @ weights["last.w"] + weights["last.b"]
+        targets = xp.tanh(h) @ weights["last.w"] + weights["last.b"]
+        return xp.concat([targets, xp.zeros_like(targets)], axis=2)
+    for layer in range(len(weights["hidden.w"])):
+        h = h + _activate(h, xp) @ weights["hidden.w"][layer] + weights["hidden.b"][layer]
+    return _activate(h, xp) @ weights["last.w"] + weights["last.b"]
 
 
 Networks = Mapping[str, Weights]
@@ -209,6 +212,6 @@ def _axis(name: str) -> int:
     return 1 if name.startswith("hidden") else 0
 
 
-def _activate(h: Floats) -> Floats:
+def _activate(h: Any, xp: Any) -> Any:
     h = h - h.mean(axis=-1, keepdims=True)
-    return np.maximum(h / np.sqrt((h * h).mean(axis=-1, keepdims=True) + np.float32(EPSILON)), np.float32(0))
+    return xp.clip(h / xp.sqrt((h * h).mean(axis=-1, keepdims=True) + EPSILON), 0.0, None)

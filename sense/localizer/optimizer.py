@@ -1,11 +1,10 @@
 """Cautious AdamW with a one-cycle learning rate: the training loop of the networks of localizer and health."""
 
+import math
 import time
 from collections.abc import Callable, Mapping
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from padforge.common.compilation import kernel
 from padforge.common.progress import OnProgress, ignore_progress
@@ -24,9 +23,26 @@ def one_cycle(share: float) -> float:
     return min(share / WARM_UP, (1 - share) / (1 - WARM_UP))
 
 
+class Parameters:
+    """Weights of a network and their gradient, each one flat array with a view for each name."""
+
+    def __init__(self, weights: Mapping[str, Floats]) -> None:
+        """Copy the weights."""
+        self._shapes = {name: weight.shape for name, weight in weights.items()}
+        self.flat = np.concatenate([weight.ravel() for weight in weights.values()])
+        self.flat_gradient = np.zeros_like(self.flat)
+        self.weights, self.gradient = self.by_name(self.flat), self.by_name(self.flat_gradient)
+
+    def by_name(self, flat: Floats) -> dict[str, Floats]:
+        """Return views of an array of as many numbers."""
+        ends = np.cumsum([math.prod(shape) for shape in self._shapes.values()])[:-1]
+        parts = zip(self._shapes.items(), np.split(flat, ends), strict=True)
+        return {name: part.reshape(shape) for (name, shape), part in parts}
+
+
 def fit_network(
-    parameters: Mapping[str, Tensor],
-    loss_of_batch: Callable[[], Tensor],
+    parameters: Parameters,
+    backpropagate: Callable[[], object],
     steps: int,
     learning_rate: float,
     *,
@@ -41,8 +57,8 @@ def fit_network(
     than by AdamW with as many steps, and 7 % less while it is pressed.
 
     Args:
-        parameters: weights by name, which require gradients and are changed in place.
-        loss_of_batch: samples a batch and returns its loss.
+        parameters: of the network, which are changed in place.
+        backpropagate: samples a batch and writes the gradient of its loss.
         steps: of the training.
         learning_rate: maximum.
         seconds: limit the training in place of `steps`.
@@ -53,32 +69,20 @@ def fit_network(
         The moving averages of the weights by name.
     """
     begin = time.monotonic()
-    weights = list(parameters.values())
-    sizes, shapes = [weight.numel() for weight in weights], [weight.shape for weight in weights]
-    flat = torch.cat([weight.detach().flatten() for weight in weights])
-    gradient = torch.zeros_like(flat)
-    for weight, shape, values, slopes in zip(weights, shapes, flat.split(sizes), gradient.split(sizes), strict=True):
-        weight.data, weight.grad = values.view(shape), slopes.view(shape)  # one step for all
-    average = flat.numpy().copy()
-    arrays = flat.numpy(), gradient.numpy(), np.zeros_like(average), np.zeros_like(average), average
+    average = parameters.flat.copy()
+    arrays = parameters.flat, parameters.flat_gradient, np.zeros_like(average), np.zeros_like(average), average
     share, step, reports = 0.0, 0, 0
-    torch.set_flush_denormal(True)  # denormal numbers, to which moments of vanishing gradients decay, are slow
-    try:
-        while share < 1:
-            step += 1
-            share = step / steps if seconds is None else min((time.monotonic() - begin) / max(seconds, 1e-9), 1.0)
-            loss_of_batch().backward()
-            # The first steps decay faster, so that the initial weights do not weigh on the average.
-            renewal = 1 - min(AVERAGE_DECAY, step / (step + 9))
-            _take_step(*arrays, step, learning_rate * one_cycle(share), weight_decay, renewal)
-            if share * REPORTS >= reports + 1:
-                reports = int(share * REPORTS)
-                on_progress(reports, REPORTS, "")
-    finally:
-        torch.set_flush_denormal(False)
-    ends = np.cumsum(sizes)[:-1]
-    fitted = zip(parameters, shapes, np.split(average, ends), strict=True)
-    return {name: values.reshape(shape) for name, shape, values in fitted}
+    while share < 1:
+        step += 1
+        share = step / steps if seconds is None else min((time.monotonic() - begin) / max(seconds, 1e-9), 1.0)
+        backpropagate()
+        # The first steps decay faster, so that the initial weights do not weigh on the average.
+        renewal = 1 - min(AVERAGE_DECAY, step / (step + 9))
+        _take_step(*arrays, step, learning_rate * one_cycle(share), weight_decay, renewal)
+        if share * REPORTS >= reports + 1:
+            reports = int(share * REPORTS)
+            on_progress(reports, REPORTS, "")
+    return parameters.by_name(average)
 
 
 @kernel(fastmath={"contract", "reassoc", "nsz"})
@@ -93,10 +97,10 @@ def _take_step(
     decay: float,
     renewal: float,
 ) -> None:
-    """Take a step of all weights (n,) by their gradient (n,), which becomes 0; update its mean and mean square.
+    """Take a step of all weights (n,) by their gradient (n,); update its mean and mean square.
 
-    The moving average of the weights is renewed by that share. In two passes over memory it takes a sixth of the time
-    that a dozen operations of torch take.
+    The moving average of the weights is renewed by that share. Two passes over memory take a sixth of the time that a
+    dozen operations on arrays take.
     """
     first, second = np.float32(1 - BETAS[0]), np.float32(1 - BETAS[1])
     epsilon, zero = np.float32(EPSILON), np.float32(0)
@@ -112,4 +116,3 @@ def _take_step(
         change = mean[i] / (np.sqrt(unbiased * square[i]) + epsilon)
         weights[i] = shrinkage * weights[i] - (further * change if mean[i] * gradient[i] > zero else zero)
         average[i] += renewed * (weights[i] - average[i])
-        gradient[i] = zero

@@ -10,7 +10,6 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-import torch
 
 from padforge.common.compilation import kernel
 from padforge.sense.arrays import Array, Floats, Indices, Mask
@@ -85,7 +84,7 @@ class PressSampler:
         windows = presses.complete, presses.now_factor, presses.now_offset
         self._source = _Source(np.ascontiguousarray(table), residual, *windows, float(self.depth_gain), LATEST_NOISE)
         self._n_timed = presses.complete.shape[1]
-        self._bayes = tuple(stage.map_arrays(torch.from_numpy) for stage in bayes)
+        self._bayes = tuple(stage.map_arrays(np.ascontiguousarray) for stage in bayes)
         self.n_inputs = fibres * (n_features + 1) + self._n_timed + (N_SUMMARY if bayes else 0)
         self._phase, self._speed, self._per_mm = phase, presses.speed, presses.per_mm
 
@@ -113,11 +112,9 @@ class PressSampler:
         if not self._bayes:
             return x, np.zeros(1, np.float32)
         bayes = self._bayes[bayes_stage(int(moments.counts[0]), self._n_timed) or 0]
-        features = torch.from_numpy(x)[:, : fibres * n_features].view(-1, fibres, n_features)
-        with torch.no_grad():
-            position, summary = bayes.predict(features, torch.from_numpy(fibre_mask), torch)
-        x[:, -N_SUMMARY:] = summary.numpy()
-        return x, position.numpy()
+        features = x[:, : fibres * n_features].reshape(-1, fibres, n_features)
+        position, x[:, -N_SUMMARY:] = bayes.predict(features, fibre_mask)
+        return x, position
 
     def _sample_moments(self, batch: int) -> _Moments:
         """Sample moments of the phase; with Bayesian localizers one for all, since each of these serves one stage."""

@@ -1,4 +1,4 @@
-"""Training of the networks in torch: their tasks, and the losses of the localizer.
+"""Training of the networks: their tasks, and the loss of the localizer.
 
 The loss is the distance, not its square, plus a likelihood of the expected error. Every step masks random fibres,
 augments the positions (and depths) of presses, whose features follow the response model, and reads them at random
@@ -20,15 +20,13 @@ from threading import Event, Lock
 from typing import NamedTuple
 
 import numpy as np
-import torch
 from scipy.linalg import eigh
-from torch import Tensor
 
 from padforge.common.parallel import makespan, one_thread, run_tasks
 from padforge.common.progress import OnProgress, ignore_progress
 from padforge.common.validation import InputError
-from padforge.design.published.networks import fit_batch
 from padforge.sense.arrays import Array, Floats
+from padforge.sense.localizer.backpropagation import TrainableMlp, random_weights
 from padforge.sense.localizer.bayes import BayesianLocalizer, fit_stages
 from padforge.sense.localizer.moments import PHASES, RESIDUAL, RESIDUAL_PHASE, Phase
 from padforge.sense.localizer.network import (
@@ -43,7 +41,6 @@ from padforge.sense.localizer.network import (
 from padforge.sense.localizer.optimizer import fit_network
 from padforge.sense.localizer.press_sampler import PressSampler
 from padforge.sense.localizer.scaler import TrainingPresses, leave_one_out_residuals
-from padforge.sense.localizer.torch_network import EnsembleMlp
 from padforge.sense.settings import LocalizerSettings
 
 
@@ -139,8 +136,8 @@ def run_trainings(
         task, seed = tasks[number], seeds[number]
         training = Training(presses, table, task, seed)
         fitted = fit_network(
-            dict(training.network.named_parameters()),
-            training.loss,
+            training.network.parameters,
+            training.backpropagate,
             task.steps,
             task.options.learning_rate,
             seconds=task.seconds,
@@ -241,6 +238,8 @@ def training_steps(presses: int, options: LocalizerSettings) -> int:
 
 def train_published(train: TrainingPresses, early_stop: TrainingPresses, rng: np.random.Generator) -> Weights:
     """Train the published network by Levenberg-Marquardt with early stopping on the presses of `early_stop`."""
+    from padforge.design.published.networks import fit_batch  # torch takes long to import
+
     x, y, *held_back = (
         part.reshape(len(part), -1).astype(np.float64)
         for part in (train.inputs, train.targets, early_stop.inputs, early_stop.targets)
@@ -257,6 +256,24 @@ def train_published(train: TrainingPresses, early_stop: TrainingPresses, rng: np
         "last.b": (targets.middle + targets.half * network.output[:, -1])[None],
     }
     return {name: np.ascontiguousarray(weight[None], dtype=np.float32) for name, weight in weights.items()}
+
+
+def loss_gradient(outputs: Floats, targets: Floats) -> Floats:
+    """Return the gradient of the loss of a batch by the outputs (B, 2 N) of a network for targets (B, N).
+
+    With the errors e of x and y, m of the measures, and the expected errors s, the loss is the mean over the batch of
+
+        sqrt(|e|^2 + |ROUNDING s|^2) + MEASURE_WEIGHT sum |m| + LOG_ERROR_WEIGHT sum (|error| / s + log s),
+
+    where only the last term trains s, and s alone.
+    """
+    predicted, log_error = np.split(outputs, 2, axis=1)
+    error, clipped = predicted - targets, log_error.clip(MIN_LOG_ERROR, MAX_LOG_ERROR)
+    expected = np.exp(clipped)
+    rounded = np.sqrt(np.square(error[:, :2]).sum(axis=1) + np.square(ROUNDING * expected[:, :2]).sum(axis=1) + 1e-8)
+    grad_position, grad_measures = error[:, :2] / rounded[:, None], MEASURE_WEIGHT * np.sign(error[:, 2:])
+    grad_log_error = LOG_ERROR_WEIGHT * (1 - np.abs(error) / expected) * (log_error == clipped)
+    return np.concatenate([grad_position, grad_measures, grad_log_error], axis=1) / len(outputs)
 
 
 class Training:
@@ -278,44 +295,31 @@ class Training:
             centred = (targets - targets.mean(axis=0))[:, 2:]
             self._force_per_depth = (centred[:, :1] * centred[:, 1:]).sum() / np.square(centred[:, :1]).sum()
         n_outputs = N_OUTPUTS + 2 * (targets.shape[1] - 2)
-        generator = torch.Generator().manual_seed(seed)
-        self.network = EnsembleMlp.random(sampler.n_inputs, n_outputs, options, generator)
+        start = task.start or random_weights(sampler.n_inputs, n_outputs, options, rng)
         self._directions, self._shrinkage = self._fit_directions()
         if task.start is not None:
-            first = self.scale_up(torch.from_numpy(task.start["first.w"]).mT).mT
-            self.network = EnsembleMlp.from_numpy({**task.start, "first.w": first.contiguous().numpy()})
+            start = {**start, "first.w": self.scale_up(start["first.w"].swapaxes(1, 2)).swapaxes(1, 2)}
+        self.network = TrainableMlp(start, self._batch)
 
     def weights(self, fitted: Weights) -> Weights:
-        """Return weights for unscaled inputs, from `fitted` parameters for scaled ones."""
-        first = self.scale_down(torch.from_numpy(fitted["first.w"]).mT).mT
-        return {**EnsembleMlp.join(fitted), "first.w": np.ascontiguousarray(first.numpy())}
+        """Return weights for unscaled inputs, from `fitted` ones for scaled inputs."""
+        first = self.scale_down(fitted["first.w"].swapaxes(1, 2)).swapaxes(1, 2)
+        return {**fitted, "first.w": np.ascontiguousarray(first)}
 
     def measure_pace(self) -> float:
         """Return the seconds that a step takes."""
         durations = []
         for _ in range(PACE_STEPS):
             begin = time.monotonic()
-            self.loss().backward()
+            self.backpropagate()
             durations.append(time.monotonic() - begin)
         return float(np.median(durations))
 
-    def loss(self) -> Tensor:
-        """Return the loss of the next batch.
-
-        With the errors e of x and y, m of the measures, and the expected errors s (which only the last term trains):
-
-            sqrt(|e|^2 + |ROUNDING s|^2) + MEASURE_WEIGHT sum |m| + LOG_ERROR_WEIGHT sum (|error| / s + log s).
-        """
+    def backpropagate(self) -> None:
+        """Write the gradient of the loss of the next batch."""
         self.n_steps += 1
-        inputs, targets = map(torch.from_numpy, self._next_batch())
-        predicted, log_error = self.network.forward_bfloat16(self.scale_down(inputs))[0].chunk(2, dim=1)
-        error, log_error = predicted - targets, log_error.clamp(MIN_LOG_ERROR, MAX_LOG_ERROR)
-        rounding = (ROUNDING * log_error.detach().exp()[:, :2]).square()
-        loss = (error[:, :2].square() + rounding).sum(dim=1).add(1e-8).sqrt()
-        if error.shape[1] > 2:
-            loss = loss + MEASURE_WEIGHT * error[:, 2:].abs().sum(dim=1)
-        likelihood = (error.detach().abs() * (-log_error).exp() + log_error).sum(dim=1)
-        return (loss + LOG_ERROR_WEIGHT * likelihood).mean()
+        inputs, targets = self._next_batch()
+        self.network.backward(loss_gradient(self.network.forward(self.scale_down(inputs)), targets))
 
     def _next_batch(self) -> tuple[Floats, Floats]:
         """Return a new batch, or every second time a recent one if Bayesian positions make new ones expensive."""
@@ -327,29 +331,30 @@ class Training:
         return self._recent[self._sampler.rng.integers(len(self._recent))]
 
     def sample_batch(self) -> tuple[Floats, Floats]:
-        """Sample inputs (1, B, I) and the targets of the network (B, 2 + T)."""
+        """Sample inputs (B, I) and the targets of the network (B, 2 + T)."""
         rows = self._sampler.sample_rows(self._batch)
         targets = self._augment_position(self._sampler.targets[rows])
         x, position = self._sampler.inputs(rows, targets, INPUT_NOISE)
-        return x[None], targets - position
+        return x, targets - position
 
-    def _fit_directions(self) -> tuple[Tensor, Tensor]:
+    def _fit_directions(self) -> tuple[Floats, Floats]:
         """Return the directions (I, n) in which inputs vary most, and the shares (n,) by which these are shrunk."""
-        x = np.concatenate([self.sample_batch()[0][0] for _ in range(COMMON_BATCHES)]).astype(np.float64)
+        x = np.concatenate([self.sample_batch()[0] for _ in range(COMMON_BATCHES)]).astype(np.float64)
         n_inputs = x.shape[1]
         index_range = max(n_inputs - COMMON_DIRECTIONS, 0), n_inputs - 1  # of the largest eigenvalues
         squares, directions = eigh(x.T @ x / len(x), subset_by_index=index_range)
+        directions[np.abs(directions) < 1e-12] = 0  # denormal numbers would make a step take twice as long
         shrinkage = 1 - (1 + squares.clip(0) / COMMON_SQUARE) ** -0.5
-        return torch.from_numpy(directions.astype(np.float32)), torch.from_numpy(shrinkage.astype(np.float32))
+        return np.ascontiguousarray(directions, np.float32), shrinkage.astype(np.float32)
 
-    def scale_down(self, x: Tensor) -> Tensor:
+    def scale_down(self, x: Floats) -> Floats:
         """Scale (..., I) inputs down, most strongly in the directions in which they vary most."""
-        return (x - x @ self._directions * self._shrinkage @ self._directions.T) / COMMON_SQUARE**0.5
+        return (x - x @ self._directions * self._shrinkage @ self._directions.T) * np.float32(COMMON_SQUARE**-0.5)
 
-    def scale_up(self, x: Tensor) -> Tensor:
+    def scale_up(self, x: Floats) -> Floats:
         """Undo `scale_down`."""
         growth = self._shrinkage / (1 - self._shrinkage)
-        return (x + x @ self._directions * growth @ self._directions.T) * COMMON_SQUARE**0.5
+        return (x + x @ self._directions * growth @ self._directions.T) * np.float32(COMMON_SQUARE**0.5)
 
     def _augment_position(self, targets: Floats) -> Floats:
         """Augment (B, 2 + T) targets by normal noise, reflected at the bounds; force follows depth."""

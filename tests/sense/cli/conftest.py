@@ -3,7 +3,6 @@
 import shutil
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -17,7 +16,6 @@ from padforge.design import Morphology
 from padforge.sense import Evaluation, calibrate
 from padforge.sense.health import trace_model
 from padforge.sense.localizer.model import LocalizerModel
-from padforge.sense.localizer.torch_network import EnsembleMlp
 from padforge.sense.report.calibration import calibrate_into
 from padforge.sense.rig.operation import record_simulated
 from padforge.sense.settings import LocalizerSettings, RigSettings
@@ -57,7 +55,7 @@ def make_model(folder: Path, presses: int) -> Path:
     (folder / "pad.toml").write_text(SPEC)
     spec = Spec.load(folder / "pad.toml")
     recording = record_simulated(spec, Morphology.straight(2), folder / "rec", {"presses": presses})
-    with mock.patch.object(trace_model, "MAX_STEPS", 80), blank_pictures(), few_moments(), single_precision():
+    with mock.patch.object(trace_model, "MAX_STEPS", 80), blank_pictures(), few_moments():
         calibrate_into(recording, folder / "model", spec.section(LocalizerSettings))
     return folder
 
@@ -68,21 +66,16 @@ def make_deep_presses(folder: Path) -> Path:
     recording = simulate(pad, rig)
     recording = replace(recording, forces_n=3.0 * recording.depths_mm)
     recording.save(folder / "rec", {})
-    with few_moments(), single_precision():
+    with few_moments():
         localizer, _ = calibrate(recording, LocalizerSettings(members=1, hidden=32, layers=1, epochs=12))
     localizer.save(folder / "model")
     return folder
 
 
-def single_precision() -> AbstractContextManager[Any]:
-    """Train alike on processors with and without bfloat16, so that outputs of one are those of the other."""
-    return mock.patch.object(EnsembleMlp, "forward_bfloat16", EnsembleMlp.forward)
-
-
 @pytest.fixture(autouse=True)
 def short_calibrations() -> Iterator[None]:
-    """They are alike on all processors, and evaluated at two moments of a press, which takes longest of a short one."""
-    with single_precision(), few_moments():
+    """They are evaluated at two moments of a press, which takes longest of a short one."""
+    with few_moments():
         yield
 
 

@@ -3,10 +3,13 @@
 import math
 
 import numpy as np
+import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
+from torch.nn import functional
 
+from padforge.sense.health import trace_model
 from padforge.sense.health.trace_model import (
     COMPONENTS,
     INPUTS,
@@ -22,6 +25,7 @@ from padforge.sense.health.trace_model import (
     extract_traces,
     predict_fibres,
 )
+from padforge.sense.localizer import optimizer
 
 FIBRES = 2
 
@@ -134,3 +138,44 @@ def test_extract_traces_has_nan_where_the_recording_ends() -> None:
     # One that the next press cuts short is filled.
     first, _ = extract_traces(readings, down_command, np.array([45, 70]))[:, 0]
     assert first[-RELEASED:].tolist() == [*range(45, 50), *[49] * 15]
+
+
+def test_backpropagation_agrees_with_torch() -> None:
+    """Standard deviations are clipped for some targets, and one fibre or more of each press is dropped."""
+    rng, (members, batch, fibres, n_inputs, n_targets, hidden) = np.random.default_rng(0), (2, 5, 3, 4, 2, 6)
+
+    def normal(*shape: int) -> np.ndarray:
+        return rng.standard_normal(shape, np.float32)
+
+    n_outputs = 2 * n_targets
+    weights = {
+        "first.w": normal(members, fibres * n_inputs, hidden),
+        "first.mask": normal(members, fibres, hidden),
+        "first.b": normal(members, 1, hidden),
+        "hidden.w": normal(members, hidden, hidden),
+        "hidden.b": normal(members, 1, hidden),
+        "last.w": normal(members, hidden, fibres * n_outputs),
+        "last.b": 3 * normal(members, 1, fibres * n_outputs),
+    }
+    inputs, targets = normal(members, batch, fibres, n_inputs), normal(members, batch, fibres, n_targets)
+    dropped = (normal(members, batch, fibres).argsort(axis=2) < rng.integers(1, 3, (members, batch, 1))).astype("f4")
+    parameters = optimizer.Parameters(weights)
+    for _ in range(2):  # nothing remains of a batch
+        trace_model.backpropagate(parameters, inputs, targets, dropped)
+
+    w = {name: torch.from_numpy(weight).requires_grad_() for name, weight in weights.items()}
+    x, y, masked = map(torch.from_numpy, (inputs, targets, dropped))
+    h = torch.einsum("ebcn,ecnh->ebh", x * (1 - masked)[..., None], w["first.w"].view(members, fibres, -1, hidden))
+    h = functional.silu(h + torch.einsum("ebc,ech->ebh", 1 - masked, w["first.mask"]) + w["first.b"])
+    h = functional.silu(torch.baddbmm(w["hidden.b"], h, w["hidden.w"]))
+    mean, log_std = torch.baddbmm(w["last.b"], h, w["last.w"]).view(members, batch, fibres, -1).chunk(2, dim=3)
+    assert ((log_std < -4) | (log_std > 2)).any()
+    std = log_std.clamp(-4, 2).exp()
+    t = torch.distributions.StudentT(trace_model.T_DEGREES, mean, std)
+    constant = torch.distributions.StudentT(trace_model.T_DEGREES).log_prob(torch.zeros(()))
+    loss = (constant - t.log_prob(y) + (y - mean) ** 2 / 4) * masked[..., None]
+    (loss.sum(dim=(1, 2, 3)) / masked.sum(dim=(1, 2))).sum().backward()
+    for name, gradient in parameters.gradient.items():
+        expected = w[name].grad
+        assert expected is not None
+        np.testing.assert_allclose(gradient, expected, atol=1e-4 * float(expected.abs().max()))
