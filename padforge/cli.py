@@ -41,8 +41,8 @@ PRESETS = {
 }
 """Settings other than the defaults, by section, that `padforge init` can write."""
 
-EXTRAS = {"design": "design", "fabricate": "cad", "sense": "train", "study": "train"}
-"""Optional dependencies, as in `pyproject.toml`, of each stage; commands that chain stages need all of them."""
+EXTRAS = {"design": "design", "fabricate": "cad", "sense": "design", "study": "train", "run": "design,cad"}
+"""Optional dependencies, as in `pyproject.toml`, of commands; others need all of these."""
 
 
 @click.group(context_settings={"help_option_names": ["-h", "--help"]})

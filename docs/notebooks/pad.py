@@ -2,7 +2,7 @@
 # # From an idea to a calibrated sensor
 #
 # This notebook designs a small pad, makes its mould, presses it on a simulated rig, and learns to locate touches, in a
-# minute. It needs `pip install 'padforge[design,cad,train,formats]' scikit-learn`.
+# minute. It needs `pip install 'padforge[design,cad,formats]' scikit-learn`.
 
 # %%
 import matplotlib.pyplot as plt

@@ -157,7 +157,8 @@ def calibrate(
     training, test = (
         positioned[part] for part in split_presses(len(positioned), options.split, options.test_share, rng)
     )
-    made_by = provenance("padforge sense calibrate", options.seed, packages=("torch", "safetensors"))
+    packages = ("safetensors", *["torch"] * (options.method == "published"))
+    made_by = provenance("padforge sense calibrate", options.seed, packages=packages)
     made_by |= {"inputs": {"recording": recording.digest}, "recording_kind": recording.source.get("kind")}
     with stage("train"):
         model = fit_recording(recording, training, options, rng, on_progress, time_budget, pad)
@@ -223,7 +224,7 @@ def fit_model(
     Raises:
         InputError: too few presses, or a training that diverged.
     """
-    # torch is slow to import, and predictions need none
+    # compiled kernels take long to import, and predictions need none
     from padforge.sense.localizer.training import train_members, train_published
 
     # 1. Response model

@@ -160,7 +160,7 @@ def recalibrate(
     # 3. Radii
     gain, standard_error = validation.gain(before, after)
     widened = validation.widening(after)
-    origin = provenance("padforge sense recalibrate", seed, packages=("torch", "safetensors"))
+    origin = provenance("padforge sense recalibrate", seed, packages=("safetensors",))
     inputs = {"recording": recording.digest, "localizer": dict(model.provenance)}
     origin |= {"inputs": inputs, "recording_kind": recording.source.get("kind")}
     result = Recalibration(

@@ -123,7 +123,7 @@ def fibre_loss_study(
         states: list[Any] = compute_states(tasks, on_progress)
         predictions = {subset: Localization(**state) for subset, state in zip(subsets, states, strict=True)}
         methods[RETRAINED] = evaluate(predictions.__getitem__)
-    origin = provenance("padforge sense fibre-loss", options.seed, packages=("torch",))
+    origin = provenance("padforge sense fibre-loss", options.seed, packages=["torch"] * retrain)
     origin["inputs"] = {"recording": recording.digest, "localizer": dict(localizer.provenance) if localizer else {}}
     split = options.split if localizer is None else localizer.split
     return FibreLoss(split, len(training), len(test), methods, origin)

@@ -107,7 +107,7 @@ def learning_curve(
     counts = np.array(sizes, dtype=float)
     fit = fit_power_law(counts, errors.mean(axis=1))
     forecast = _forecast(counts, errors, fit, rng)
-    origin = provenance("padforge sense learning-curve", options.seed, packages=("torch",))
+    origin = provenance("padforge sense learning-curve", options.seed)
     origin["inputs"] = {"recording": recording.digest}
     return LearningCurve(
         test_presses=len(test),

@@ -71,9 +71,9 @@ def test_locate_works_without_optional_libraries(few) -> None:
     assert shown[0] == 0, shown[2]
     assert calibrated[:2] == [2, ""]
     assert calibrated[2].startswith("padforge: this needs ")
-    assert calibrated[2].endswith("pip install 'padforge[train]'\n")
+    assert calibrated[2].endswith("pip install 'padforge[design]'\n")
     assert (run[0], run[2].count("\n")) == (2, 1)
-    assert run[2].endswith("pip install 'padforge[design,cad,train]'\n")
+    assert run[2].endswith("pip install 'padforge[design,cad]'\n")
 
 
 @pytest.mark.skipif(os.name != "posix", reason="keys are read of POSIX terminals alone")
