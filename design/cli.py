@@ -94,7 +94,7 @@ def design(
     padforge design edit out/pad/morphology.json      edit the paths in a browser
     padforge design import plan.svg                   import them from a drawing
 
-    Writes morphology.json, design.json, design.svg and design.png. Exit code 1 if the best pad breaks a rule. Ctrl-C
+    Writes morphology.json, design.json, and figures of the plan. Exit code 1 if the best pad breaks a rule. Ctrl-C
     stops with the best pad so far (exit code 130); --resume continues from there, also after a kill. A pad from which a
     mould, a recording or other files in the folder were made is replaced with --force only.
     """

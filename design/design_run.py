@@ -92,7 +92,7 @@ def run_design(
         files.check_replaceable(path, folder / path.name, regenerated, force)
         document["morphology_sha256"] = files.sha256(folder / path.name)
         figure = draw_plan(designed, contact, result.violations, pad.keep_out_corners_mm)
-        for name in ("design.svg", "design.png"):
+        for name in ("figures/design.svg", "figures/design.png"):
             save_figure(figure, folder / name)
         files.write_json(folder / "design.json", document)
     on_written(result)

@@ -153,7 +153,7 @@ def design_sections(folder: Path, document: Mapping[str, Any]) -> list[PageSecti
             rules.append([field.description if field else name, limit, result, name])
     body = [
         columns(
-            [figures([(folder / "design.svg", plan)])],
+            [figures([(folder / "figures/design.svg", plan)])],
             [
                 heading("Errors by failed fibres"),
                 paragraph(error_text),

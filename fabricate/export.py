@@ -172,12 +172,12 @@ FORMATS: dict[str, Mapping[str, Callable[..., None]]] = {
     "svg": {"tracks.svg": lambda f, path: _write_utf8(path, tracks_svg(f.plan.shrinkage_compensated))},
     "dxf": {"tracks.dxf": lambda f, path: _write_utf8(path, tracks_dxf(f.plan.shrinkage_compensated))},
     "png": {
-        "mould.png": _draw_mould_png,
-        "tracks.png": lambda f, path: draw_tracks(f.plan.shrinkage_compensated, path),
+        "figures/mould.png": _draw_mould_png,
+        "figures/tracks.png": lambda f, path: draw_tracks(f.plan.shrinkage_compensated, path),
     },
     "gcode": {
         "laying.gcode": lambda f, path: _write_utf8(path, gcode(f.plan, f.toolpath)),
-        "toolpath.svg": lambda f, path: draw_toolpath(f.plan, f.toolpath, path),
+        "figures/toolpath.svg": lambda f, path: draw_toolpath(f.plan, f.toolpath, path),
     },
 }
 """Writers of the files of every format, called with the fabrication, the body if the name has "*", and the path."""
@@ -230,7 +230,7 @@ def build(
         fabrication = Fabrication(plan, bodies, _check_bodies(plan, bodies))
     writers = _choose_writers(fabrication, formats)
     with profiling.stage("checks"):
-        if "toolpath.svg" in writers:
+        if "figures/toolpath.svg" in writers:
             fabrication.findings.extend(check_toolpath(plan, fabrication.toolpath))
         if "mould.step" in writers:
             fabrication.findings.append(_describe_cad(fabrication))
@@ -289,7 +289,7 @@ def _compile_build(fabrication: Fabrication, names: list[str], origin: Mapping[s
             "rules": settings.rules.model_dump(include={"min_mean_bend_radius_mm"}),
             "silicone": settings.silicone.model_dump(mode="json"),
             "fibre": settings.fibre.model_dump(),
-            **({"dispenser": settings.dispenser.model_dump(mode="json")} if "toolpath.svg" in names else {}),
+            **({"dispenser": settings.dispenser.model_dump(mode="json")} if "figures/toolpath.svg" in names else {}),
         },
         provenance=dict(origin),
         sha256={},
@@ -306,12 +306,13 @@ def _write_files(out: Path, writers: Mapping[str, Callable[[Path], None]], resul
     with files.atomic_files(out, without=deleted) as folder:
         for name, write in writers.items():
             with profiling.stage(f"write {name}"), files.reraise_write_error(out / name):
+                (folder / name).parent.mkdir(exist_ok=True)
                 write(folder / name)
         result = replace(result, sha256={name: files.sha256(folder / name) for name in writers})
         files.write_json(folder / "fabrication.json", result.to_dict())
     for name in sorted(deleted):
         _log.info("%s is gone: it was of the mould before this one", out / name)
-    for file in sorted(out.iterdir()):
-        if file.name in earlier.keys() - writers.keys():
-            _log.warning("%s is left from the mould before this one: it is not as it was written", file)
+    for name in sorted(earlier.keys() - writers.keys()):
+        if files.is_local(name) and (out / name).exists():
+            _log.warning("%s is left from the mould before this one: it is not as it was written", out / name)
     return result

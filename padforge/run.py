@@ -18,7 +18,7 @@ from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from padforge.common.command_line import INTERRUPTED
-from padforge.common.files import read_json, reraise_as_input_error, sha256, write_json
+from padforge.common.files import is_local, read_json, reraise_as_input_error, sha256, write_json
 from padforge.common.validation import InputError
 
 from .settings import SECTIONS, check_settings
@@ -142,7 +142,7 @@ class _StageCache:
         return result
 
     def _digests(self, names: Iterable[str]) -> dict[str, str]:
-        paths = {name: self._run.out / Path(name).name for name in names}
+        paths = {name: self._run.out / name for name in names if is_local(name)}
         return {name: sha256(path) for name, path in paths.items() if path.exists()}
 
 

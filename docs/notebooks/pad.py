@@ -42,7 +42,7 @@ Image("plan.png")
 built = fabricate.build(found.morphology, "mould", formats=["stl", "png"])
 print(f"{built.mould_volume_ml:.0f} ml of plastic, {built.silicone_volume_ml:.0f} ml of silicone")
 print(f"{sum(finding.status == 'pass' for finding in built.findings)} of {len(built.findings)} checks passed")
-Image("mould/mould.png")
+Image("mould/figures/mould.png")
 
 # %% [markdown]
 # ## Presses

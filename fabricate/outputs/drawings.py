@@ -22,10 +22,10 @@ Bounds = tuple[float, float, float, float]
 
 _NAMESPACES = {"xmlns": "http://www.w3.org/2000/svg", "xmlns:inkscape": "http://www.inkscape.org/namespaces/inkscape"}
 _NOTE = "#555555"  # colour of notes
-ORIENTATION_FILE = "orientation.svg"
+ORIENTATION_FILE = "figures/orientation.svg"
 ORIENTATION_CAPTION = "The pad in its mould, turned over, and in use, from above and from the near side."
-ORIENTATION_LINK = f"![{ORIENTATION_CAPTION}]({ORIENTATION_FILE})"  # link to the drawing from a page in the same folder
-CROSSING_FILE = "crossing.svg"
+ORIENTATION_LINK = f"![{ORIENTATION_CAPTION}]({ORIENTATION_FILE})"  # link to the drawing from `laying.md`
+CROSSING_FILE = "figures/crossing.svg"
 CROSSING_CAPTION = "The two fibres that cross nearest to each other, in section: the pad lies turned over, to scale."
 CROSSING_LINK = f"![{CROSSING_CAPTION}]({CROSSING_FILE})"
 MIRRORED = "Its numbers are mirrored on purpose: on the casting they read the right way."

@@ -407,7 +407,7 @@ contact. Then crimp a wire to each end, and pull gently: the resistance must not
     if "laying.gcode" in document["files"]:
         yield """
 Or let a machine lay them in this order, on the pad turned over: its toolpath is in `laying.gcode` and drawn in \
-`toolpath.svg`. It waits while you fasten and cut each fibre and seal each step."""
+`figures/toolpath.svg`. It waits while you fasten and cut each fibre and seal each step."""
 
 
 def _wire_lines(document: Document) -> Iterator[str]:

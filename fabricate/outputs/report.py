@@ -23,7 +23,13 @@ from padforge.fabricate.outputs.laying_page import laying_page
 MAX_BYTES = 3_000_000  # maximum size of a packed mesh; base64 makes 4 MB of it, half of the maximum of a page
 _STEPS = np.iinfo(np.uint16).max  # steps of a coordinate along a side of the bounding box
 _TOLERANCES_MM = (0.01, 0.02, 0.05, 0.1, 0.2)  # tried in order for a large mesh; the last is half a common nozzle
-_PICTURES = ("mould.stl", "mould.png", "tracks.png", "toolpath.svg", drawings.ORIENTATION_FILE, drawings.CROSSING_FILE)
+_CAPTIONS = {
+    "figures/mould.png": "The mould from above, {size} mm: colour stands for family and height.{mirrored}",
+    "figures/tracks.png": "The fibres in the tray of the mould, from above, with numbers at their starts; where two"
+    " cross, the line of the deeper one is whole.",
+    "figures/toolpath.svg": "The toolpath of a needle that lays the fibres, the pad turned over.",
+}
+_SHOWN = ("mould.stl", *_CAPTIONS, drawings.ORIENTATION_FILE, drawings.CROSSING_FILE)
 _MAX_POSITIONS = 3  # positions of a finding in a table
 _VIEW = """\
 <figure class="view" id="mould-view" hidden>
@@ -135,7 +141,7 @@ def fabrication_sections(folder: Path, document: Mapping[str, Any]) -> list[page
         KeyError, IndexError, TypeError, ValueError, AttributeError: the document is not as padforge writes it.
         InputError: the mesh or a picture has changed since it was written with the document.
     """
-    digests = {name: document["sha256"][name] for name in _PICTURES if name in document["sha256"]}
+    digests = {name: document["sha256"][name] for name in _SHOWN if name in document["sha256"]}
     unchanged = find_unchanged(folder, digests)
     for name in digests:
         if name not in unchanged and (folder / name).exists():
@@ -154,12 +160,7 @@ def _mould_section(folder: Path, names: Collection[str], document: Mapping[str, 
     remarks = sorted((f for f in findings if f["status"] != "pass"), key=lambda finding: finding["status"])
     large = f"{solid.name} is too large to be turned on this page, also if simplified; the pictures show it."
     mirrored = f" {drawings.MIRRORED}" if document["settings"]["mould"]["number_mm"] else ""
-    captions = {
-        "mould.png": f"The mould from above, {size} mm: colour stands for family and height.{mirrored}",
-        "tracks.png": "The fibres in the tray of the mould, from above, with numbers at their starts; where two cross,"
-        " the line of the deeper one is whole.",
-        "toolpath.svg": "The toolpath of a needle that lays the fibres, the pad turned over.",
-    }
+    captions = {name: caption.format(size=size, mirrored=mirrored) for name, caption in _CAPTIONS.items()}
     return page.PageSection(
         "Mould",
         [

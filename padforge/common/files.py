@@ -15,7 +15,7 @@ import shutil
 import stat
 import sys
 import time
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from functools import cache
 from importlib import metadata
@@ -173,6 +173,11 @@ def sync(path: Path) -> None:
             raise
 
 
+def _sync_all(paths: Iterable[Path]) -> None:
+    for path in paths:
+        sync(path)
+
+
 def to_disk(handle: int) -> None:
     """Synchronise an open file to the disk; on macOS `os.fsync` would leave it in the drive's cache."""
     if sys.platform == "darwin":
@@ -188,26 +193,28 @@ def to_disk(handle: int) -> None:
 def atomic_files(folder: Path, without: Collection[str] = ()) -> Iterator[Path]:
     """Replace a set of files together: yield an empty folder, whose files are moved to `folder` on success.
 
-    If the body fails, `folder` is unchanged. A kill during the move leaves no JSON document of either set. Files named
-    in `without` are removed before the move.
+    They may lie in folders of it. If the body fails, `folder` is unchanged. A kill during the move leaves no JSON
+    document of either set. Files named in `without` are removed before the move.
     """
     with reraise_write_error(folder):
         make_folder(folder)
         with temporary_folder(folder) as stage:
             yield stage
-            names = sorted(path.name for path in stage.iterdir() if path.is_file())
+            names = sorted(path.relative_to(stage).as_posix() for path in stage.rglob("*") if path.is_file())
+            folders = {(folder / name).parent for name in names} | {folder}
             documents = [name for name in names if name.endswith(".json")]
             for name in names:
                 if (folder / name).is_dir():
                     raise InputError(f"{folder / name}: is a folder, expected a file or nothing")
                 sync(stage / name)
+                make_folder((folder / name).parent)
             for name in (*documents, *without):
                 (folder / name).unlink(missing_ok=True)
-            sync(folder)
+            _sync_all(folders)
             for group in ([name for name in names if name not in documents], documents):
                 for name in group:
                     (stage / name).replace(folder / name)
-                sync(folder)
+                _sync_all(folders)
 
 
 def check_file(path: Path, max_bytes: int = MAX_BYTES) -> Path:
@@ -255,12 +262,18 @@ def sha256(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
+def is_local(name: str) -> bool:
+    """Return whether a name from a document is that of a result in its folder, or in a folder of results there."""
+    path = Path(name)
+    return path.parent.as_posix() in (".", "figures", "health") and path.name not in ("", "..")
+
+
 def find_unchanged(folder: Path, digests: Mapping[str, object]) -> set[str]:
     """Return the names of a folder's files that still have the digest in `digests`; invalid entries are ignored."""
     unchanged = set[str]()
     for name, digest in digests.items():
         with suppress(InputError, OSError):
-            if Path(name).name == name and check_file(folder / name) and sha256(folder / name) == digest:
+            if is_local(name) and check_file(folder / name) and sha256(folder / name) == digest:
                 unchanged.add(name)
     return unchanged
 

@@ -65,9 +65,8 @@ def calibrate(
     padforge sense calibrate out/pad/recording --time-budget 600
     padforge sense calibrate out/pad/recording --time-budget 20 --without health --without moments
 
-    Writes localizer and health (.safetensors, .json), health_live for touches found live, calibration.json,
-    error_map.png, error_by_loss.png and error_by_moment.png. Exit 1 if the recording is doubtful: units that cannot be
-    right, or presses that cannot lie where it says.
+    Writes localizer.json and .safetensors, a folder health, calibration.json, and figures of the errors. Exit 1 if the
+    recording is doubtful: units that cannot be right, or presses that cannot lie where it says.
 
     With few presses, --morphology adds the responses that the plan predicts. The fibres must be on the channels in the
     order of the plan, and positions must count from the middle of the pad.

@@ -440,7 +440,7 @@ def has_health(folder: Path) -> bool:
     return any(files_of(folder, name).document.exists() for name in (COMMANDED, DETECTED))
 
 
-HEALTH_FILES = frozenset(file.name for name in (COMMANDED, DETECTED) for file in files_of(Path(), name))
+HEALTH_FILES = frozenset(file.as_posix() for name in (COMMANDED, DETECTED) for file in files_of(Path(), name))
 """Names of the files of a fault detector."""
 
 

@@ -23,7 +23,7 @@ from padforge.sense.health.trace_model import (
 from padforge.sense.localizer.model_files import DOCUMENT_CONFIG, files_of, select_arrays
 
 FORMAT = "padforge-health/1"
-COMMANDED, DETECTED = "health", "health_live"
+COMMANDED, DETECTED = "health/commanded", "health/detected"
 """Names of the files of a model: trained on presses as commanded, and as detected in the readings."""
 FALSE_ALARM_RATE = 1e-5  # default false alarms per press, of all fibres and kinds of fault together
 MAX_FALSE_ALARM_RATE = 0.1

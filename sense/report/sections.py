@@ -18,7 +18,7 @@ from padforge.sense.localizer.evaluation import BUILT_PAD, reserve_lines
 from padforge.sense.recording.recording import Recording
 from padforge.sense.recording.run_directory import JOURNAL, read_journal
 
-MAP, BY_LOSS, BY_MOMENT = "error_map.png", "error_by_loss.png", "error_by_moment.png"
+MAP, BY_LOSS, BY_MOMENT = (f"figures/error_{name}.png" for name in ("map", "by_loss", "by_moment"))
 NUMBERS = ("one", "two", "three")
 
 Errors = Mapping[tuple[int, ...], float]

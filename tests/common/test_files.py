@@ -159,13 +159,13 @@ def test_folder_is_written_on_disks_that_synchronise_no_folders(tmp_path, monkey
     assert (tmp_path / "file.txt").read_text(encoding="utf-8") == "new"
 
 
-def test_find_unchanged_compares_digests_in_one_folder_and_sha256_covers_folders(tmp_path):
-    for path in (tmp_path / "a", tmp_path / "b", tmp_path / "in" / "c"):
+def test_find_unchanged_compares_digests_of_local_files_and_sha256_covers_folders(tmp_path):
+    for path in (tmp_path / "a", tmp_path / "b", tmp_path / "in" / "c", tmp_path / "figures" / "d"):
         files.write_json(path, {})
     digest = files.sha256(tmp_path / "a")
     (tmp_path / "b").write_text("changed")
-    names = ["a", "b", "c", "../a", "", "in", "in/c", str(tmp_path / "a")]
-    assert files.find_unchanged(tmp_path, dict.fromkeys(names, digest)) == {"a"}
+    names = ["a", "b", "c", "../a", "..", "", "in", "in/c", "figures/d", "figures/../a", str(tmp_path / "a")]
+    assert files.find_unchanged(tmp_path, dict.fromkeys(names, digest)) == {"a", "figures/d"}
     assert files.find_unchanged(tmp_path, {"a": None, "c": [1]}) == set()
     before = files.sha256(tmp_path)
     (tmp_path / "a").write_text("2")

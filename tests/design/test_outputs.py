@@ -21,6 +21,7 @@ from padforge.design.optimize.search import SearchResult
 from padforge.design.settings import SearchSettings
 from tests.design.conftest import max_distance_mm
 from tests.helpers.door import call
+from tests.helpers.folders import files_in
 from tests.helpers.golden import Golden, page_text
 from tests.helpers.json_text import json_text
 from tests.helpers.less import compare_little
@@ -84,9 +85,9 @@ def test_design(run, golden: Golden) -> None:
     document = document_of("out/pad/design.json")
     golden("design/design.json", json_text(document), forget=[VERSIONS, *SECONDS], rtol=1e-3)
     golden("design/design_morphology.json", json_text(document_of("out/pad/morphology.json")["knots"]), rtol=1e-3)
-    assert sorted(path.name for path in Path("out/pad").iterdir()) == [
-        *("design.json", "design.png", "design.svg", "morphology.json")
-    ]
+    assert files_in(Path("out/pad")).keys() == {
+        *("design.json", "figures/design.png", "figures/design.svg", "morphology.json")
+    }
 
     read = load_result(Path("out/pad"))
     assert summary_lines(read, Path("out/pad")) == printed.splitlines()[1:-1]

@@ -55,7 +55,8 @@ def contacts_document() -> dict[str, Any]:
 
 
 def test_design_section(golden: Golden, tmp_path: Path) -> None:
-    (tmp_path / "design.svg").write_text('<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 1 1"/>')
+    (tmp_path / "figures").mkdir()
+    (tmp_path / "figures/design.svg").write_text('<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 1 1"/>')
     sections = [design_sections(tmp_path, design_document(enforce)) for enforce in (True, False)]
     texts = [page_text(page("Pad", "", each)) for each in sections]
     golden("design/report_design.txt", "\n\n".join(texts))

@@ -30,12 +30,15 @@ from padforge.fabricate.export import FORMATS, Build, build
 from padforge.fabricate.mould import LID_MM, Body, Prism
 from padforge.fabricate.outputs import pictures
 from tests.fabricate.planted import level_pad, with_settings
+from tests.helpers.folders import files_in
 from tests.helpers.less import small_pictures
 
 PAD = Morphology.random((1, 2), 2, seed=7, pitch_mm=(12.0, 10.0))
 FILES = {f"{body}.{suffix}" for body in ("mould", "lid", "conductive", "holder") for suffix in ("stl", "3mf")}
-FILES |= {"mould.step", "mould.png", "tracks.svg", "tracks.dxf", "tracks.png", "laying.gcode", "toolpath.svg"}
-FILES |= {"fabrication.json", "laying.md", "orientation.svg", "crossing.svg"}
+FILES |= {f"figures/{name}" for name in ("mould.png", "tracks.png", "toolpath.svg")}
+FILES |= {"mould.step", "tracks.svg", "tracks.dxf", "laying.gcode"}
+BESIDE = {"laying.md", "figures/orientation.svg", "figures/crossing.svg"}
+FILES |= {"fabrication.json", *BESIDE}
 SETTINGS = with_settings({"lid": True, "pins": True, "conductive": True, "holder": True})
 
 
@@ -49,8 +52,8 @@ def built(tmp_path_factory) -> tuple[Path, Build]:
 
 def test_build_writes_all_files_with_their_digests_and_no_others(built):
     out, result = built
-    assert {path.name for path in out.iterdir()} == FILES
-    assert {*result.files} == FILES - {"fabrication.json", "laying.md", "orientation.svg", "crossing.svg"}
+    assert files_in(out).keys() == FILES
+    assert {*result.files} == FILES - {"fabrication.json", *BESIDE}
     assert json.loads((out / "fabrication.json").read_text()) == json.loads(json.dumps(result.to_dict()))
     assert result.sha256 == {name: sha256(out / name) for name in FILES - {"fabrication.json"}}
 
@@ -191,17 +194,13 @@ def test_build_refuses_in_one_line_and_writes_nothing(tmp_path, monkeypatch, pla
         pad, settings = level_pad(1.8, 1.2), with_settings({"levels": "two"})
     with pytest.raises(InputError, match=line):
         build(pad, tmp_path / "out", formats, settings)
-    assert not (tmp_path / "out").exists() or not contents(tmp_path / "out")
-
-
-def contents(folder: Path) -> dict[str, bytes]:
-    return {path.name: path.read_bytes() for path in folder.iterdir()}
+    assert not (tmp_path / "out").exists() or not files_in(tmp_path / "out")
 
 
 def test_interrupted_build_keeps_the_old_mould(tmp_path, monkeypatch):
     """At its last file, when all others are written."""
     build(PAD, tmp_path, ["stl", "svg"])
-    before = contents(tmp_path)
+    before = files_in(tmp_path)
 
     def stopped(*_):
         raise OSError(errno.ENOSPC, "full")
@@ -209,7 +208,7 @@ def test_interrupted_build_keeps_the_old_mould(tmp_path, monkeypatch):
     monkeypatch.setattr(export.files, "write_json", stopped)
     with pytest.raises(InputError):
         build(Morphology.straight(2), tmp_path, ["stl", "svg"])
-    assert contents(tmp_path) == before
+    assert files_in(tmp_path) == before
 
 
 def test_build_deletes_earlier_files_unless_they_were_changed(tmp_path, caplog):
@@ -220,8 +219,8 @@ def test_build_deletes_earlier_files_unless_they_were_changed(tmp_path, caplog):
         (tmp_path / name).write_text("somebody's own")
     result = build(Morphology.straight(2), tmp_path, ["stl"])
     left = {"mine.stl", "mould.step", "tracks.dxf"}
-    assert {path.name for path in tmp_path.iterdir()} == {*result.sha256, "fabrication.json"} | left
-    assert result.sha256.keys() == {"mould.stl", "laying.md", "orientation.svg", "crossing.svg"}
+    assert files_in(tmp_path).keys() == {*result.sha256, "fabrication.json"} | left
+    assert result.sha256.keys() == {"mould.stl", *BESIDE}
     gone = "is gone: it was of the mould before this one"
     assert caplog.messages == [
         *(f"{tmp_path / name} {gone}" for name in ("mould.3mf", "tracks.svg")),

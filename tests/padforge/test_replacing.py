@@ -10,6 +10,7 @@ from padforge.common.files import sha256, write_json
 from padforge.design.morphology import Morphology
 from padforge.sense.recording.run_directory import Recorder
 from tests.helpers.door import called, refused
+from tests.helpers.folders import files_in
 from tests.helpers.less import blank_pictures
 
 SMALL = "[pad]\ngrid = 1\n[search]\nknots = 1\nstarts = 1\nsteps = 2\nmax_failures = 1\n[rules]\nenforce = false\n"
@@ -43,10 +44,6 @@ def pad(designed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path
     return folder
 
 
-def contents(folder: Path) -> dict[str, bytes]:
-    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
-
-
 @pytest.mark.parametrize(
     "words",
     [f"{DESIGN} --seed 1", "design import plan.svg --out pad", "design edit other.json --out pad/morphology.json"],
@@ -66,8 +63,7 @@ def test_run_replaces_only_files_it_regenerates(pad: Path) -> None:
 
 def undrawn(pad: Path) -> dict[str, bytes]:
     """What lies in the folder of the pad, but what has times in it, and pictures, which are blank."""
-    found = contents(pad / "pad")
-    return {name: found[name] for name in found if name not in ("design.json", "design.png", "design.svg")}
+    return {name: content for name, content in files_in(pad / "pad").items() if "design." not in name}
 
 
 def test_same_pad_replaces_nothing_and_force_what_is_in_use(pad: Path) -> None:
@@ -84,9 +80,9 @@ def test_refused_search_keeps_checkpoints(pad: Path) -> None:
     path = pad / "pad" / "morphology.json"
     path.write_text(path.read_text() + "\n")
     made_from(pad / "pad" / "twin.json", **{"morphology.json": sha256(path)})
-    before = contents(pad / "pad")
+    before = files_in(pad / "pad")
     assert "twin.json was made from it" in called(*DESIGN.split(), cwd=pad).err
-    after = contents(pad / "pad")
+    after = files_in(pad / "pad")
     assert {name: after[name] for name in before} == before
     assert {name.partition("/")[0] for name in after.keys() - before.keys()} == {"search"}
     assert called(*DESIGN.split(), "--resume", "--force", cwd=pad).code == 0
@@ -104,7 +100,7 @@ def test_run_does_not_replace_localizer_of_measured_presses(tmp_path: Path, told
 def test_run_does_not_replace_measured_recording(folder: Path) -> None:
     """Of a real pad, at work, with files of others in it, or behind a link."""
     recording = folder / "out" / "pad" / "recording"
-    kept = contents(recording)
+    kept = files_in(recording)
     with Recorder.resume(recording):
         assert "another program is recording into it" in refused("run", cwd=folder)
     start = json.loads((recording / "start.json").read_text())

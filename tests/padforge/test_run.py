@@ -8,6 +8,7 @@ import signal
 import threading
 import time
 from collections.abc import Callable
+from hashlib import sha256
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -16,7 +17,6 @@ import pytest
 import trimesh
 from safetensors.numpy import load_file
 
-from padforge.common.files import sha256
 from padforge.common.parallel import Checkpoints
 from padforge.common.settings import Spec
 from padforge.design import Contact, SearchSettings
@@ -27,6 +27,7 @@ from padforge.run import Run
 from padforge.sense.recording.recording import Recording
 from padforge.sense.report.calibration import calibrate_into
 from tests.helpers.door import called, refused
+from tests.helpers.folders import files_in
 from tests.helpers.less import compare_little, small_pictures
 from tests.padforge.conftest import SMALL
 
@@ -36,7 +37,8 @@ VOLATILE = ("design.json", "run.json", "report.html")
 
 
 def digests(folder: Path, *without: str) -> dict[str, str]:
-    return {path.name: sha256(path) for path in (folder / "out" / "pad").iterdir() if path.name not in without}
+    found = files_in(folder / "out" / "pad").items()
+    return {name: sha256(content).hexdigest() for name, content in found if name not in without}
 
 
 def resumed(folder: Path, *more: str) -> str:
@@ -54,10 +56,12 @@ def breaks(*_: object, **__: object) -> None:
 def test_run_makes_everything(finished: tuple[Path, str]) -> None:
     folder, printed = finished
     out = folder / "out" / "pad"
-    names = "morphology.json design.json design.svg design.png mould.stl mould.step mould.png tracks.svg tracks.png"
-    names += " laying.md orientation.svg crossing.svg fabrication.json recording contacts.json localizer.safetensors"
-    names += " localizer.json calibration.json error_map.png error_by_loss.png"
-    assert {path.name for path in out.iterdir()} >= set(names.split())
+    names = "morphology.json design.json mould.stl mould.step tracks.svg laying.md fabrication.json contacts.json"
+    names += " localizer.json localizer.safetensors calibration.json run.json report.html recording figures"
+    assert {path.name for path in out.iterdir()} == set(names.split())
+    figures = "design.svg design.png mould.png tracks.png orientation.svg crossing.svg"
+    figures += " error_map.png error_by_loss.png error_by_moment.png"
+    assert {path.name for path in (out / "figures").iterdir()} == set(figures.split())
     mesh = trimesh.load_mesh(out / "mould.stl")
     assert mesh.is_watertight
     assert mesh.body_count == 1
@@ -128,7 +132,9 @@ def test_resume_repeats_stages_of_changed_settings(folder: Path, monkeypatch: py
         assert resumed(folder) == ", ".join(stage for stage in ALL.split(", ") if stage not in repeated), section
         if section == "mould":
             after = digests(folder)
-            assert [name for name in ("mould.stl", "recording") if after[name] != before[name]] == ["mould.stl"]
+            assert [name for name in ("mould.stl", "recording/readings.bin") if after[name] != before[name]] == [
+                "mould.stl"
+            ]
             for name, result in as_before.items():
                 monkeypatch.setattr(f"padforge.{name}", lambda *ask, make=result, **_: asked.append(ask) or make())
     asked.clear()

@@ -99,7 +99,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     with pytest.MonkeyPatch.context() as patch:
         small_pictures(patch)
         build(PAD, folder, ["stl", "png"], inputs=[folder / "morphology.json"])
-    save_figure(draw_plan(PAD, Contact()), folder / "design.svg")
+    save_figure(draw_plan(PAD, Contact()), folder / "figures" / "design.svg")
     written(folder / "design.json", design_document())
     written(folder / "calibration.json", calibration_document())
     written(folder / "contacts.json", contacts_document())
@@ -108,7 +108,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     start = {"format": "padforge-recording/1", "fibres": 4, "source": source, "provenance": made_by}
     written(folder / "recording" / "start.json", start)
     written(folder / "studies" / "drift.json", study_document())
-    shutil.copy(folder / "tracks.png", folder / "studies" / "drift.png")
+    shutil.copy(folder / "figures" / "tracks.png", folder / "studies" / "drift.png")
     return folder
 
 

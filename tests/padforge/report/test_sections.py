@@ -133,7 +133,7 @@ def test_report_refuses_damaged_file_in_one_line(pad: Path, name: str, content: 
 def test_report_refuses_mould_of_other_checks(pad: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     blank_pictures(monkeypatch)
     build(Morphology.straight(2), tmp_path / "other", ["stl"])
-    for name in ("mould.stl", "orientation.svg"):
+    for name in ("mould.stl", "figures/orientation.svg"):
         shutil.copy(tmp_path / "other" / name, pad / name)
     line = r"mould\.stl: is not the one fabrication\.json was written with; fabricate again"
     with pytest.raises(InputError, match=line):

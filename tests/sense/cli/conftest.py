@@ -45,11 +45,6 @@ def padforge_sense(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixtur
     return run
 
 
-def files_in(folder: str) -> dict[str, bytes]:
-    """The content of the files of a folder, by name."""
-    return {path.name: path.read_bytes() for path in Path(folder).iterdir() if path.is_file()}
-
-
 def make_model(folder: Path, presses: int) -> Path:
     """Make a recording `rec`, and `model`, quickly calibrated on it."""
     (folder / "pad.toml").write_text(SPEC)

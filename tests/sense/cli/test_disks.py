@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from padforge import sense
+from tests.helpers.folders import files_in
 
 COMMANDS = {
     "record": "record --out out/rec",
@@ -38,7 +39,7 @@ def test_command_on_a_full_disk_leaves_all_or_nothing(few, name: str) -> None:
     sense.export_csv(sense.Recording.open("rec"), "whole.csv")
     out, words = Path("model" if name == "calibrate" else "out"), COMMANDS[name].split()
     out.mkdir(exist_ok=True)
-    before = {path.name: path.read_bytes() for path in out.iterdir()}
+    before = files_in(out)
     for limit in (0, 20_000) if name == "locate" else (1000,):
         with full_disk(limit):
             code, _, err = few(*words)
@@ -47,10 +48,10 @@ def test_command_on_a_full_disk_leaves_all_or_nothing(few, name: str) -> None:
             (out / "places.csv").unlink()
         else:
             assert (code, err.count("padforge: "), "Traceback" in err) == (2, 1, False), err
-            assert {path.name: path.read_bytes() for path in out.iterdir()} == before
+            assert files_in(out) == before
     assert few(*words)[0] == 0
     if name == "calibrate":
-        assert {path.name for path in out.iterdir()} == set(before) - {"error_by_moment.png"}
+        assert files_in(out).keys() == set(before) - {"figures/error_by_moment.png"}
         assert (out / "localizer.json").read_bytes() != before["localizer.json"]
     if name in ("record", "import"):
         assert len(sense.Recording.open("out/rec").down_command) == 60

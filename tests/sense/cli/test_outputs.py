@@ -21,8 +21,9 @@ from padforge.sense.localizer import training
 from padforge.sense.localizer.model import Localization, LocalizerModel
 from padforge.sense.settings import RigSettings
 from padforge.sense.simulation.simulated_recording import simulate
+from tests.helpers.folders import files_in
 from tests.helpers.golden import Golden
-from tests.sense.cli.conftest import Run, files_in
+from tests.sense.cli.conftest import Run
 from tests.sense.conftest import first_presses
 
 RTOL = 0.05
@@ -80,6 +81,7 @@ def test_session_of_few_presses(few: Run, golden: Golden, monkeypatch: pytest.Mo
     session("deploy --model model short localizer.onnx")
     session("record --presses 20 --seed 2 --out later/recording")
     for name in HEALTH_FILES:  # of an earlier model, and this one has none
+        Path("later", name).parent.mkdir(exist_ok=True)
         Path("later", name).touch()
     session("recalibrate --model model later/recording --morphology plan.json")
     assert not HEALTH_FILES & files_in("later").keys()

@@ -16,9 +16,10 @@ from padforge.sense.health.fault_detector import HEALTH_FILES, has_health
 from padforge.sense.health.health_model import COMMANDED, HYPOTHESES, MIN_PRESSES, WARM_UP, find_dead_fibres
 from padforge.sense.health.trace_model import LEVEL_RATE, MEMBERS
 from padforge.sense.localizer.model_files import files_of
+from tests.helpers.folders import files_in
 from tests.sense.health.pads import detect_later, fit, plant
 
-DOCUMENT = files_of(Path(), COMMANDED).document.name
+DOCUMENT = files_of(Path(), COMMANDED).document
 
 
 def make_detector(model: HealthModel) -> FaultDetector:
@@ -30,7 +31,7 @@ def make_detector(model: HealthModel) -> FaultDetector:
 def test_detector_files_keep_every_bit(pad: Recording, model: HealthModel, tmp_path: Path, golden: Any) -> None:
     assert not has_health(tmp_path)
     make_detector(replace(model, provenance={"command": "test"})).save(tmp_path / "old")
-    assert {file.name for file in (tmp_path / "old").iterdir()} == HEALTH_FILES
+    assert files_in(tmp_path / "old").keys() == HEALTH_FILES
     FaultDetector.load(tmp_path / "old").save(tmp_path / "new")
     for name in HEALTH_FILES:
         assert (tmp_path / "new" / name).read_bytes() == (tmp_path / "old" / name).read_bytes()
@@ -45,7 +46,7 @@ def test_detector_files_keep_every_bit(pad: Recording, model: HealthModel, tmp_p
 def test_load_refuses_changed_documents_and_torn_files(model: HealthModel, tmp_path: Path) -> None:
     make_detector(model).save(tmp_path)
     whole = {name: (tmp_path / name).read_bytes() for name in HEALTH_FILES}
-    document = json.loads(whole[DOCUMENT])
+    document = json.loads(whole[DOCUMENT.as_posix()])
     for change, message in (
         ({"false_alarm_rate": 0.0}, "false_alarm_rate is 0.0"),
         ({"weights_sha256": "0" * 64}, "not the weights"),
@@ -53,7 +54,7 @@ def test_load_refuses_changed_documents_and_torn_files(model: HealthModel, tmp_p
         (tmp_path / DOCUMENT).write_text(json.dumps(document | change))
         with pytest.raises(InputError, match=message):
             HealthModel.load(tmp_path)
-    (tmp_path / DOCUMENT).write_bytes(whole[DOCUMENT])
+    (tmp_path / DOCUMENT).write_bytes(whole[DOCUMENT.as_posix()])
     for name, content in whole.items():
         (tmp_path / name).write_bytes(content[:-9])
         with pytest.raises(InputError, match=r"not the weights|JSON"):
