@@ -9,7 +9,7 @@ its own, localized from the change since then; the position of the first one is 
 from collections import deque
 from dataclasses import asdict, dataclass, replace
 from math import hypot
-from typing import Any, Literal, Protocol
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -30,7 +30,7 @@ from padforge.sense.localizer.features import (
     valid_fibres,
     windows_from_rest,
 )
-from padforge.sense.localizer.model import MEASURE_COLUMNS, UNIFORM, LocalizerModel
+from padforge.sense.localizer.model import MEASURE_COLUMNS, UNIFORM, FittedLocalizer, LocalizerModel, fitted_model
 from padforge.sense.localizer.model_files import check_same_pad
 from padforge.sense.localizer.moments import (
     EARLY_WINDOWS,
@@ -197,13 +197,6 @@ class BufferedPress:
         return readings, self.down_command - first, up, max(self.previous_end - first, 0)
 
 
-class FittedLocalizer(Protocol):
-    """What `padforge.sense.Localizer` is once it is fitted."""
-
-    @property
-    def model_(self) -> LocalizerModel: ...
-
-
 class Live:
     """Localizes presses in a stream of readings, with bounded memory.
 
@@ -220,7 +213,8 @@ class Live:
         is_other_pad: whether the latest presses are those of another pad; then no fibre is masked.
 
     Raises:
-        InputError: a rate out of range, a localizer that was fitted to arrays, or `check_same_pad` refuses a model.
+        InputError: a rate out of range, a localizer that is not fitted or was fitted to arrays, or `check_same_pad`
+            refuses a model.
     """
 
     def __init__(
@@ -232,8 +226,7 @@ class Live:
         health: HealthModel | None = None,
     ) -> None:
         rate_hz = check_float("rate_hz", rate_hz, MIN_RATE_HZ, MAX_RATE_HZ)
-        if not isinstance(localizer, LocalizerModel):
-            localizer = localizer.model_
+        localizer = fitted_model(localizer)
         fibres = localizer.fibres if fibres is None else fibres
         check_same_pad(localizer, "the localizer", fibres, rate_hz)
         if localizer.features == "array":
@@ -246,7 +239,8 @@ class Live:
         response_v = (np.abs(scaler.mean_v) + 2 * scaler.scale_v)[:, :n_windows].max(axis=1)
         self._response_v = np.where(response_v > 0, response_v, 1.0)  # typical maximum, the scale of the view
         self._detector = PressDetector(fibres)
-        self._frames, self._last_s = FrameStream(rate_hz, fibres), -np.inf  # frames, and time of the last reading
+        self._frames = FrameStream(rate_hz, fibres)
+        self._last_s = -np.inf  # time of the last reading
         self._buffer = RingBuffer(1 + fibres)  # times and voltages of frames
         self._presses: list[BufferedPress] = []  # current ones, in the order of their touches
         # A change that may be a second finger, and the estimate of the first one before it.
@@ -299,14 +293,11 @@ class Live:
         if len(times) and not times[0] > self._last_s:
             raise InputError(f"times begin at {times[0]:g} s, expected later than those of the last readings")
         self._last_s = float(times[-1]) if len(times) else self._last_s
-        for row in np.column_stack(self._frames.feed(times, rows)):
-            self._buffer.append(row)
-            for event in self._detector.update(row[:1], row[None, 1:]):
-                if event.down:
-                    events += self._begin(event.reading)
-                else:
-                    events += self._end(event.reading)
-            for reading in self._detector.further:
+        for frame in np.column_stack(self._frames.feed(times, rows)):  # time and voltages
+            self._buffer.append(frame)
+            for change in self._detector.update(frame[:1], frame[None, 1:]):
+                events += self._begin(change.reading) if change.down else self._end(change.reading)
+            for reading in self._detector.further:  # where a pad that was pressed is pressed further
                 self._suspect(reading)
             events += self._advance()
         return events
@@ -457,20 +448,22 @@ class Live:
                 press.fixed = self._estimate(press, lift, False)
                 press.course = self._course(press, lift, press.fixed)
         courses = [press.course for press in held if press.course is not None]
-        window = RELEASE_WINDOWS[LIFT_WINDOWS[0]][0], RELEASE_WINDOWS[LIFT_WINDOWS[-1]][1]
-        after, before = (self._mean(lift + first, lift + end) for first, end in (window, (-3, 0)))
+        # 1. The measured change, and the change that is expected if either finger lifts off
+        first, end = RELEASE_WINDOWS[LIFT_WINDOWS[0]][0], RELEASE_WINDOWS[LIFT_WINDOWS[-1]][1]
+        change = self._mean(lift + first, lift + end) - self._mean(lift - 3, lift)
         expected = np.array([course.changes_by_release[list(LIFT_WINDOWS)].mean(axis=0) for course in courses])
-        sets, mask = ([0], [1], [0, 1]), courses[0].fibre_mask & courses[1].fibre_mask
-        errors = [float((((after - before) - expected[released].sum(axis=0))[mask] ** 2).sum()) for released in sets]
+        # 2. The hypothesis of least squared error: the first finger, the second one, or both lift off
+        hypotheses, mask = ([0], [1], [0, 1]), courses[0].fibre_mask & courses[1].fibre_mask
+        errors = [float(((change - expected[fingers].sum(axis=0))[mask] ** 2).sum()) for fingers in hypotheses]
         best, second_best = np.argsort(errors)[:2]
-        released = sets[best]
+        released = hypotheses[best]
         if errors[best] > MAX_ERROR_RATIO * errors[second_best]:
             released = [1]  # a guess: either may be the one that is still held, so both positions become unknown
-            names, anywhere_mm = ("std_x_mm", "std_y_mm", "r50_mm", "r90_mm"), np.array(UNIFORM)[[0, 0, 1, 2]]
-            radii_mm = dict(zip(names, (self._localizer.scaler.scale_mm * anywhere_mm).tolist(), strict=True))
+            std_mm, r50_mm, r90_mm = (self._localizer.scaler.scale_mm * np.array(UNIFORM)).tolist()
+            unknown = {"std_x_mm": std_mm, "std_y_mm": std_mm, "r50_mm": r50_mm, "r90_mm": r90_mm}
             for press in held:
                 if press.fixed is not None:
-                    press.fixed = replace(press.fixed, unlike=True, **radii_mm)
+                    press.fixed = replace(press.fixed, unlike=True, **unknown)
                     events.append(self._show(press.fixed))
         elif released == [1]:
             held[1].fixed = None  # only its own release changes the readings now, and locates it better
@@ -485,32 +478,35 @@ class Live:
 
     def _follow(self, press: BufferedPress, cut: int | None = None) -> list[Event]:
         """Return the events of a press at the latest reading; with `cut`, the last ones of a press that ends there."""
-        until = self._buffer.end
-        if cut is not None:
-            until = max(cut, press.down_command + 1)
-            if press.up_command is None:
-                press.release(cut, self._buffer)
+        until = self._buffer.end if cut is None else max(cut, press.down_command + 1)
+        if cut is not None and press.up_command is None:
+            press.release(cut, self._buffer)
         press.store_opening(self._buffer)
         is_complete = False
         if press.up_command is not None:
             end = press.up_command + (0 if press.fixed else RELEASE)
             is_complete = until >= end or cut is not None
             until = min(until, end)
+        # published features need a complete press, and after a lift it is not yet known which finger rests
+        is_estimated_now = self._localizer.features == "windows" and self._lift is None
         events: list[Event] = []
-        if press.fixed is not None:
-            if is_complete:
-                events.append(self._show(replace(press.fixed, final=True)))
-        elif is_complete or (self._localizer.features == "windows" and self._lift is None):
-            # published features need a complete press, and after a lift it is not yet known which finger rests
+        if press.fixed is None and (is_complete or is_estimated_now):
             events.append(self._show(self._estimate(press, until, is_complete)))
-        if press.up_command is not None and is_complete:
-            if press.fixed is None and press.other is None:
-                events += [*self._check_pad(press, until), *self._check_fibres(press, until)]
-            elif self._monitor is not None:  # it skips this press, but numbers those after it
-                self._monitor.n_presses += 1
-            self._previous_end = max(self._previous_end, press.up_command)
-            self._presses.remove(press)
-            press.other = None  # otherwise fingers that take turns without a rest form an endless chain
+        elif press.fixed is not None and is_complete:
+            events.append(self._show(replace(press.fixed, final=True)))
+        return [*events, *self._finish(press, until)] if is_complete else events
+
+    def _finish(self, press: BufferedPress, end: int) -> list[Event]:
+        """Remove a complete press; return what it shows of the pad and its fibres, unless fingers overlapped."""
+        events: list[Event] = []
+        if press.fixed is None and press.other is None:
+            events += [*self._check_pad(press, end), *self._check_fibres(press, end)]
+        elif self._monitor is not None:  # it skips this press, but numbers those after it
+            self._monitor.n_presses += 1
+        assert press.up_command is not None
+        self._previous_end = max(self._previous_end, press.up_command)
+        self._presses.remove(press)
+        press.other = None  # otherwise fingers that take turns without a rest form an endless chain
         return events
 
     def _estimate(self, press: BufferedPress, until: int, final: bool) -> Estimate:

@@ -6,7 +6,7 @@ A localizer trained on presses of several depths also predicts depth, and force 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, ClassVar, Literal, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -403,3 +403,18 @@ class LocalizerModel(LocalizerDocument):
             residual_network=residual_network,
             single_press=tuple(SinglePressTest(**test) for test in tests),
         )
+
+
+class FittedLocalizer(Protocol):
+    """What `padforge.sense.Localizer` is once it is fitted."""
+
+    @property
+    def model_(self) -> LocalizerModel: ...
+
+
+def fitted_model(localizer: FittedLocalizer | LocalizerModel) -> LocalizerModel:
+    """Return the model of a localizer; InputError if it is not fitted."""
+    model = localizer if isinstance(localizer, LocalizerModel) else getattr(localizer, "model_", None)
+    if model is None:
+        raise InputError("the localizer is not fitted, expected fit or load before")
+    return model

@@ -82,21 +82,22 @@ class Phase:
         return isinstance(n_complete, int) and self.first <= n_complete < self.first + len(self.shares)
 
 
+def _half_at_last(n: int) -> tuple[float, ...]:
+    """Return n shares: a half at the last number of complete windows, and the other half divided among the others."""
+    return (*(0.5 / (n - 1),) * (n - 1), 0.5)
+
+
 PHASES: Mapping[int, Mapping[str, Phase]] = {
     N_TIMED: {
         "touched": Phase(1, (0.05, 0.12, 0.26, 0.15, 0.11, 0.09, 0.08, 0.07, 0.07), 1.4, sliding=0.3),
         "settled": Phase(N_PRESS_WINDOWS, (1.0,), 1.3),
-        "released": Phase(
-            N_PRESS_WINDOWS + 1,
-            (*(0.5 / (len(RELEASE_WINDOWS) - 1),) * (len(RELEASE_WINDOWS) - 1), 0.5),
-            1.7,
-        ),
+        "released": Phase(N_PRESS_WINDOWS + 1, _half_at_last(len(RELEASE_WINDOWS)), 1.7),
     },
-    N_PRESS_WINDOWS: {"held": Phase(1, (*(0.5 / (N_PRESS_WINDOWS - 1),) * (N_PRESS_WINDOWS - 1), 0.5), sliding=0.2)},
+    N_PRESS_WINDOWS: {"held": Phase(1, _half_at_last(N_PRESS_WINDOWS), sliding=0.2)},
     0: {"press": Phase(0, (1.0,))},
 }
-"""Phases by the name of their network, for each number of timed windows: all, those of the touch alone, or none if the
-features do not depend on the moment. Where phases overlap, the last one answers."""
+"""Phases by the name of their network, for each number K of timed windows: of press and release, of the press alone, or
+none if the features do not depend on the moment. Where phases overlap, the last one answers."""
 SLIDE_NETWORK = "touched"
 """Network that follows a sliding finger; the others know fingers at rest alone."""
 RESIDUAL = "residual"
@@ -109,8 +110,8 @@ rarely exceeded at rest."""
 POSSIBLE_SLIDE_THRESHOLD = 1.75
 """The same, above which a press may be sliding and is not taken for two fingers; 5 % of pairs of fingers exceed it."""
 BAYES_STAGES = (12, 13, 14, 15, 17)
-"""Complete windows from which on a Bayesian localizer of its own answers. Before the release has shown, at 12, it errs
-by a third more than a network."""
+"""Numbers of complete windows from which on the next Bayesian localizer answers. Before 12 the
+release has not shown yet, and one errs by a third more than a network."""
 RESIDUAL_PHASE = Phase(BAYES_STAGES[0], (0.15, 0.1, 0.15, 0.1, 0.05, 0.45))
 """Phase of the network that corrects the Bayesian localizers."""
 

@@ -150,8 +150,8 @@ class Sliding:
 
     weights: Weights  # of `SLIDE_NETWORK`
     # (C, len(LATEST_WINDOWS), len(PRESS_WINDOWS)), see `FeatureScaler.latest_window_map`
-    now_factor: Floats
-    now_offset: Floats
+    latest_factor: Floats
+    latest_offset: Floats
 
     def follow(self, presses: ScaledFeatures) -> TrackedFinger:
         """Track the finger of presses whose touch is complete."""
@@ -166,9 +166,8 @@ class Sliding:
         early = presses.inputs.copy()
         for k in range(len(LATEST_WINDOWS)):
             window = EARLY_WINDOWS - 1 - k
-            early[:, :, n_timed + k] = (
-                early[:, :, window] * self.now_factor[:, k, window] + self.now_offset[:, k, window]
-            )
+            factor, offset = self.latest_factor[:, k, window], self.latest_offset[:, k, window]
+            early[:, :, n_timed + k] = early[:, :, window] * factor + offset
         early_targets, early_std = predict_from(early, EARLY_WINDOWS)
         distance = np.hypot(*(targets - early_targets)[:, :2].T)
         distance = distance / np.maximum(np.hypot(*early_std[:, :2].T), np.float32(1e-9))

@@ -1,7 +1,7 @@
 """Sections of the HTML report on recording, calibration, fibre loss and studies.
 
-They raise the errors of Python where a document is not as padforge writes it, InputError for a figure of it that cannot
-be read.
+If a document is not as padforge writes it, they raise errors of Python, which the caller converts to an InputError
+(`reraise_as_input_error`). A figure that cannot be read raises InputError.
 """
 
 import json
@@ -14,7 +14,7 @@ from typing import Any
 from padforge.common.files import read_bytes
 from padforge.common.page import PageSection, collapsible, columns, figures, heading, paragraph, table
 from padforge.common.validation import InputError
-from padforge.sense.localizer.evaluation import BUILT_PAD, reserve_lines
+from padforge.sense.localizer.evaluation import SIMULATED_NOTE, reserve_lines
 from padforge.sense.recording.recording import Recording
 from padforge.sense.recording.run_directory import JOURNAL, read_journal
 
@@ -84,7 +84,7 @@ def calibration_sections(folder: Path, document: Mapping[str, Any]) -> list[Page
         *_measure_errors(rows),
         *_moment_errors(folder, document.get("by_moment", [])),
         *(
-            [paragraph(f"Errors are {BUILT_PAD} with 0 / 1 / 2 / 3 of 6 fibres failed, after 4500 presses.")]
+            [paragraph(f"Errors are {SIMULATED_NOTE} with 0 / 1 / 2 / 3 of 6 fibres failed, after 4500 presses.")]
             * simulated
         ),
         *map(paragraph, reserve_lines(document)),
@@ -149,7 +149,7 @@ def fibre_loss_sections(folder: Path, document: Mapping[str, Any]) -> list[PageS
     body = []
     for name, method in methods.items():
         errors = {tuple(row["failed"]): float(row["mean_mm"]) for row in method["by_subset"]}
-        if any(errors):
+        if errors.keys() - {()}:  # a fibre has failed in one of the sets
             body += [*([heading(name.capitalize())] if name else []), *_describe_losses(errors)]
     if not body:
         return []
@@ -213,14 +213,15 @@ def _names(failed: Sequence[int]) -> str:
 def _loss_table(errors: Errors, fibres: int) -> str:
     """Write a triangle: the error without one fibre on its diagonal, without two below it; darker is worse."""
     low, high = min(errors.values()), max(errors.values())
+    # row and column in the table, whose first column has the numbers of the fibres
     cells = {(failed[-1], failed[0] + 1): error for failed, error in errors.items() if failed}
-    columns = range(1, fibres + 1)
+    numbers = range(1, fibres + 1)
     rows = [
-        [row + 1, *(f"{cells[row, column]:.2f}" if (row, column) in cells else "" for column in columns)]
+        [row + 1, *(f"{cells[row, column]:.2f}" if (row, column) in cells else "" for column in numbers)]
         for row in range(fibres)
     ]
     shades = {cell: (error - low) / ((high - low) or 1.0) for cell, error in cells.items()}
-    return table(["", *map(str, columns)], rows, shades)
+    return table(["", *map(str, numbers)], rows, shades)
 
 
 def find_studies(folder: Path) -> Iterator[tuple[Path, dict[str, Any]]]:
