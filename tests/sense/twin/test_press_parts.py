@@ -55,7 +55,7 @@ def test_parts_memory_and_touch_are_those_that_were_simulated(recording: Recordi
 
 def test_kernels_of_a_press() -> None:
     """It is held by its last windows, creeps meanwhile, and leaves what remains inverted; what it takes adds to it."""
-    held, onset, creep, after, replaced = part_kernels(Cycle(40, 13.3), RigSettings(hysteresis_s=1e4))
+    (held, onset, creep, after), replaced = part_kernels(Cycle(40, 13.3), RigSettings(hysteresis_s=1e4))
     assert held[6:9] == pytest.approx(1, abs=0.05)
     assert held[13:] == pytest.approx(0, abs=1e-9)
     assert onset[1] > held[1]
