@@ -1,9 +1,9 @@
 """Prediction of every fibre's response to a press from the responses of the others: mean and standard deviation.
 
-The response of a fibre, its trace (the readings around a press) minus its rest, is reduced to principal components. An
-ensemble of networks with dropout of fibres predicts it, and the level of the rest, from the other valid fibres; and a
-standard deviation, so that what is hard to predict does not count as a fault. Heteroscedastic regression: D. A. Nix,
-A. S. Weigend, IEEE ICNN 1994; ensembles: B. Lakshminarayanan, A. Pritzel, C. Blundell, NeurIPS 2017.
+The trace of a fibre, its readings around a press, is its baseline, the mean at rest, plus its response, of which the
+principal components are used. An ensemble of networks with dropout of fibres predicts both from the other valid fibres,
+with standard deviations, so that what is hard to predict does not count as a fault. Heteroscedastic regression: D. A.
+Nix, A. S. Weigend, IEEE ICNN 1994; ensembles: B. Lakshminarayanan, A. Pritzel, C. Blundell, NeurIPS 2017.
 """
 
 from collections.abc import Mapping
@@ -80,8 +80,8 @@ def extract_traces(readings: Array, down_command: Indices, up_command: Indices) 
 class TraceHistory:
     """State of the fibres after earlier presses."""
 
-    level: Array  # running level of the rest; shape (L,), V; NaN before the first press
-    n_presses: Indices  # presses in it; shape (L,)
+    level: Array  # running mean of the baseline; shape (L,), V; NaN before the first press
+    n_presses: Indices  # presses in that mean; shape (L,)
     residue: Array  # decaying sum of earlier responses; shape (L, D)
 
     @classmethod
@@ -102,14 +102,14 @@ class TracePCA:
     def fit_transform(cls, traces: Array) -> tuple["TracePCA", Floats, Array]:
         """Fit to healthy traces (Q, L, TRACE); return also their inputs (Q, L, N) and targets (Q, L, T)."""
         responses = traces - traces[:, :, :REST].mean(axis=2, keepdims=True)
-        moments = np.einsum("qcw,qcv->cwv", responses, responses) / len(responses)
-        components = np.linalg.eigh(moments)[1][:, :, : -COMPONENTS - 1 : -1]
+        second_moments = np.einsum("qcw,qcv->cwv", responses, responses) / len(responses)
+        components = np.linalg.eigh(second_moments)[1][:, :, : -COMPONENTS - 1 : -1]
         fibres = traces.shape[1]
         pca = cls(components, np.ones((fibres, INPUTS)), np.ones((fibres, TARGETS)))
         history = TraceHistory.initial(fibres)
         inputs, targets = map(np.stack, zip(*[pca.project(trace, history) for trace in traces], strict=True))
         input_rms, target_rms = np.sqrt((inputs**2).mean(axis=0)), np.sqrt((targets**2).mean(axis=0))
-        # Small components stay smaller, and their noise with them.
+        # Geometric means of each rms and the fibre's largest: small inputs stay smaller, and their noise with them.
         input_scale = np.sqrt(input_rms * input_rms.max(axis=1, keepdims=True))
         pca = cls(components, *(np.where(scale > MIN_SCALE_V, scale, 1.0) for scale in (input_scale, target_rms)))
         return pca, *pca.scale(inputs, targets)
@@ -167,35 +167,38 @@ def train_networks(inputs: Floats, targets: Array, rows: list[Indices], rng: np.
 
     generator = torch.Generator().manual_seed(int(rng.integers(2**63)))
     x, y = torch.from_numpy(inputs), torch.from_numpy(targets.astype(np.float32))
-    members, (_, fibres, numbers), outputs = len(rows), x.shape, y.shape[2]
+    n_members, (_, fibres, n_inputs), n_targets = len(rows), x.shape, y.shape[2]
 
     def normal(*shape: int, fan_in: int, gain: float = 1.0) -> torch.Tensor:
         return (torch.randn(*shape, generator=generator) * gain / fan_in**0.5).requires_grad_()
 
     weights = {
-        "first.w": normal(members, fibres, numbers, HIDDEN, fan_in=fibres * numbers),
-        "first.mask": normal(members, fibres, HIDDEN, fan_in=fibres * numbers),
-        "first.b": torch.zeros(members, HIDDEN, requires_grad=True),
-        "hidden.w": normal(members, HIDDEN, HIDDEN, fan_in=HIDDEN),
-        "hidden.b": torch.zeros(members, HIDDEN, requires_grad=True),
-        "last.w": normal(members, fibres, HIDDEN, 2 * outputs, fan_in=HIDDEN, gain=0.1),
-        "last.b": torch.zeros(members, fibres, 2 * outputs, requires_grad=True),
+        "first.w": normal(n_members, fibres, n_inputs, HIDDEN, fan_in=fibres * n_inputs),
+        "first.mask": normal(n_members, fibres, HIDDEN, fan_in=fibres * n_inputs),
+        "first.b": torch.zeros(n_members, HIDDEN, requires_grad=True),
+        "hidden.w": normal(n_members, HIDDEN, HIDDEN, fan_in=HIDDEN),
+        "hidden.b": torch.zeros(n_members, HIDDEN, requires_grad=True),
+        "last.w": normal(n_members, fibres, HIDDEN, 2 * n_targets, fan_in=HIDDEN, gain=0.1),
+        "last.b": torch.zeros(n_members, fibres, 2 * n_targets, requires_grad=True),
     }
     member_rows = [torch.from_numpy(row) for row in rows]
     probabilities = torch.tensor(DROPOUT[: max(fibres - 1, 1)])
 
     def loss_of_batch() -> torch.Tensor:
-        batch = torch.stack([r[torch.randint(len(r), (BATCH,), generator=generator)] for r in member_rows])
-        count = 1 + torch.multinomial(probabilities, members * BATCH, replacement=True, generator=generator)
-        order = torch.rand(members, BATCH, fibres, generator=generator).argsort(dim=2)
-        dropped = (order < count.view(members, BATCH, 1)).to(x.dtype)[..., None]
-        noisy = x[batch] + INPUT_NOISE * torch.randn(members, BATCH, fibres, numbers, generator=generator)
+        # 1. A batch of presses for each member, with 1 to 3 fibres masked, whose targets are predicted
+        batch = torch.stack([part[torch.randint(len(part), (BATCH,), generator=generator)] for part in member_rows])
+        n_dropped = 1 + torch.multinomial(probabilities, n_members * BATCH, replacement=True, generator=generator)
+        rank = torch.rand(n_members, BATCH, fibres, generator=generator).argsort(dim=2)
+        dropped = (rank < n_dropped.view(n_members, BATCH, 1)).to(x.dtype)[..., None]
+        noisy = x[batch] + INPUT_NOISE * torch.randn(n_members, BATCH, fibres, n_inputs, generator=generator)
+        # 2. Forward pass
         h = torch.einsum("ebcn,ecnh->ebh", noisy * (1 - dropped), weights["first.w"])
         h = h + torch.einsum("ebc,ech->ebh", 1 - dropped[..., 0], weights["first.mask"])
         h = silu(h + weights["first.b"][:, None])
         h = silu(torch.baddbmm(weights["hidden.b"][:, None], h, weights["hidden.w"]))
         out = torch.einsum("ebh,echt->ebct", h, weights["last.w"]) + weights["last.b"][:, None]
-        mean, log_std = out.split(outputs, dim=3)
+        mean, log_std = out.split(n_targets, dim=3)
+        # 3. Negative log-likelihood of Student's t
         log_std = log_std.clamp(*LOG_STD)
         square = (y[batch] - mean) ** 2
         nll = (T_DEGREES + 1) / 2 * torch.log1p(square * torch.exp(-2 * log_std) / T_DEGREES) + log_std

@@ -20,8 +20,8 @@ class _Affine(nn.Module):
 class EnsembleMlp(nn.Module):
     """Ensemble of residual MLPs.
 
-    Its parameters are those of `network.Weights`, but one for each hidden layer, `hidden.0.w`: a step would copy the
-    gradients of all layers into one array, a twentieth of its time.
+    Its parameters are those of `network.Weights`, but with an array for each hidden layer, such as `hidden.0.w`: a step
+    would take a twentieth longer if it copied the gradients of all layers into one array.
     """
 
     def __init__(self, weights: Mapping[str, Tensor]) -> None:
@@ -60,7 +60,7 @@ class EnsembleMlp(nn.Module):
 
     @staticmethod
     def join(parameters: Weights) -> Weights:
-        """Return the weights of an ensemble of its parameters by name."""
+        """Return the weights of an ensemble from its parameters by name: hidden layers are stacked."""
         weights = {name: weight for name, weight in parameters.items() if not name.startswith("hidden.")}
         for kind in "w", "b":
             layers = [weight for name, weight in parameters.items() if name.startswith("hidden.") and name[-1] == kind]
@@ -69,7 +69,7 @@ class EnsembleMlp(nn.Module):
 
     @property
     def n_members(self) -> int:
-        """E."""
+        """Number of members, E."""
         return self.first.w.shape[0]
 
     def forward(self, x: Tensor) -> Tensor:

@@ -30,8 +30,8 @@ from padforge.sense.studies.study import (
 RULES = {"published": signals_quantized, "exact": signals}
 """Signals of sampled fibres, as in the published figures, or exact."""
 MIN_NETWORKS = 16
-"""Minimum number of networks for each number of failed fibres, since the error of a network depends on its first weights:
-for fewer sets of failed fibres, several networks are trained for each set."""
+"""Minimum networks for each number of failed fibres. If there are fewer sets of these, several networks are trained for
+each, since the error of a single network depends on its first weights."""
 MAX_SETS = 1024  # sets of failed fibres of one size that are evaluated; if there are more, a sample is drawn
 Respond = Callable[[Morphology, Array], Array]
 HIDDEN = 50  # neurons of a network
