@@ -1,8 +1,8 @@
 """Test errors of calibrations against their run time, for shorter trainings and smaller networks.
 
 `python -m padforge.benchmarks.calibration OUT [RECORDING.mat PRESSES...]` prints a table and draws
-OUT/bench_calibration.png: for presses on a simulated pad, or for PRESSES of a recording of the authors. A case takes
-some ten minutes on two cores, which nothing else should use meanwhile.
+OUT/bench_calibration.png: for presses on a simulated pad, and for each number PRESSES of those in a recording of the
+authors. A case takes some ten minutes on two cores, which nothing else should use meanwhile.
 """
 
 import sys
@@ -91,9 +91,9 @@ def _row(case: str, way: str, epochs: int, seconds: float, errors_mm: Sequence[f
 
 
 def main(out: Path, mat: Path | None, presses: Sequence[int]) -> None:
-    """Print a table of all calibrations, as they are done, and draw their errors against their run times.
+    """Calibrate on the simulated pad and, if `mat` is a recording, on each of these numbers of its presses.
 
-    They are on the simulated pad, and on numbers of presses of a recording of the authors, if there is one.
+    A line of a table is printed after each calibration; their errors are drawn against their run times.
     """
     pad = Morphology.straight(4)
     cases = [("simulated", simulate(pad, RigSettings(presses=SIMULATED + TEST, seed=0)), SIMULATED)]

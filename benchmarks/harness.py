@@ -32,7 +32,7 @@ BUDGET_S = 0.2
 LONG_S = 1.0
 """Work that takes longer is done once a round, s."""
 MAX_BASELINE_S = 0.1
-"""Baselines that take longer are measured in the first round only, s: their run time is not compared between runs."""
+"""Baselines that take longer are measured in the first round only, since runs are not compared by them, s."""
 
 FORMAT = "padforge-benches/1"
 """Format of bench.json; runs of earlier versions stay comparable, so keys must not change."""
@@ -107,7 +107,7 @@ class Worsening:
     what: str  # SLOWER or LESS_ACCURATE
     before: float  # seconds per item, or error in the earlier run
     now: float  # the same in this run
-    ratio: float  # of the two; of times as far as the pace of the machine does not explain it
+    ratio: float  # now over before; for times, corrected for the pace of the machine
 
     def __str__(self) -> str:
         case, way, size, repetition = self.key
@@ -118,7 +118,7 @@ class Worsening:
 def measure_round(
     bench: Bench, rounds: BenchRounds, on_progress: OnProgress, repeat: Callable[[TrialKey], bool]
 ) -> int:
-    """Add a round to the measurements: new trials, and those to `repeat` but slow baselines; return their number."""
+    """Measure new trials, and again those to `repeat` except for slow baselines; return how many were measured."""
     if not rounds.seconds:
         bench.prepare()
     n_measured = 0
@@ -143,7 +143,7 @@ def measure_round(
 
 
 def _measure(work: Callable[[], Any]) -> tuple[Any, float, bool]:
-    """Return the result, the least time in s, and whether it was measured once or twice only."""
+    """Return the result, the minimum time in s, and whether the work was called only once or twice."""
     result, first = _timed_call(work)
     if first > LONG_S:
         return result, first, True
@@ -183,7 +183,7 @@ def run_benches(
     """Measure benchmarks, and write `bench.json` and a figure of each.
 
     Returns:
-        The content of `bench.json`, and what is worse than in the `earlier` run; slower only if so in all rounds.
+        The content of `bench.json`, and what is worse than in the `earlier` run; a slower trial is so in all rounds.
     """
     check_writable(out)
     rounds = {bench.name: BenchRounds() for bench in benches}

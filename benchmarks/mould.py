@@ -75,7 +75,7 @@ def _evaluate_mesh(new_plan: Callable[[], Plan], mesh: Any) -> Mapping[str, floa
 
 def _evaluate_solid(new_plan: Callable[[], Plan], solid: Any) -> Mapping[str, float]:
     plan = new_plan()
-    floor_mm = plan.settings.mould.floor_mm  # where ridges meet it in one solid, and where they begin as solids
+    floor_mm = plan.settings.mould.floor_mm  # ridges of one solid end there, those of their own begin below it
     points = np.vstack([*_horizontal_edges(solid, floor_mm), *_horizontal_edges(solid, floor_mm - INTO_FLOOR_MM)])
     with TemporaryDirectory() as folder:
         path = Path(folder) / "mould.step"

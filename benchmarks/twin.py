@@ -38,8 +38,8 @@ PLAN_CONTACT = Contact(radius=0.6)
 
 WIDTH = 0.55
 """Standard deviation of the Gaussian profile, grid units; the others are about as wide."""
-GAIN_V, GAIN_SD = -0.5, 0.2
-"""Response to a relative stretch of 1, V, and standard deviation of its logarithm over channels."""
+GAIN_V = -0.5  # response to a relative stretch of 1, V
+GAIN_SD = 0.2  # standard deviation of the logarithm of gains over channels
 OFFSET_SCALE = 1.5
 """Correlation length of lateral offsets along a fibre, grid units."""
 
@@ -173,7 +173,8 @@ def _evaluate(world: str, fitted: Identification | Predict) -> Mapping[str, floa
     """Return the relative error of responses at test positions, and of an identification its other results."""
     pad = printed(world)
     positions_mm = np.random.default_rng(1).uniform(-0.5, 0.5, (TEST, 2)) * pad.sensed_mm
-    stretch, live = pad.as_built_stretch(positions_mm), [c for c in pad.channels if c.fibre is not None]
+    stretch = pad.as_built_stretch(positions_mm)
+    live = [channel for channel in pad.channels if channel.fibre is not None]
     true = np.column_stack([channel.gain_v * stretch[:, channel.fibre] for channel in live])
     if not isinstance(fitted, Identification):
         return {"error": _relative_error(fitted(positions_mm)[:, [channel.channel for channel in live]], true)}

@@ -81,12 +81,13 @@ def find_reader(path: Path) -> Callable[..., Recording]:
     """Return the function that imports a path, by its extension; InputError if there is none."""
     if _is_bag_folder(path):
         return import_bag
-    if path.suffix.lower() not in _READERS:
-        hint = f"; {_ADVICE[path.suffix.lower()]}" if path.suffix.lower() in _ADVICE else ""
+    extension = path.suffix.lower()
+    if extension not in _READERS:
+        hint = f"; {_ADVICE[extension]}" if extension in _ADVICE else ""
         raise InputError(
             f"{path}: ends in {path.suffix!r}, allowed are {', '.join(_READERS)}, or a rosbag2 folder{hint}"
         )
-    return _READERS[path.suffix.lower()]
+    return _READERS[extension]
 
 
 def describe_file(path: Path, encoding: str = "") -> list[str]:
@@ -114,8 +115,8 @@ def export_file(
 ) -> None:
     """Write a recording as .csv, .h5 or .mcap, by the extension, or as a folder of a kind of `FORMATS`.
 
-    Predicted positions are for .mcap and LeRobot; faults and dead fibres, as `export_bag` has them, and the states of
-    `arm_states` for .mcap.
+    Only .mcap and LeRobot hold predicted positions; only .mcap holds faults and dead fibres (see `export_bag`), and the
+    states that `arm_states` returns.
     """
     extension = path.suffix.lower()
     if kind == "lerobot":

@@ -152,8 +152,8 @@ class Recorder:
         times_s, _ = read_blocks(path / READINGS, fibres)
         if (journal and not len(times_s)) or not (np.diff(times_s) > 0).all():
             # No interruption can cause this, so nothing is cut off.
-            what = f"the readings of {len(journal)} presses of {fibres} fibres in the journal"
-            raise InputError(f"{path / READINGS}: not {what}")
+            expected = f"ascending readings of {fibres} fibres, for {len(journal)} presses in the journal"
+            raise InputError(f"{path / READINGS}: does not fit the recording, expected {expected}")
         self._path, self.fibres, self.last_s = path, fibres, -np.inf
         self._blocks, times_s = BlockWriter.resume(path / READINGS, fibres)
         self._update_last_time(times_s)

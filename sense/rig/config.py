@@ -136,7 +136,7 @@ def locate_on_bed(rig: RigSettings, folder: Path) -> RigSettings:
     box = (
         *(max(x - half_x, dx), min(x + half_x, width + dx)),
         *(max(y - half_y, dy), min(y + half_y, depth + dy)),
-        *(max(contact - rig.max_depth_mm, frame.walls_mm) - 1e-6, height + dz),
+        *(max(contact - rig.max_depth_mm, frame.walls_mm) - 1e-6, height + dz),  # less rounding of the deepest press
     )
     return rig.model_copy(
         update={
@@ -192,7 +192,7 @@ def plan_notice(config: RigConfig) -> str:
     """Return a notice that a resumed recording keeps its plan although `[rig]` sets another; "" if it does not."""
     stored, current = read_json(config.out / START, FORMAT)["source"]["rig"], config.rig.model_dump(mode="json")
     changed = [f"{key} = {stored.get(key)}" for key in _PLAN_KEYS if stored.get(key) != current[key]]
-    return f"{config.out}: goes on by the plan it was begun with, [rig] {', '.join(changed)}" if changed else ""
+    return f"{config.out}: keeps the plan that it was begun with, [rig] {', '.join(changed)}" if changed else ""
 
 
 def open_recorder(

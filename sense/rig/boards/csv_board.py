@@ -90,7 +90,7 @@ class CsvBoard(SerialBoard):
         level_v = float(np.median(np.abs(table[:, columns]))) * self._count_v
         warning = "its lines have no header and no check: what is damaged or lost is not seen"
         if level_v > 50.0:  # probably counts of a converter
-            warning += f"; they rest at {level_v:.4g}: if that are counts, [rig] count_v is the volts of one"
+            warning += f"; they rest at {level_v:.4g}: if these are counts, set [rig] count_v to the volts of one"
         return {
             "channels": len(inputs),
             "inputs": list(inputs),
