@@ -29,10 +29,8 @@ from padforge.sense.localizer.scaler import FeatureScaler, leave_one_out_residua
 from padforge.sense.recording.frames import frame_rate_hz, framed
 from padforge.sense.recording.recording import Recording
 
-SIMULATED = 1275
-"""Presses of the training on the simulated pad."""
-TEST = 400
-"""Presses that are not trained on, and on which errors are measured."""
+SIMULATED = 1275  # presses of the training on the simulated pad
+TEST = 400  # presses that are not trained on, and on which errors are measured
 MAX_FAILURES = 3
 EPOCHS = (11, 45, 90, 180)
 WAYS: dict[str, dict[str, Any]] = {
@@ -46,9 +44,8 @@ WAYS: dict[str, dict[str, Any]] = {
 def trials(case: str, recording: Recording, n_training: int) -> Iterator[Row]:
     """Yield calibrations by all ways, each with its run time and its errors, on presses that are drawn at random."""
     rng = np.random.default_rng(0)
-    training, test = np.split(
-        rng.permutation(np.flatnonzero(recording.has_position))[: n_training + TEST], [n_training]
-    )
+    order = rng.permutation(np.flatnonzero(recording.has_position))
+    training, test = order[:n_training], order[n_training : n_training + TEST]
     begin = time.perf_counter()
     errors_mm = _bayesian_errors(recording, training, test)
     yield _row(case, "Bayesian alone", 0, time.perf_counter() - begin, errors_mm)

@@ -15,17 +15,14 @@ from padforge.sense.signals.filters import running_median, total_variation
 
 READINGS = 10_000
 LONG = (100_000, 1_000_000)
-PUBLISHED = 4.0
-"""The published regularisation weight lam."""
+PUBLISHED = 4.0  # the published regularisation weight lam
 LAMS = (1.0, 2.0, 4.0, 6.0, 8.0)
 LAMS_V = (0.001, 0.003, 0.01, 0.03, 0.1)
 WIDTHS = (3, 5, 9, 15, 21)
 STEPS = (10, 30, 100, 300, 1000)
 
-PERIOD = 40
-"""Readings from press to press; half of them pressed."""
-LSB_V = 3.3 / 1023
-"""Step of a 10-bit converter, V."""
+PERIOD = 40  # readings from press to press; half of them pressed
+LSB_V = 3.3 / 1023  # step of a 10-bit converter, V
 
 
 def trials() -> Iterator[BenchTrial]:

@@ -25,33 +25,25 @@ from padforge.common.progress import OnProgress
 from padforge.common.validation import InputError
 
 ROUNDS = 3
-MAX_RECHECKS = 5
-"""Further rounds of trials that seem slower than in the earlier run."""
-BUDGET_S = 0.2
-"""Time for repetitions of short work in a round, s."""
-LONG_S = 1.0
-"""Work that takes longer is done once a round, s."""
+MAX_RECHECKS = 5  # further rounds of trials that seem slower than in the earlier run
+BUDGET_S = 0.2  # time for repetitions of short work in a round, s
+LONG_S = 1.0  # work that takes longer is done once a round, s
 MAX_BASELINE_S = 0.1
 """Baselines that take longer are measured in the first round only, since runs are not compared by them, s."""
 
-FORMAT = "padforge-benches/1"
-"""Format of bench.json; runs of earlier versions stay comparable, so keys must not change."""
+FORMAT = "padforge-benches/1"  # format of bench.json; runs of earlier versions stay comparable, so keys must not change
 
 Row = dict[str, Any]
 """A trial: "case", "way", "size", "repetition", "error", "seconds", "paces" and more."""
 TrialKey = tuple[str, str, float, int]
-Documents = Mapping[str, Mapping[str, Any]]
-"""Results in bench.json by the name of the benchmark."""
-KEY = ("case", "way", "size", "repetition")
-"""Columns that identify a trial."""
+Documents = Mapping[str, Mapping[str, Any]]  # results in bench.json by the name of the benchmark
+KEY = ("case", "way", "size", "repetition")  # columns that identify a trial
 
 SLOWER, LESS_ACCURATE = "slower", "less accurate"
-MAX_RATIO = 1.25
-"""Ratio beyond which a trial counts as worse."""
+MAX_RATIO = 1.25  # ratio beyond which a trial counts as worse
 SHORT_S = 1e-3
 """The time of shorter work depends on memory layout: it counts as slower only if another trial of its way does."""
-MIN_ERROR = 1e-15
-"""Smaller errors, of rounding, count as equal."""
+MIN_ERROR = 1e-15  # smaller errors, of rounding, count as equal
 
 
 @dataclass(frozen=True)

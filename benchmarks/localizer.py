@@ -29,14 +29,10 @@ from padforge.sense.simulation.simulated_recording import simulate
 
 PRESSES = 1500  # of the recording
 TEST = 300  # the last ones, which are tested on
-EPOCHS = (3, 10, 30, 100)
-"""Maximum steps of Levenberg-Marquardt; each uses all presses."""
-ITERATIONS = (30, 100, 300)
-"""Iterations of L-BFGS; each uses all presses."""
-PASSES = (30, 100, 300)
-"""Passes of Adam through batches of BATCH presses."""
-STEPS = (50, 200, 800, 3200)
-"""Training steps of a masked network for a phase of relative length 1."""
+EPOCHS = (3, 10, 30, 100)  # maximum steps of Levenberg-Marquardt; each uses all presses
+ITERATIONS = (30, 100, 300)  # iterations of L-BFGS; each uses all presses
+PASSES = (30, 100, 300)  # passes of Adam through batches of BATCH presses
+STEPS = (50, 200, 800, 3200)  # training steps of a masked network for a phase of relative length 1
 FEATURES = ("published", "windows")
 MARQUARDT = ("published",)
 """Features that Levenberg-Marquardt is run on: with F times as many, a step takes F^2 to F^3 times as long."""

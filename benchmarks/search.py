@@ -18,8 +18,7 @@ KNOTS = (5, 20)
 SEEDS = (0, 1)
 GENERATIONS = (5, 20)
 STEPS = (50, 150)
-SUBSETS = 2
-"""Evaluated sets of failed fibres of each size, of which there are up to 56: enough to distinguish the ways."""
+SUBSETS = 2  # evaluated sets of failed fibres of each size, of which there are up to 56: enough to distinguish the ways
 
 
 def trials() -> Iterator[BenchTrial]:

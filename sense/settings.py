@@ -60,18 +60,11 @@ class RigSettings(Settings):
     drift_mv: float = Field(default=20.0, ge=0, le=1000, description="simulated pad: std of the drifting baseline, mV")
     creep: float = Field(default=0.3, ge=0, lt=1, description="simulated pad: share of a response lost by creep")
     hysteresis: float = Field(
-        default=0.65,
-        ge=0,
-        lt=1,
-        description="simulated pad: residue after a press, of opposite sign, as a share of its response",
+        default=0.65, ge=0, lt=1, description="simulated pad: residue of a press as a share of its response, inverted"
     )
     hysteresis_s: float = Field(default=30.0, ge=0.01, le=1e4, description="simulated pad: residue's time constant, s")
-    onset_width: float = Field(
-        default=0.75, ge=0.1, le=2, description="simulated pad: width of a press at its onset over that of the held one"
-    )
-    after_width: float = Field(
-        default=0.7, ge=0.1, le=2, description="simulated pad: width of the residue of a press over that of the press"
-    )
+    onset_width: float = Field(default=0.75, ge=0.1, le=2, description="simulated pad: onset width / press width")
+    after_width: float = Field(default=0.7, ge=0.1, le=2, description="simulated pad: residue width / press width")
     sensitivity: float = Field(
         default=0.6, ge=0, le=2, description="simulated pad: std of the logarithm of the sensitivity along a fibre"
     )
@@ -79,24 +72,14 @@ class RigSettings(Settings):
         default=1.0, ge=0, le=2, description="simulated pad: std of what onset, creep and residue add to that logarithm"
     )
     path_mm: float = Field(default=1.0, ge=0, le=10, description="simulated pad: std of paths about their plan, mm")
-    memory: float = Field(
-        default=0.8, ge=0, le=1, description="simulated pad: share of residues that a press at their position removes"
-    )
+    memory: float = Field(default=0.8, ge=0, le=1, description="simulated pad: share of residues that a press removes")
     memory_mm: float = Field(default=10.0, gt=0, le=1e3, description="simulated pad: distance over which it falls, mm")
-    gain_wander: float = Field(
-        default=0.06, ge=0, le=1, description="simulated pad: relative std of the gains, which wander over minutes"
-    )
-    floor_mv: float = Field(
-        default=3.0, ge=0, le=1000, description="simulated pad: scatter of a response that does not grow with it, mV"
-    )
-    touch_s: float = Field(
-        default=0.025, ge=0, le=1, description="simulated pad: std over the pad of the time of the touch, s"
-    )
-    scatter: float = Field(
-        default=0.17, ge=0, le=1, description="simulated pad: scatter from press to press, as a share of the response"
-    )
+    gain_wander: float = Field(default=0.06, ge=0, le=1, description="simulated pad: relative std of gains in minutes")
+    floor_mv: float = Field(default=3.0, ge=0, le=1000, description="simulated pad: scatter at zero response, mV")
+    touch_s: float = Field(default=0.025, ge=0, le=1, description="simulated pad: std over the pad of touch times, s")
+    scatter: float = Field(default=0.17, ge=0, le=1, description="simulated pad: scatter as a share of the response")
     scatter_common: float = Field(
-        default=0.7, ge=0, le=1, description="simulated pad: share of that variance common to all fibres"
+        default=0.7, ge=0, le=1, description="simulated pad: share of the variance of that scatter common to all fibres"
     )
     host: str = Field(default="192.168.0.100", pattern=r"^[A-Za-z0-9._:-]{1,253}$", description="UR controller address")
     board: str = Field(
@@ -112,9 +95,7 @@ class RigSettings(Settings):
     printer_port: Annotated[Annotated[str, Field(min_length=1, max_length=4096)] | None, *Unknown] = Field(
         default=None, description='serial port of the 3D printer, or "unknown"'
     )
-    printer_baud: int = Field(
-        default=115_200, ge=9600, le=2_000_000, description="speed of the 3D printer's port, baud"
-    )
+    printer_baud: int = Field(default=115_200, ge=9600, le=2_000_000, description="speed of the printer's port, baud")
     board_rate_hz: float = Field(default=1000.0, ge=1, le=10_000, description="samples a second, averaged to rate_hz")
     count_v: float = Field(
         default=1.0,
@@ -246,8 +227,7 @@ IDEAL_RIG = RigSettings(
     scatter_common=0.36,
 )
 """A pad whose fibres lie as planned, and respond to all parts of a press alike."""
-SIMULATED = frozenset(IDEAL_RIG.model_fields_set | {"memory_mm"})
-"""Names of the settings of the simulated pad."""
+SIMULATED = frozenset(IDEAL_RIG.model_fields_set | {"memory_mm"})  # names of the settings of the simulated pad
 IDEAL = {"rig": IDEAL_RIG}
 
 
@@ -258,9 +238,7 @@ class LocalizerSettings(Settings):
         default="ensemble",
         description="one ensemble for every moment and loss of fibres, or published: 50 tanh, Levenberg-Marquardt",
     )
-    split: Split = Field(
-        default="random", description="presses held back for the test: drawn at random, or the last ones"
-    )
+    split: Split = Field(default="random", description="presses of the test: drawn at random, or the last ones")
     test_share: float = Field(default=0.15, gt=0, lt=1, description="share of the presses held back for the test")
     max_failures: int = Field(default=3, ge=0, le=8, description="train and test for up to this many failed fibres")
     members: int = Field(
@@ -278,7 +256,5 @@ class LocalizerSettings(Settings):
         description="passes through the presses, up to 9900 steps; in `padforge run` the default is 90",
     )
     batch: int = Field(default=256, ge=1, le=65_536, description="presses in a training step")
-    learning_rate: float = Field(
-        default=5e-3, gt=0, le=1, description="greatest learning rate of the one-cycle schedule"
-    )
+    learning_rate: float = Field(default=5e-3, gt=0, le=1, description="maximum rate of the one-cycle schedule")
     seed: int = Field(default=0, ge=0, le=2**32 - 1, description="seed of the split and of the training")

@@ -33,8 +33,6 @@ _READERS: dict[str, Callable[..., Recording]] = {
     **dict.fromkeys(SUFFIXES, import_bag),
 }
 _WRITERS: dict[str, Callable[[Recording, Path], None]] = {".csv": export_csv, ".h5": export_hdf5}
-FORMATS = ("lerobot",)
-"""Formats that are folders, without an extension."""
 
 
 def open_recording(path: str | Path) -> Recording:
@@ -113,7 +111,7 @@ def export_file(
     dead: Sequence[int] = (),
     states: Array | None = None,
 ) -> None:
-    """Write a recording as .csv, .h5 or .mcap, by the extension, or as a folder of a kind of `FORMATS`.
+    """Write a recording as .csv, .h5 or .mcap, by the extension, or as a LeRobot dataset if the kind is "lerobot".
 
     Only .mcap and LeRobot hold predicted positions; only .mcap holds faults and dead fibres (see `export_bag`), and the
     states that `arm_states` returns.
@@ -124,8 +122,8 @@ def export_file(
     elif extension == ".mcap":
         export_bag(recording, path, localization, faults, dead, states)
     elif extension not in _WRITERS:
-        folders = ", ".join(f"--format {name}" for name in FORMATS)
-        raise InputError(f"{path}: ends in {path.suffix!r}, allowed are {', '.join(_WRITERS)}, .mcap, or {folders}")
+        allowed = f"{', '.join(_WRITERS)}, .mcap, or --format lerobot"
+        raise InputError(f"{path}: ends in {path.suffix!r}, allowed are {allowed}")
     elif localization is not None:
         raise InputError(f"{path}: predictions of a model can be written as .mcap or lerobot only")
     else:

@@ -67,9 +67,8 @@ class FaultLikelihoods:
         log_noise_std = np.median(np.abs(log_noise - log_noise_mean), axis=0) / MEDIAN_NORMAL
         calibrated = np.hypot(std * std_scale, std_floor)
         offset_residual = ((targets - mean) / calibrated)[:, :, -1]
-        autocorr = np.clip(
-            [(offset_residual[1:] * offset_residual[:-1]).mean() / (offset_residual**2).mean()], 0.0, 0.95
-        )
+        autocov = (offset_residual[1:] * offset_residual[:-1]).mean()
+        autocorr = np.clip([autocov / (offset_residual**2).mean()], 0.0, 0.95)
         innovation_std = np.array([np.median(np.abs(offset_residual[1:] - autocorr * offset_residual[:-1])) / MEDIAN_T])
         library = rng.choice(len(traces), LIBRARY)
         return cls(

@@ -95,9 +95,8 @@ class PadSensor:
             board = open_board(self._rig, self._model, self._options, self._localizer.fibres)
             with closing(board):
                 stream = stream_board(board, self._localizer.rate_hz)
-                pipeline = Live(
-                    self._localizer, rate_hz=stream.rate_hz, fibres=stream.fibres, health=load_health(self._model)
-                )
+                health = load_health(self._model)
+                pipeline = Live(self._localizer, rate_hz=stream.rate_hz, fibres=stream.fibres, health=health)
                 for times_s, readings in stream.blocks:
                     pipeline.update(times_s, readings)
                     if len(times_s):

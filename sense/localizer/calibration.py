@@ -153,9 +153,7 @@ def calibrate(
         raise InputError("time_budget is given: method published has no time limit, expected method ensemble")
     rng = np.random.default_rng(options.seed)
     positioned = np.flatnonzero(recording.has_position)
-    training, test = (
-        positioned[part] for part in split_presses(len(positioned), options.split, options.test_share, rng)
-    )
+    training, test = split_presses(positioned, options.split, options.test_share, rng)
     made_by = provenance("padforge sense calibrate", options.seed, packages=("torch", "safetensors"))
     made_by |= {"inputs": {"recording": recording.digest}, "recording_kind": recording.source.get("kind")}
     with stage("train"):
@@ -379,9 +377,7 @@ def _calibrate_scales(
     mean of the scales is known from other pads, and the presses determine only the ratios between members.
     """
     positions = model.scaler.scale_positions(positions_mm)
-    subsets = [
-        failed for n_failed in range(levels) for failed in failure_subsets(model.fibres, n_failed, SCALE_SUBSETS)
-    ]
+    subsets = [failed for n in range(levels) for failed in failure_subsets(model.fibres, n, SCALE_SUBSETS)]
 
     # 1. Mean ratio of error to expected error of each member, by moment and set of failed fibres, shrunk towards the
     # expected ratio; the first axis of `outputs` and `ratios` holds the members of each of the networks `names` in turn
@@ -392,8 +388,10 @@ def _calibrate_scales(
         on_progress(n_complete - first, len(moments), "expected errors")
         growth = Experience.at_moment(n_complete).growth(n_trained) if n_trained else 1.0
         rows = np.flatnonzero(count_complete(features.complete) == n_complete)  # the next press cut others short
+        if not len(rows):
+            continue
         names = active_networks(model.networks, n_complete, features.complete.shape[1], bool(model.bayes))
-        for failed in subsets if len(rows) else ():
+        for failed in subsets:
             outputs = predict_members(model.networks, features[rows].without(failed), *model.corrected)
             predicted, log_error = (half[:, :, :2] for half in np.split(outputs, 2, axis=2))
             error = np.abs(predicted - positions[rows]).mean(axis=2)
@@ -437,11 +435,10 @@ def _split_training(
 ) -> tuple[Indices, Indices, Indices]:
     """Return presses for training, for early stopping if published, and for calibration."""
     share = CALIBRATION_SHARE[options.method]
-    train, held_back = (training[part] for part in split_presses(len(training), options.split, share, rng, 2))
+    train, held_back = split_presses(training, options.split, share, rng, 2)
     if options.method == "ensemble" or len(held_back) < 2:
         return train, held_back, held_back
-    early_stop, calibration = (held_back[part] for part in split_presses(len(held_back), options.split, 0.5, rng, 1))
-    return train, early_stop, calibration
+    return train, *split_presses(held_back, options.split, 0.5, rng, 1)
 
 
 def trainable_targets(recording: Recording, presses: Indices) -> dict[str, Array]:
@@ -477,18 +474,16 @@ def split_unseen(
     positioned = np.flatnonzero(recording.has_position)
     if model is not None and (test := held_back_presses(model, recording)) is not None:
         return np.setdiff1d(positioned, test), test
-    rng = np.random.default_rng(options.seed)
-    training, test = split_presses(len(positioned), options.split, options.test_share, rng)
-    return positioned[training], positioned[test]
+    return split_presses(positioned, options.split, options.test_share, np.random.default_rng(options.seed))
 
 
 def split_presses(
-    presses: int, split: str, share: float, rng: np.random.Generator, min_training: int = MIN_TRAINING
+    presses: Indices, split: str, share: float, rng: np.random.Generator, min_training: int = MIN_TRAINING
 ) -> tuple[Indices, Indices]:
-    """Split presses into those for training and a share that is held back; return ascending indices of both.
+    """Split presses into those for training and a share that is held back.
 
     Args:
-        presses: their number.
+        presses: ascending indices.
         split: "random", or "chronological" to hold the last presses back.
         share: of the presses held back.
         rng: for a random split.
@@ -498,11 +493,11 @@ def split_presses(
         InputError: fewer than `min_training` presses would be left.
     """
     # a further split of training presses, which has a lower `min_training`, holds back at least one
-    n_held_back = max(round(share * presses), 1 if min_training < MIN_TRAINING else 0)
-    if not 1 <= n_held_back <= presses - min_training:
+    n_held_back = max(round(share * len(presses)), 1 if min_training < MIN_TRAINING else 0)
+    if not 1 <= n_held_back <= len(presses) - min_training:
         raise InputError(
-            f"recording has {presses} presses of known position: a share of {share:g} holds {n_held_back} back, "
+            f"recording has {len(presses)} presses of known position: a share of {share:g} holds {n_held_back} back, "
             f"expected at least 1, and {min_training} to learn from"
         )
-    order = rng.permutation(presses) if split == "random" else np.arange(presses)
+    order = rng.permutation(presses) if split == "random" else presses
     return np.sort(order[:-n_held_back]), np.sort(order[-n_held_back:])

@@ -312,11 +312,9 @@ class LocalizerModel(LocalizerDocument):
             InputError: `failed` are no indices of fibres, or all of them, or any for method "published".
         """
         presses = presses.without(self._check_failed(failed))
-        chunk = max(1, _CHUNK // self.fibres)
-        starts = range(0, max(len(presses), 1), chunk)
-        parts = [
-            predict(self.networks, presses[first : first + chunk], *self.corrected, self.sliding) for first in starts
-        ]
+        size = max(1, _CHUNK // self.fibres)
+        chunks = (presses[first : first + size] for first in range(0, max(len(presses), 1), size))
+        parts = [predict(self.networks, chunk, *self.corrected, self.sliding) for chunk in chunks]
         targets, std, slid = (np.concatenate(part) for part in zip(*parts, strict=True))
         fibre_mask, n_complete = presses.fibre_mask, count_complete(presses.complete)
         level = np.minimum((~fibre_mask).sum(axis=1), self.max_failures)

@@ -33,19 +33,16 @@ from padforge.sense.arrays import Indices, Mask
 
 Window = tuple[int, int]
 
-REST: Window = (-10, 0)
-"""Frames at rest before the probe is sent down; their mean is the baseline of the other windows."""
+REST: Window = (-10, 0)  # frames at rest before the probe is sent down; their mean is the baseline of the other windows
 PRESS_WINDOWS: tuple[Window, ...] = ((1, 2), (2, 3), (3, 4), (4, 5), (5, 6), (6, 8), (8, 12), (12, 16), (16, 20))
 """Windows after the probe was sent down: fine while it sinks in, broad while it rests in the silicone."""
 RELEASE_WINDOWS: tuple[Window, ...] = ((0, 1), (1, 2), (2, 3), (3, 4), (4, 6), (6, 9), (9, 14), (14, 20))
 """Windows after the probe was sent up: the release depends on the position as much as the press does."""
 LATEST_WINDOWS: tuple[Window, ...] = ((-1, 0), (-2, -1))
 """Windows before the latest reading, or before the release if that is earlier: they locate a finger that moves."""
-PRESS_MIDDLES = np.array([(first + end - 1) / 2 for first, end in PRESS_WINDOWS])
-"""Middles of `PRESS_WINDOWS`."""
+PRESS_MIDDLES = np.array([(first + end - 1) / 2 for first, end in PRESS_WINDOWS])  # middles of `PRESS_WINDOWS`
 N_PRESS_WINDOWS = len(PRESS_WINDOWS)
-N_TIMED = len(PRESS_WINDOWS) + len(RELEASE_WINDOWS)
-"""Windows of a press that are complete one after the other."""
+N_TIMED = len(PRESS_WINDOWS) + len(RELEASE_WINDOWS)  # windows of a press that are complete one after the other
 MODULATED = slice(2, 5), slice(5, 9), slice(12, 17)
 """Groups of windows; the sensitivity of a group is modulated as one (see `response_model`)."""
 
@@ -98,12 +95,9 @@ PHASES: Mapping[int, Mapping[str, Phase]] = {
 }
 """Phases by the name of their network, for each number K of timed windows: of press and release, of the press alone, or
 none if the features do not depend on the moment. Where phases overlap, the last one answers."""
-SLIDE_NETWORK = "touched"
-"""Network that follows a sliding finger; the others know fingers at rest alone."""
-RESIDUAL = "residual"
-"""Network that corrects the Bayesian localizers."""
-EARLY_WINDOWS = 5
-"""Complete windows soon after the touch, when a finger has not slid far."""
+SLIDE_NETWORK = "touched"  # network that follows a sliding finger; the others know fingers at rest alone
+RESIDUAL = "residual"  # network that corrects the Bayesian localizers
+EARLY_WINDOWS = 5  # complete windows soon after the touch, when a finger has not slid far
 SLIDE_THRESHOLD = 3.0
 """Distance from the position at `EARLY_WINDOWS`, in its standard deviations, above which a press counts as sliding;
 rarely exceeded at rest."""

@@ -73,8 +73,7 @@ def forward(weights: Weights, x: Floats) -> Floats:
     return _activate(h) @ weights["last.w"] + weights["last.b"]
 
 
-Networks = Mapping[str, Weights]
-"""Networks by phase, see `moments.PHASES`."""
+Networks = Mapping[str, Weights]  # networks by phase, see `moments.PHASES`
 
 
 def predict_members(
@@ -124,9 +123,8 @@ def predict(
     for count in np.unique(n_complete).tolist():
         if count or not presses.complete.shape[1]:
             rows = np.flatnonzero(n_complete == count)
-            targets[rows], std[rows] = combine_members(
-                predict_members(networks, presses[rows], bayes, residual_network)
-            )
+            outputs = predict_members(networks, presses[rows], bayes, residual_network)
+            targets[rows], std[rows] = combine_members(outputs)
     slid = np.zeros(len(presses), bool)
     rows = np.flatnonzero(n_complete >= N_PRESS_WINDOWS)
     if sliding is not None and len(rows):

@@ -93,9 +93,8 @@ class SinglePressTest:
         relative_depth = 1 + presses.depth_gain * presses.targets[:, 2:3] if presses.depth_gain else np.ones((1, 1))
         at_presses = relative_depth * interpolate_grid(table.reshape(side, side, -1), positions)
         residual = presses.inputs - at_presses.reshape(presses.inputs.shape)
-        projection = fit_projection(
-            table, residual, presses.fibre_mask, COMPONENTS, earlier.projection if earlier else None
-        )
+        earlier_projection = earlier.projection if earlier else None
+        projection = fit_projection(table, residual, presses.fibre_mask, COMPONENTS, earlier_projection)
         residual = np.einsum("qcf,cfd->qcd", residual, projection) * presses.fibre_mask[:, :, None]
         # 2. Responses and scatter on a coarse grid over the presses
         offset = np.einsum("cf,cfd->cd", centring * usable, projection)

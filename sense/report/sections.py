@@ -21,8 +21,7 @@ from padforge.sense.recording.run_directory import JOURNAL, read_journal
 MAP, BY_LOSS, BY_MOMENT = "error_map.png", "error_by_loss.png", "error_by_moment.png"
 NUMBERS = ("one", "two", "three")
 
-Errors = Mapping[tuple[int, ...], float]
-"""Mean error, mm, by indices of failed fibres, ascending."""
+Errors = Mapping[tuple[int, ...], float]  # mean error, mm, by indices of failed fibres, ascending
 
 
 def recording_sections(folder: Path, document: Mapping[str, Any]) -> list[PageSection]:

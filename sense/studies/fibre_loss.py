@@ -157,13 +157,9 @@ def train_without(
 
 def fibre_loss_lines(result: FibreLoss) -> list[str]:
     """Format the errors of both methods as a table."""
+    keys = ("mean_mm", "std_mm", "max_mm")
     cells = [
-        [
-            name,
-            f"{row['n_failed']}",
-            f"{row['subsets']}",
-            *(f"{row[f'{key}_mm']:.2f}" for key in ("mean", "std", "max")),
-        ]
+        [name, str(row["n_failed"]), str(row["subsets"]), *(f"{row[key]:.2f}" for key in keys)]
         for name, method in result.methods.items()
         for row in method.errors
     ]

@@ -81,7 +81,7 @@ def learning_curve(
     options = or_default("options", options, settings.LocalizerSettings)
     rng = np.random.default_rng(options.seed)
     presses = np.flatnonzero(recording.has_position)
-    training, test = (presses[part] for part in split_presses(len(presses), options.split, options.test_share, rng))
+    training, test = split_presses(presses, options.split, options.test_share, rng)
     if len(training) * SHARES[0] < MIN_PRESSES:
         raise InputError(
             f"recording has {len(training)} presses to train on, "

@@ -103,9 +103,8 @@ def _evaluate(
         for repeat in range(repeats)
         for network, failed in zip(presses.fit(failures, hidden, repeat), failures, strict=True)
     ]
-    fresh, training, maps = (
-        np.array(part).reshape(repeats, len(failures), -1).mean(axis=0) for part in zip(*errors, strict=True)
-    )
+    by_repeat = (np.array(part).reshape(repeats, len(failures), -1) for part in zip(*errors, strict=True))
+    fresh, training, maps = (part.mean(axis=0) for part in by_repeat)
     return {"fresh": fresh[:, 0], "training": training[:, 0], "maps": maps.astype(np.float32)}
 
 

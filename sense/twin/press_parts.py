@@ -42,7 +42,7 @@ MAX_EVALUATIONS = 40  # of that fit in each round
 
 
 @dataclass(frozen=True)
-class SplitPresses:
+class SeparatedPresses:
     """Parts of Q presses in all channels, without the earlier residues that they remove."""
 
     parts: PressParts[Responses]
@@ -57,8 +57,8 @@ class Kernels(NamedTuple):
     removed: Array  # (F,)
 
 
-def split_presses(recording: Recording, training: Mask, hysteresis_s: float) -> SplitPresses:
-    """Split the presses of known position of a recording; maps of their parts are fitted to those in `training`."""
+def separate_parts(recording: Recording, training: Mask, hysteresis_s: float) -> SeparatedPresses:
+    """Separate the parts of the presses of known position; maps of these parts are fitted to presses in `training`."""
     presses = recording.down_command, recording.up_command, recording.presses_mm
     down, up, positions_mm = (part[recording.has_position] for part in presses)
     inputs = compute_features(recording.readings, down, up)
@@ -88,11 +88,11 @@ def split_presses(recording: Recording, training: Mask, hysteresis_s: float) -> 
         rig = _fit_memory(presses, pressed / kernels.removed[is_held].mean(), training, rig)
         removed, kernels = replaced_residues(*presses, rig), part_kernels(cycle, rig)
     pressed = pressed - kernels.removed[is_held].mean() * removed
-    split = PressParts(*(Responses(positions_mm, part, valid) for part in parts))
+    responses = PressParts(*(Responses(positions_mm, part, valid) for part in parts))
     # at most the greatest value of `[rig]`, which readings that are far apart would exceed
     touch_s = min(_touch_std(positions_mm, timed, is_held) / recording.rate_hz, 1.0)
     fitted = {name: getattr(rig, name) for name in BOUNDS} | {"touch_s": touch_s}
-    return SplitPresses(split, Responses(positions_mm, pressed, valid), fitted)
+    return SeparatedPresses(responses, Responses(positions_mm, pressed, valid), fitted)
 
 
 def _touch_std(positions_mm: Array, windows: Array, is_held: Mask) -> float:
