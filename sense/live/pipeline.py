@@ -2,8 +2,8 @@
 
 It returns events: the position of a press at every reading from its touch to the end of its release, with radii that
 are valid at that moment; faulty fibres, which are masked from the next press on; and a notice if the latest presses are
-those of another pad, for which no fibre is masked. A second finger that lands while the first one rests is a press of
-its own, localized from the change since then; the position of the first one is no longer updated.
+those of another pad, on which no fibre counts as faulty. A second finger that lands while the first one rests is a
+press of its own, localized from the change since then; the position of the first one is no longer updated.
 """
 
 from collections import deque
@@ -182,18 +182,21 @@ class BufferedPress:
         Also returned are the indices in them of `down_command`, of `up_command` (n while the press is held), and of the
         end of the previous press.
         """
+        # 1. The opening, and the latest readings of a long press
         up_command = until if self.up_command is None else min(self.up_command, until)
         opening_end = min(self.down_command + OPENING, until)
-        latest = max(up_command - LATEST, opening_end)
         if self._opening is None:
             opening = buffer.rows(self.down_command - LEAD, opening_end)[:, 1:]
         else:
             n_after_until = self.down_command + OPENING - opening_end
             opening = self._opening[: len(self._opening) - n_after_until]
-        first, n_omitted = opening_end - len(opening), latest - opening_end
-        readings = np.concatenate([opening, buffer.rows(latest, until)[:, 1:]])
-        readings = readings - self.relaxation(np.append(np.arange(first, opening_end), np.arange(latest, until)))
-        up = up_command - first - n_omitted
+        latest_first = max(up_command - LATEST, opening_end)
+        latest = buffer.rows(latest_first, until)[:, 1:]
+        # 2. Their change by the other finger is subtracted
+        first = opening_end - len(opening)
+        rows = np.append(np.arange(first, opening_end), np.arange(latest_first, until))
+        readings = np.concatenate([opening, latest]) - self.relaxation(rows)
+        up = up_command - first - (latest_first - opening_end)
         return readings, self.down_command - first, up, max(self.previous_end - first, 0)
 
 
@@ -210,7 +213,7 @@ class Live:
         presses: the latest estimate of each of the last presses, oldest first.
         track: estimates of the latest press at the last positions to which it has moved, oldest first.
         faults: all faults so far, oldest first.
-        is_other_pad: whether the latest presses are those of another pad; then no fibre is masked.
+        is_other_pad: whether the latest presses are those of another pad; then only dead fibres of `health` are masked.
 
     Raises:
         InputError: a rate out of range, a localizer that is not fitted or was fitted to arrays, or `check_same_pad`
@@ -352,8 +355,8 @@ class Live:
         first = self._buffer.end - len(readings)
         down, previous_end = (np.array([max(index - first, 0)]) for index in (down_command, self._previous_end))
         baseline, history = mean_at_rest(readings, down, previous_end), compute_history(readings, down)
-        begin = self._n_presses, time_s, touched, down_command, self._previous_end
-        self._add(BufferedPress(*begin, baseline, baseline, history))
+        indices = touched, down_command, self._previous_end
+        self._add(BufferedPress(self._n_presses, time_s, *indices, baseline, baseline, history))
         return events
 
     def _add(self, press: BufferedPress) -> None:
@@ -370,12 +373,12 @@ class Live:
         self._candidate, held = None, self._held
         if not held or self._lift is not None:
             return []
-        command = max(self._buffer.command_index(released, RELEASE_DELAY_S), held[-1].touched)
+        up_command = max(self._buffer.command_index(released, RELEASE_DELAY_S), held[-1].touched)
         if len(held) > 1:
-            self._lift = command
+            self._lift = up_command
             return []
-        events = self._cut([press for press in self._presses if press is not held[0]], command)
-        held[0].release(command, self._buffer)
+        events = self._cut([press for press in self._presses if press is not held[0]], up_command)
+        held[0].release(up_command, self._buffer)
         return events
 
     def _suspect(self, touched: int) -> None:
@@ -392,9 +395,8 @@ class Live:
         before = first.fixed or self._estimate(first, down_command, False)
         if before.unlike:
             return
-        press = BufferedPress(
-            self._n_presses, time_s, touched, down_command, sunk_in, first.untouched, first.baseline, first.history
-        )
+        indices, before_press = (touched, down_command, sunk_in), (first.untouched, first.baseline, first.history)
+        press = BufferedPress(self._n_presses, time_s, *indices, *before_press)
         press.finger, press.other = 3 - first.finger, first  # the other one of fingers 1 and 2
         if first.fixed is None:
             first.course = self._course(first, down_command, before)
@@ -404,7 +406,7 @@ class Live:
         self._candidate = press, before
 
     def _course(self, press: BufferedPress, until: int, estimate: Estimate) -> PressCourse:
-        """Return the course expected of a press at an estimated position, scaled to its readings."""
+        """Return the expected course of a press at an estimated position, scaled to its readings."""
         features = self._features_of_working_fibres(press, until)
         return PressCourse.fit(self._localizer, features, np.array([estimate.x_mm, estimate.y_mm]))
 
@@ -512,21 +514,36 @@ class Live:
     def _estimate(self, press: BufferedPress, until: int, final: bool) -> Estimate:
         scaled = self._localizer.scaler.transform(self._features_of_working_fibres(press, until))
         result = self._localizer.localize(scaled)
-        numbers = np.concatenate([result.positions_mm[0], result.std_mm[0], result.r50_mm, result.r90_mm]).tolist()
+        (x_mm, y_mm), (std_x_mm, std_y_mm) = result.positions_mm[0].tolist(), result.std_mm[0].tolist()
         measures = {
             column: float(values[0])
             for name, measure in result.measures.items()
             for column, values in zip(MEASURE_COLUMNS[name], (measure.values, measure.r90), strict=True)
         }
         now_s = float(self._buffer.rows(until - 1, until)[0, 0])
-        if press.up_command is None or until <= press.up_command:
-            moment = "touch", until - press.touched, now_s - press.time_s
-        else:
-            moment = "lift", until - press.up_command, now_s - press.up_s
-        failed = tuple(np.flatnonzero(~scaled.fibre_mask[0]).tolist())
-        unlike = bool(result.unlike is not None and result.unlike[0])
-        more = {"failed": failed, "unlike": unlike, "finger": press.finger}
-        return Estimate(press.number, press.time_s, now_s, *moment, final, *numbers, **more, **measures)
+        since: Literal["touch", "lift"] = "touch"
+        first, first_s = press.touched, press.time_s
+        if press.up_command is not None and until > press.up_command:
+            since, first, first_s = "lift", press.up_command, press.up_s
+        return Estimate(
+            press=press.number,
+            time_s=press.time_s,
+            now_s=now_s,
+            since=since,
+            readings=until - first,
+            since_s=now_s - first_s,
+            final=final,
+            x_mm=x_mm,
+            y_mm=y_mm,
+            std_x_mm=std_x_mm,
+            std_y_mm=std_y_mm,
+            r50_mm=float(result.r50_mm[0]),
+            r90_mm=float(result.r90_mm[0]),
+            failed=tuple(np.flatnonzero(~scaled.fibre_mask[0]).tolist()),
+            unlike=bool(result.unlike is not None and result.unlike[0]),
+            finger=press.finger,
+            **measures,
+        )
 
     def _features_of_working_fibres(self, press: BufferedPress, until: int) -> PressFeatures:
         features = self._features(press, until)

@@ -301,8 +301,8 @@ class LocalizerModel(LocalizerDocument):
     def predict_features(self, presses: ScaledFeatures, failed: ArrayLike = ()) -> Localization:
         """Predict the positions of Q single presses.
 
-        A press without a valid fibre or without a complete window has the middle of the pressed area, and the radii of
-        an unknown position.
+        A press without a valid fibre (of method "published", with an invalid one) or without a complete window has the
+        middle of the pressed area, and the radii of an unknown position.
 
         Args:
             presses: scaled features.
