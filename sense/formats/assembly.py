@@ -28,8 +28,7 @@ from padforge.sense.recording.recording import (
 )
 from padforge.sense.recording.tables import UNKNOWN, name_lines
 
-Arrays = Sequence[tuple[ColumnEntry, NDArray[Any]]]
-"""Arrays of a file, each with its entry of the mapping."""
+Arrays = Sequence[tuple[ColumnEntry, NDArray[Any]]]  # arrays of a file, each with its entry of the mapping
 MEASURES = {"depth": "depths_mm", "reached": "reached_mm", "force": "forces_n"}
 """Quantities with one value a press, and their attributes of a `Recording`."""
 MAX_GAP = 3  # maximum readings without a position that are bridged within a press

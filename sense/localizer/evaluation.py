@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -134,14 +135,8 @@ def evaluate(
     presses = model.scaled_features(recording)
     features, positions_mm = presses[test], recording.presses_mm[test]
     measures = {name: values[test] for name, values in recording.measures.items()}
-    rows, by_subset = errors_by_loss(
-        model.fibres,
-        levels,
-        lambda failed: model.predict_features(features, failed),
-        positions_mm,
-        measures,
-        on_progress,
-    )
+    predict = partial(model.predict_features, features)
+    rows, by_subset = errors_by_loss(model.fibres, levels, predict, positions_mm, measures, on_progress)
     prediction = model.predict_features(features)
     within_r90 = float((distances(prediction.positions_mm, positions_mm) <= prediction.r90_mm).mean())
     localization, is_other_pad = model.predict_features(presses), model.is_other_pad(features)

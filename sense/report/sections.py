@@ -74,6 +74,11 @@ def calibration_sections(folder: Path, document: Mapping[str, Any]) -> list[Page
     head = ["failed", "sets", "mean (mm)", "std", "worst", "median", "95 %", "in r50", "in r90"]
     shares = [[f"{row[f'within_r{k}']:.1%}" for k in (50, 90)] for row in rows]
     errors = [_error_cells(row, "median_mm", "p95_mm") + cells for row, cells in zip(rows, shares, strict=True)]
+    note = f"Errors are {SIMULATED_NOTE} with 0 / 1 / 2 / 3 of 6 fibres failed, after 4500 presses."
+    pictures = [
+        (folder / MAP, "True positions of presses, and the errors of the predicted ones."),
+        (folder / BY_LOSS, "Error by number of failed fibres."),
+    ]
     body = [
         paragraph(
             f"Errors on {document['test_presses']} {presses} never trained on ({split}).{one_network} Every position"
@@ -82,21 +87,12 @@ def calibration_sections(folder: Path, document: Mapping[str, Any]) -> list[Page
         table(head, errors),
         *_measure_errors(rows),
         *_moment_errors(folder, document.get("by_moment", [])),
-        *(
-            [paragraph(f"Errors are {SIMULATED_NOTE} with 0 / 1 / 2 / 3 of 6 fibres failed, after 4500 presses.")]
-            * simulated
-        ),
-        *map(paragraph, reserve_lines(document)),
+        *map(paragraph, [*([note] if simulated else []), *reserve_lines(document)]),
         paragraph(
             "Mean, standard deviation and worst are over the sets of failed fibres; median and 95th percentile over all"
             " their presses."
         ),
-        figures(
-            [
-                (folder / MAP, "True positions of presses, and the errors of the predicted ones."),
-                (folder / BY_LOSS, "Error by number of failed fibres."),
-            ]
-        ),
+        figures(pictures),
         heading("Idle share"),
         paragraph("The share of presses in which a fibre changes by less than 2 % of its range."),
         table(["fibre", *map(str, range(1, len(idle) + 1))], [["idle", *idle]]),
