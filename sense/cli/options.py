@@ -99,7 +99,7 @@ class Prediction(NamedTuple):
     faults: "list[FibreFault]"
     shifts: "list[DomainShift]"
     detector: "FaultDetector | None"
-    is_other_pad: bool  # then no fibre is reported as faulty or masked
+    is_other_pad: bool  # then no fibre is reported or masked as faulty
 
 
 def predict_despite_faults(

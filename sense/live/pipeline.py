@@ -426,14 +426,16 @@ class Live:
         """Start the candidate as a press if a second finger explains it; drop it once it is complete without that."""
         first, until = self._held[0], self._buffer.end
         press.store_opening(self._buffer)
-        n_complete = int(complete_windows(*(np.array([index]) for index in (press.down_command, until, until))).sum())
+        now = np.array([until])  # the press is held: its release may begin now at the earliest
+        n_complete = int(complete_windows(np.array([press.down_command]), now, now).sum())
         if n_complete < MIN_COMPLETE or first.course is None:
             return []
         estimate = self._estimate(press, until, False)
         distance = hypot(estimate.x_mm - before.x_mm, estimate.y_mm - before.y_mm)
         elsewhere, deepening = (self._course(press, until, each) for each in (estimate, before))
         is_elsewhere = distance > before.r90_mm + estimate.r90_mm and elsewhere.explained_share > MIN_EXPLAINED
-        if is_elsewhere and max(deepening.explained_share, elsewhere.share_explained_by(first.course)) < MAX_DEEPENING:
+        share_of_first = max(deepening.explained_share, elsewhere.share_explained_by(first.course))
+        if is_elsewhere and share_of_first < MAX_DEEPENING:
             events = self._cut([each for each in self._presses if each is not first], press.down_command)
             self._candidate, first.fixed = None, before
             self._add(press)

@@ -34,7 +34,8 @@ from padforge.sense.arrays import MAX_FIBRES, MAX_INDEX, Array, check_numbers
 from padforge.sense.recording.block_file import BlockWriter, read_blocks, write_at
 
 FORMAT = "padforge-recording/1"
-START, JOURNAL, READINGS, STATES = FILES = "start.json", "journal.ndjson", "readings.bin", "states.bin"
+START, JOURNAL, READINGS, STATES = "start.json", "journal.ndjson", "readings.bin", "states.bin"
+FILES = START, JOURNAL, READINGS, STATES
 STATE_COLUMNS = ("time_s", "x_mm", "y_mm", "z_mm", "rx", "ry", "rz", "speed_mm_s", "force_n", "safety")
 """Columns of a state of the arm; force is NaN without a sensor, safety 1 normal and 0 stopped."""
 _NEW_START = UNFINISHED + START

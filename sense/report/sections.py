@@ -162,14 +162,14 @@ def fibre_loss_sections(folder: Path, document: Mapping[str, Any]) -> list[PageS
 
 def _describe_losses(errors: Errors) -> Iterator[str]:
     """Describe the errors by set of failed fibres: the worst ones in words, all as tables."""
+    # 1. The worst set of each size, in words
     fibres = 1 + max(fibre for failed in errors for fibre in failed)
     counts = sorted({len(failed) for failed in errors} - {0})
     worst_sets = [max((each for each in errors if len(each) == count), key=errors.__getitem__) for count in counts]
-    worst = "; ".join(
-        f"of {_fibre_count(len(failed))}, {_names(failed)} ({errors[failed]:.2f} mm)" for failed in worst_sets
-    )
+    losses = [f"of {_fibre_count(len(each))}, {_names(each)} ({errors[each]:.2f} mm)" for each in worst_sets]
     intact = f" With all fibres the error is {errors[()]:.2f} mm." if () in errors else ""
-    yield paragraph(f"The worst loss: {worst}.{intact}")
+    yield paragraph(f"The worst loss: {'; '.join(losses)}.{intact}")
+    # 2. Errors without one and two fibres, and mean errors without each fibre
     pairs: list[str] = []
     if {1, 2} <= set(counts):
         few = {failed: error for failed, error in errors.items() if len(failed) <= 2}
@@ -187,6 +187,7 @@ def _describe_losses(errors: Errors) -> Iterator[str]:
     rows = [[fibre + 1, *(mean_with(fibre, count) for count in counts)] for fibre in range(fibres)]
     means = [table(head, rows), paragraph("Mean error over the sets of failed fibres that a fibre is in.")]
     yield columns(*([pairs] if pairs else []), means)
+    # 3. The ten worst sets
     ranked = sorted(errors.items(), key=lambda item: -item[1])[:10]
     rows = [[_names(failed), f"{error:.2f}"] for failed, error in ranked if failed]
     yield collapsible("The worst sets", [table(["failed", "mean (mm)"], rows)])

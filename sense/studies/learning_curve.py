@@ -90,8 +90,7 @@ def learning_curve(
     order = rng.permutation(training)
     sizes = [round(share * len(order)) for share in SHARES]
     options = options.model_copy(update={"members": 1, "method": "ensemble"})
-    # as many steps as in a calibration on that many presses: with one short training for all, more presses would hardly
-    # lower the error
+    # as many steps as in a calibration on so many presses; otherwise more presses would hardly lower the error
     steps = [training_steps(size, options) for size in sizes]
 
     def test_errors(number: int) -> Array:

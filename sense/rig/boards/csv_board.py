@@ -62,7 +62,7 @@ class CsvBoard(SerialBoard):
         start_s = clock.now()
         while (elapsed_s := clock.now() - start_s) < _START_S + LISTEN_S:
             now_s, data = stream.receive()
-            received += data[: _MIN_LINES * 100]
+            received += data[: _MIN_LINES * 100]  # for the description of a wrong stream
             lines += [(now_s, numbers) for numbers in self._decode(data) if elapsed_s > _START_S and numbers]
         if len(lines) < _MIN_LINES:
             message, advice = describe_lines(bytes(received))
