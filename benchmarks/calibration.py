@@ -67,8 +67,7 @@ def _bayesian_errors(recording: Recording, training: Indices, test: Indices) -> 
     rate_hz = frame_rate_hz(recording.rate_hz)
     presses = scaler.training_presses(features[training], recording.presses_mm[training], rate_hz=rate_hz)
     presses = leave_one_out_residuals(presses, table)
-    n_timed = presses.complete.shape[1]
-    localizer = fit_stages(table, presses.inputs, presses.fibre_mask, presses.targets, n_timed)[-1]
+    localizer = fit_stages(table, presses.inputs, presses.fibre_mask, presses.targets, presses.n_timed)[-1]
 
     scaled, errors_mm = scaler.transform(features[test]), []
     inputs = scaled.inputs.astype(np.float64)

@@ -30,7 +30,7 @@ from padforge.sense.localizer.evaluation import (
 )
 from padforge.sense.localizer.features import FeatureSet, PressFeatures, compute_features
 from padforge.sense.localizer.model import Localization, LocalizerModel
-from padforge.sense.localizer.moments import MODULATED, N_PRESS_WINDOWS, complete_at, count_complete
+from padforge.sense.localizer.moments import MODULATED, N_PRESS_WINDOWS, complete_at
 from padforge.sense.localizer.network import (
     MAX_LOG_ERROR,
     MIN_LOG_ERROR,
@@ -85,7 +85,7 @@ class Experience:
     def ratio(self, n_trained: int, failed_share: float) -> float:
         """Return the mean ratio of distance to expected radius when a share of the fibres has failed.
 
-        Errors on new presses then grow less, since they are large in training already.
+        Errors grow less from training to new presses then, since they are large in training already.
         """
         return self.mean_ratio * (1 - FAILURE_DECREASE * failed_share * (1 - 1 / self.growth(n_trained)))
 
@@ -322,11 +322,11 @@ def calibrate_uncertainty(
         experience = [Experience.at_moment(n_complete) for n_complete in range(1, len(moments) + 1)]
         expected = np.array([[each.ratio(n_trained, share) for share in failed_shares] for each in experience])
         prior_ratios = adapt_ratios(expected, predictions, positions_mm)
-    ratios = [[None] * levels] * len(moments) if prior_ratios is None else prior_ratios.tolist()
-    factors: list[list[Array]] = [
-        [conformal(sets, positions_mm, measures, ratio) for sets, ratio in zip(*of_moment, strict=True)]
-        for of_moment in zip(predictions, ratios, strict=True)
-    ]
+    factors: list[list[Array]] = []
+    for moment, by_level in enumerate(predictions):
+        ratios = [None] * levels if prior_ratios is None else prior_ratios[moment].tolist()
+        pairs = zip(by_level, ratios, strict=True)
+        factors.append([conformal(sets, positions_mm, measures, ratio) for sets, ratio in pairs])
     if len(moments) > 1:
         factors = [factors[0], *factors]  # a placeholder for 0 complete windows, where nothing is predicted
     n_presses = len(positions_mm) + PRIOR_PRESSES * (prior_ratios is not None)
@@ -387,10 +387,10 @@ def _calibrate_scales(
     for n_complete, features in enumerate(moments, first):
         on_progress(n_complete - first, len(moments), "expected errors")
         growth = Experience.at_moment(n_complete).growth(n_trained) if n_trained else 1.0
-        rows = np.flatnonzero(count_complete(features.complete) == n_complete)  # the next press cut others short
+        rows = np.flatnonzero(features.n_complete == n_complete)  # the next press cut others short
         if not len(rows):
             continue
-        names = active_networks(model.networks, n_complete, features.complete.shape[1], bool(model.bayes))
+        names = active_networks(model.networks, n_complete, features.n_timed, bool(model.bayes))
         for failed in subsets:
             outputs = predict_members(model.networks, features[rows].without(failed), *model.corrected)
             predicted, log_error = (half[:, :, :2] for half in np.split(outputs, 2, axis=2))

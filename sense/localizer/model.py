@@ -27,7 +27,6 @@ from padforge.sense.localizer.moments import (
     RESIDUAL,
     SLIDE_NETWORK,
     complete_at,
-    count_complete,
 )
 from padforge.sense.localizer.network import Networks, Sliding, Weights, predict
 from padforge.sense.localizer.scaler import FeatureScaler, ScaledFeatures, array_field
@@ -316,13 +315,13 @@ class LocalizerModel(LocalizerDocument):
         chunks = (presses[first : first + size] for first in range(0, max(len(presses), 1), size))
         parts = [predict(self.networks, chunk, *self.corrected, self.sliding) for chunk in chunks]
         targets, std, slid = (np.concatenate(part) for part in zip(*parts, strict=True))
-        fibre_mask, n_complete = presses.fibre_mask, count_complete(presses.complete)
+        fibre_mask, n_complete = presses.fibre_mask, presses.n_complete
         level = np.minimum((~fibre_mask).sum(axis=1), self.max_failures)
         # the network of the touch locates a finger that slid, even when it rests again
         factors = self.interval_factors[np.where(slid, N_PRESS_WINDOWS - 1, n_complete), level]
         to_std, to_r50, to_r90 = factors[:, :3].T * self.scaler.scale_mm
         radius = np.hypot(*std[:, :2].T)
-        is_complete = n_complete > 0 if presses.complete.shape[1] else np.ones(len(presses), bool)
+        is_complete = n_complete > 0 if presses.n_timed else np.ones(len(presses), bool)
         has_fibres = fibre_mask.all(axis=1) if self.method == "published" else fibre_mask.any(axis=1)
         is_unknown = np.logical_not(is_complete & has_fibres)
         unknown_std_mm, unknown_r50_mm, unknown_r90_mm = np.array(UNIFORM) * self.scaler.scale_mm

@@ -29,7 +29,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from padforge.sense.arrays import Indices, Mask
+from padforge.sense.arrays import Indices
 
 Window = tuple[int, int]
 
@@ -127,11 +127,6 @@ def complete_at(n_complete: int, down_command: Indices, up_command: Indices) -> 
     if n_complete <= N_PRESS_WINDOWS:
         return down_command + PRESS_WINDOWS[n_complete - 1][1]
     return up_command + RELEASE_WINDOWS[n_complete - N_PRESS_WINDOWS - 1][1]
-
-
-def count_complete(complete: Mask) -> Indices:
-    """Return the number (Q,) of complete windows of presses."""
-    return complete.sum(axis=1)
 
 
 def bayes_stage(n_complete: int, n_timed: int) -> int | None:

@@ -24,7 +24,6 @@ from padforge.sense.localizer.moments import (
     SLIDE_THRESHOLD,
     active_networks,
     bayes_stage,
-    count_complete,
 )
 from padforge.sense.localizer.scaler import ScaledFeatures
 
@@ -86,7 +85,7 @@ def predict_members(
 
     With `bayes`, the last member is the Bayesian localizer of the stage, corrected by the residual network.
     """
-    n_complete, n_timed = int(presses.complete[:1].sum()), presses.complete.shape[1]
+    n_complete, n_timed = int(presses.complete[:1].sum()), presses.n_timed
     is_published = "hidden.w" not in next(iter(networks.values()))
     x = (
         presses.inputs.reshape(len(presses), -1)
@@ -116,12 +115,12 @@ def predict(
         Scaled targets (Q, N) and their standard deviations, 0 where no window is complete; and whether a finger has
         slid (Q,).
     """
-    n_complete = count_complete(presses.complete)
+    n_complete = presses.n_complete
     first = next(iter(networks.values()))
     n_targets = first["last.w"].shape[2] // (2 if "hidden.w" in first else 1)
     targets, std = np.zeros((2, len(presses), n_targets), np.float32)
     for count in np.unique(n_complete).tolist():
-        if count or not presses.complete.shape[1]:
+        if count or not presses.n_timed:
             rows = np.flatnonzero(n_complete == count)
             outputs = predict_members(networks, presses[rows], bayes, residual_network)
             targets[rows], std[rows] = combine_members(outputs)
@@ -153,7 +152,7 @@ class Sliding:
 
     def follow(self, presses: ScaledFeatures) -> TrackedFinger:
         """Track the finger of presses whose touch is complete."""
-        n_timed = presses.complete.shape[1]
+        n_timed = presses.n_timed
 
         def predict_from(features: Floats, n_complete: int) -> tuple[Floats, Floats]:
             complete = presses.complete & (np.arange(n_timed) < n_complete)

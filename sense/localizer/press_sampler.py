@@ -84,7 +84,7 @@ class PressSampler:
         residual = (presses.inputs - expected.reshape(presses.inputs.shape)).astype(np.float32)
         windows = presses.complete, presses.latest_factor, presses.latest_offset
         self._source = _Source(np.ascontiguousarray(table), residual, *windows, float(self.depth_gain), LATEST_NOISE)
-        self._n_timed = presses.complete.shape[1]
+        self._n_timed = presses.n_timed
         self._bayes = tuple(stage.map_arrays(torch.from_numpy) for stage in bayes)
         self.n_inputs = fibres * (n_features + 1) + self._n_timed + (N_SUMMARY if bayes else 0)
         self._phase, self._speed, self._per_mm = phase, presses.speed, presses.per_mm
@@ -160,7 +160,7 @@ def _compute_inputs(
         fibre_mask: valid fibres; shape (B, C).
         moments: `_Moments` of the presses.
         noise: standard deviation of noise on the features.
-        rng: random number generator.
+        rng: of the noise.
         x: filled with 0; shape (B, I). Masked features, and windows that are not complete, stay 0.
     """
     side, (fibres, size), n_timed = len(source.table), source.residual.shape[1:], source.complete.shape[1]

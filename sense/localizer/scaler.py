@@ -52,6 +52,16 @@ class ScaledFeatures:
     def __len__(self) -> int:
         return len(self.inputs)
 
+    @property
+    def n_timed(self) -> int:
+        """Number of timed windows, K."""
+        return self.complete.shape[1]
+
+    @property
+    def n_complete(self) -> Indices:
+        """Number (Q,) of complete windows of each press."""
+        return self.complete.sum(axis=1)
+
     def without(self, failed: Iterable[int]) -> "ScaledFeatures":
         """Return the features with fibres masked in every press, by their indices."""
         working = ~np.isin(np.arange(self.fibre_mask.shape[1]), list(failed))
@@ -178,7 +188,7 @@ class FeatureScaler:
     ) -> "TrainingPresses":
         """Scale features and targets of presses; `rate_hz` of readings is needed only for training with slides."""
         scaled, targets = self.transform(features), self.scale_targets(positions_mm, measures)
-        latest_factor, latest_offset = self.latest_window_map(scaled.complete.shape[1])
+        latest_factor, latest_offset = self.latest_window_map(scaled.n_timed)
         return TrainingPresses(
             scaled.inputs,
             scaled.fibre_mask,
