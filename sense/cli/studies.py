@@ -237,9 +237,9 @@ def _add_study(name: str, module: str, text: str, example: str) -> None:
     _command(name)(common.spec_option(make))
 
 
-_sensitivity = """Presses by tools and to depths that were trained on, or were not (figure 6).
+_sensitivity = """Tools and depths other than in training (figure 6).
 
-They have 0.5 to 1.5 times the radius and the depth that [contact] states. If [contact] is a shape, as in the preset
+Radius and depth are 0.5, 1 and 1.5 times those that [contact] states. If [contact] is a shape, as in the preset
 `published`, the objects are the polygons of the paper, of radius K in grid units and with D sides."""
 _force = "Depth and force of a press, from the signals. A tool presses the layer of [contact]."
 _shape = "Which object was pressed, from the signals. Objects are a dome, a ball, a finger and a flat end."
