@@ -1,8 +1,8 @@
 """Test errors of calibrations against their run time, for shorter trainings and smaller networks.
 
 `python -m padforge.benchmarks.calibration OUT [RECORDING.mat PRESSES...]` prints a table and draws
-OUT/bench_calibration.png: for presses on a simulated pad, or for PRESSES of a recording of the authors. A case takes
-some ten minutes on two cores, which nothing else should use meanwhile.
+OUT/bench_calibration.png: for presses on a simulated pad, and for each number PRESSES of those in a recording of the
+authors. A case takes some ten minutes on two cores, which nothing else should use meanwhile.
 """
 
 import sys
@@ -29,10 +29,8 @@ from padforge.sense.localizer.scaler import FeatureScaler, leave_one_out_residua
 from padforge.sense.recording.frames import frame_rate_hz, framed
 from padforge.sense.recording.recording import Recording
 
-SIMULATED = 1275
-"""Presses of the training on the simulated pad."""
-TEST = 400
-"""Presses that are not trained on, and on which errors are measured."""
+SIMULATED = 1275  # presses of the training on the simulated pad
+TEST = 400  # presses that are not trained on, and on which errors are measured
 MAX_FAILURES = 3
 EPOCHS = (11, 45, 90, 180)
 WAYS: dict[str, dict[str, Any]] = {
@@ -46,9 +44,8 @@ WAYS: dict[str, dict[str, Any]] = {
 def trials(case: str, recording: Recording, n_training: int) -> Iterator[Row]:
     """Yield calibrations by all ways, each with its run time and its errors, on presses that are drawn at random."""
     rng = np.random.default_rng(0)
-    training, test = np.split(
-        rng.permutation(np.flatnonzero(recording.has_position))[: n_training + TEST], [n_training]
-    )
+    order = rng.permutation(np.flatnonzero(recording.has_position))
+    training, test = order[:n_training], order[n_training : n_training + TEST]
     begin = time.perf_counter()
     errors_mm = _bayesian_errors(recording, training, test)
     yield _row(case, "Bayesian alone", 0, time.perf_counter() - begin, errors_mm)
@@ -70,8 +67,7 @@ def _bayesian_errors(recording: Recording, training: Indices, test: Indices) -> 
     rate_hz = frame_rate_hz(recording.rate_hz)
     presses = scaler.training_presses(features[training], recording.presses_mm[training], rate_hz=rate_hz)
     presses = leave_one_out_residuals(presses, table)
-    n_timed = presses.complete.shape[1]
-    localizer = fit_stages(table, presses.inputs, presses.fibre_mask, presses.targets, n_timed)[-1]
+    localizer = fit_stages(table, presses.inputs, presses.fibre_mask, presses.targets, presses.n_timed)[-1]
 
     scaled, errors_mm = scaler.transform(features[test]), []
     inputs = scaled.inputs.astype(np.float64)
@@ -91,9 +87,9 @@ def _row(case: str, way: str, epochs: int, seconds: float, errors_mm: Sequence[f
 
 
 def main(out: Path, mat: Path | None, presses: Sequence[int]) -> None:
-    """Print a table of all calibrations, as they are done, and draw their errors against their run times.
+    """Calibrate on the simulated pad and, if `mat` is a recording, on each of these numbers of its presses.
 
-    They are on the simulated pad, and on numbers of presses of a recording of the authors, if there is one.
+    A line of a table is printed after each calibration; their errors are drawn against their run times.
     """
     pad = Morphology.straight(4)
     cases = [("simulated", simulate(pad, RigSettings(presses=SIMULATED + TEST, seed=0)), SIMULATED)]

@@ -21,10 +21,9 @@ from padforge.design.settings import PUBLISHED_CONTACT, Contact
 SAMPLES = (250, 500, 1000, 2000, 4000, 8000, 16000)
 KNOTS = (1, 5, 20)
 GRIDS = (4, 8, 16, 32, 64, 128)
-PUBLISHED = 2000
-"""Samples of a fibre in the published program."""
-BETA, GAMMA = 1e-7, 5e-6
-"""Published weights of sharpness and disorder."""
+PUBLISHED = 2000  # samples of a fibre in the published program
+BETA = 1e-7  # published weight of sharpness
+GAMMA = 5e-6  # published weight of disorder
 
 
 def plain_signals(pad: Morphology, presses: Array, contact: Contact, samples: int) -> Array:

@@ -14,18 +14,15 @@ from padforge.sense.arrays import Array
 from padforge.sense.signals.filters import running_median, total_variation
 
 READINGS = 10_000
-LONG = (100_000, 1_000_000)
-PUBLISHED = 4.0
-"""The published regularisation weight lam."""
-LAMS = (1.0, 2.0, 4.0, 6.0, 8.0)
-LAMS_V = (0.001, 0.003, 0.01, 0.03, 0.1)
-WIDTHS = (3, 5, 9, 15, 21)
-STEPS = (10, 30, 100, 300, 1000)
+LONG = (100_000, 1_000_000)  # readings of long recordings
+PUBLISHED = 4.0  # the published regularisation weight lam
+LAMS = (1.0, 2.0, 4.0, 6.0, 8.0)  # weights of the robust filter, readings
+LAMS_V = (0.001, 0.003, 0.01, 0.03, 0.1)  # weights of the filter of squares, V
+WIDTHS = (3, 5, 9, 15, 21)  # of the running median, readings
+STEPS = (10, 30, 100, 300, 1000)  # of the iterative solver
 
-PERIOD = 40
-"""Readings from press to press; half of them pressed."""
-LSB_V = 3.3 / 1023
-"""Step of a 10-bit converter, V."""
+PERIOD = 40  # readings from press to press; half of them pressed
+LSB_V = 3.3 / 1023  # step of a 10-bit converter, V
 
 
 def trials() -> Iterator[BenchTrial]:

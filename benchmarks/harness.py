@@ -25,33 +25,25 @@ from padforge.common.progress import OnProgress
 from padforge.common.validation import InputError
 
 ROUNDS = 3
-MAX_RECHECKS = 5
-"""Further rounds of trials that seem slower than in the earlier run."""
-BUDGET_S = 0.2
-"""Time for repetitions of short work in a round, s."""
-LONG_S = 1.0
-"""Work that takes longer is done once a round, s."""
+MAX_RECHECKS = 5  # further rounds of trials that seem slower than in the earlier run
+BUDGET_S = 0.2  # time for repetitions of short work in a round, s
+LONG_S = 1.0  # work that takes longer is done once a round, s
 MAX_BASELINE_S = 0.1
-"""Baselines that take longer are measured in the first round only, s: their run time is not compared between runs."""
+"""Baselines that take longer are measured in the first round only, since runs are not compared by them, s."""
 
-FORMAT = "padforge-benches/1"
-"""Format of bench.json; runs of earlier versions stay comparable, so keys must not change."""
+FORMAT = "padforge-benches/1"  # format of bench.json; runs of earlier versions stay comparable, so keys must not change
 
 Row = dict[str, Any]
 """A trial: "case", "way", "size", "repetition", "error", "seconds", "paces" and more."""
 TrialKey = tuple[str, str, float, int]
-Documents = Mapping[str, Mapping[str, Any]]
-"""Results in bench.json by the name of the benchmark."""
-KEY = ("case", "way", "size", "repetition")
-"""Columns that identify a trial."""
+Documents = Mapping[str, Mapping[str, Any]]  # results in bench.json by the name of the benchmark
+KEY = ("case", "way", "size", "repetition")  # columns that identify a trial
 
 SLOWER, LESS_ACCURATE = "slower", "less accurate"
-MAX_RATIO = 1.25
-"""Ratio beyond which a trial counts as worse."""
+MAX_RATIO = 1.25  # ratio beyond which a trial counts as worse
 SHORT_S = 1e-3
 """The time of shorter work depends on memory layout: it counts as slower only if another trial of its way does."""
-MIN_ERROR = 1e-15
-"""Smaller errors, of rounding, count as equal."""
+MIN_ERROR = 1e-15  # smaller errors, of rounding, count as equal
 
 
 @dataclass(frozen=True)
@@ -107,7 +99,7 @@ class Worsening:
     what: str  # SLOWER or LESS_ACCURATE
     before: float  # seconds per item, or error in the earlier run
     now: float  # the same in this run
-    ratio: float  # of the two; of times as far as the pace of the machine does not explain it
+    ratio: float  # now over before; for times, corrected for the pace of the machine
 
     def __str__(self) -> str:
         case, way, size, repetition = self.key
@@ -118,7 +110,7 @@ class Worsening:
 def measure_round(
     bench: Bench, rounds: BenchRounds, on_progress: OnProgress, repeat: Callable[[TrialKey], bool]
 ) -> int:
-    """Add a round to the measurements: new trials, and those to `repeat` but slow baselines; return their number."""
+    """Measure new trials, and again those to `repeat` except for slow baselines; return how many were measured."""
     if not rounds.seconds:
         bench.prepare()
     n_measured = 0
@@ -143,7 +135,7 @@ def measure_round(
 
 
 def _measure(work: Callable[[], Any]) -> tuple[Any, float, bool]:
-    """Return the result, the least time in s, and whether it was measured once or twice only."""
+    """Return the result, the minimum time in s, and whether the work was called only once or twice."""
     result, first = _timed_call(work)
     if first > LONG_S:
         return result, first, True
@@ -183,7 +175,7 @@ def run_benches(
     """Measure benchmarks, and write `bench.json` and a figure of each.
 
     Returns:
-        The content of `bench.json`, and what is worse than in the `earlier` run; slower only if so in all rounds.
+        The content of `bench.json`, and what is worse than in the `earlier` run; a slower trial is so in all rounds.
     """
     check_writable(out)
     rounds = {bench.name: BenchRounds() for bench in benches}

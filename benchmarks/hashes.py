@@ -24,8 +24,7 @@ from padforge.design.published.objective import published_terms
 PAD = design.Morphology.random(2, knots=3, seed=5)
 SEARCH = design.SearchSettings(knots=3, starts=1, steps=20)
 CALIBRATION = sense.LocalizerSettings(members=2, hidden=48, layers=2, epochs=20, batch=64)
-Result = tuple[str, str]
-"""The name of a result and its digest."""
+Result = tuple[str, str]  # the name of a result and its digest
 
 
 def digest(*parts: Any) -> str:

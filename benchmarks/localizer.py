@@ -1,7 +1,8 @@
 """Test error of localizers against training time on a simulated recording, for two sets of features of whole presses.
 
-The published network is trained by Levenberg-Marquardt, as published, by L-BFGS and by Adam; the masked network, which
-works with failed fibres as well and, of windows, at any moment, as in a calibration. All train on the same presses.
+The published network is trained by Levenberg-Marquardt, as published, by L-BFGS and by Adam. Masked networks, which
+also serve failed fibres and, with windows as features, any moment, are trained as in a calibration. All are trained on
+the same presses.
 """
 
 from collections.abc import Callable, Iterator, Mapping
@@ -26,19 +27,17 @@ from padforge.sense.localizer.training import PUBLISHED_HIDDEN as HIDDEN
 from padforge.sense.recording.recording import Recording
 from padforge.sense.simulation.simulated_recording import simulate
 
-PRESSES, TEST = 1500, 300
-EPOCHS = (3, 10, 30, 100)
-"""Maximum steps of Levenberg-Marquardt; each uses all presses."""
-ITERATIONS = (30, 100, 300)
-"""Iterations of L-BFGS; each uses all presses."""
-PASSES = (30, 100, 300)
-"""Passes of Adam through batches of BATCH presses."""
-STEPS = (50, 200, 800, 3200)
-"""Steps of the masked networks, of a phase of length 1."""
+PRESSES = 1500  # of the recording
+TEST = 300  # the last ones, which are tested on
+EPOCHS = (3, 10, 30, 100)  # maximum steps of Levenberg-Marquardt; each uses all presses
+ITERATIONS = (30, 100, 300)  # iterations of L-BFGS; each uses all presses
+PASSES = (30, 100, 300)  # passes of Adam through batches of BATCH presses
+STEPS = (50, 200, 800, 3200)  # training steps of a masked network for a phase of relative length 1
 FEATURES = ("published", "windows")
 MARQUARDT = ("published",)
-"""Features for Levenberg-Marquardt: with F times as many, each step takes F^2 to F^3 as long."""
-BATCH, ADAM_RATE = 128, 3e-3
+"""Features that Levenberg-Marquardt is run on: with F times as many, a step takes F^2 to F^3 times as long."""
+BATCH = 128  # presses in a step of Adam
+ADAM_RATE = 3e-3  # learning rate of Adam
 Predict = Callable[[Array], Array]
 
 

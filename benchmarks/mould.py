@@ -24,15 +24,11 @@ from padforge.fabricate.settings import DEFAULTS, MouldSettings
 
 GRID, KNOTS = 4, (1, 5, 20)
 TOLERANCES_MM = (0.05, 0.01, 0.002)
-MAX_FUSED_KNOTS = 5
-"""Beyond as many knots per fibre, Boolean operations of the CAD kernel take minutes."""
+MAX_FUSED_KNOTS = 5  # beyond as many knots per fibre, Boolean operations of the CAD kernel take minutes
 SEED = 0
-EXACT_MM = 1e-5
-"""Flattening tolerance of the exact curves, mm."""
-MARGIN_MM = 1.0
-"""Distance from the walls within which outlines belong to exits and are not compared, mm."""
-POINTS = 33
-"""Points along every curve of a CAD solid at which its deviation is measured."""
+EXACT_MM = 1e-5  # flattening tolerance of the exact curves, mm
+MARGIN_MM = 1.0  # distance from the walls within which outlines belong to exits and are not compared, mm
+POINTS = 33  # points along every curve of a CAD solid at which its deviation is measured
 
 
 def trials() -> Iterator[BenchTrial]:
@@ -42,17 +38,15 @@ def trials() -> Iterator[BenchTrial]:
     or faces of the CAD solid, "file_bytes" the size of its STL or STEP.
     """
     for knots in KNOTS:
-        pad = Morphology.random(GRID, knots, SEED)
+        pad, case = Morphology.random(GRID, knots, SEED), f"N={knots}"
         for tolerance_mm in TOLERANCES_MM:
             plan = partial(_plan, pad, tolerance_mm)
             for way, (work, evaluate) in WAYS.items():
                 if way != "fused CAD" or knots <= MAX_FUSED_KNOTS:
-                    yield BenchTrial(
-                        f"N={knots}", way, 1000 * tolerance_mm, partial(work, plan), partial(evaluate, plan)
-                    )
+                    yield BenchTrial(case, way, 1000 * tolerance_mm, partial(work, plan), partial(evaluate, plan))
         plan = partial(_plan, pad)
         work = partial(_build_curved, plan)
-        yield BenchTrial(f"N={knots}", "curved CAD", 1000 * FIT_TOLERANCES_MM[0], work, partial(_evaluate_solid, plan))
+        yield BenchTrial(case, "curved CAD", 1000 * FIT_TOLERANCES_MM[0], work, partial(_evaluate_solid, plan))
 
 
 def _plan(pad: Morphology, tolerance_mm: float = DEFAULTS.mould.tolerance_mm) -> Plan:
@@ -75,7 +69,7 @@ def _evaluate_mesh(new_plan: Callable[[], Plan], mesh: Any) -> Mapping[str, floa
 
 def _evaluate_solid(new_plan: Callable[[], Plan], solid: Any) -> Mapping[str, float]:
     plan = new_plan()
-    floor_mm = plan.settings.mould.floor_mm  # where ridges meet it in one solid, and where they begin as solids
+    floor_mm = plan.settings.mould.floor_mm  # ridges of one solid end there, those of their own begin below it
     points = np.vstack([*_horizontal_edges(solid, floor_mm), *_horizontal_edges(solid, floor_mm - INTO_FLOOR_MM)])
     with TemporaryDirectory() as folder:
         path = Path(folder) / "mould.step"

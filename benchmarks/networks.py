@@ -24,10 +24,9 @@ from padforge.design.settings import PUBLISHED_CONTACT
 
 HIDDEN = 50
 EPOCHS = 1000
-PATIENCE = 6
-"""Steps without improvement on the validation samples before training stops."""
-FAILED, SETS = 2, 14
-"""Failed fibres, and number of sets of them: the networks that are trained as one batch."""
+PATIENCE = 6  # steps without improvement on the validation samples before training stops
+FAILED = 2  # failed fibres of each network
+SETS = 14  # sets of failed fibres, whose networks are trained as one batch
 MAX_DAMPING = 1e10
 
 

@@ -16,8 +16,7 @@ from padforge.design import Morphology
 from padforge.sense import LocalizerSettings, RigSettings, calibrate, simulate
 
 PRESSES = (300, 3000)
-GRIDS = (2, 3, 4, 5)
-"""Grids of the pads; the smallest has four fibres, of which three may fail."""
+GRIDS = (2, 3, 4, 5)  # grids of the pads; the smallest has four fibres, of which three may fail
 MAX_KNOTS = 6
 SPLITS = ("chronological", "random")
 SETTINGS = LocalizerSettings(members=2, hidden=64, layers=3, epochs=240, max_failures=3)

@@ -18,15 +18,14 @@ KNOTS = (5, 20)
 SEEDS = (0, 1)
 GENERATIONS = (5, 20)
 STEPS = (50, 150)
-SUBSETS = 2
-"""Sets of failed fibres of each size, of up to 56: enough to distinguish the ways in a few minutes."""
+SUBSETS = 2  # evaluated sets of failed fibres of each size, of which there are up to 56: enough to distinguish the ways
 
 
 def trials() -> Iterator[BenchTrial]:
-    """Yield searches by all ways and budgets for the published contact between the fibres.
+    """Yield searches by all ways and budgets, for the published contact on the area between the fibres.
 
-    The genetic search minimises the published objective, the gradient search the expected error, without design rules
-    as the genetic search does, and with them.
+    The genetic search minimises the published objective without design rules; the gradient search minimises the
+    expected error, without and with them.
     """
     unconstrained = RulesSettings(enforce=False)
     ways = [("genetic", n, {"method": "genetic", "generations": n}, unconstrained) for n in GENERATIONS]

@@ -33,15 +33,12 @@ WORLDS = {
     "skirted, 2 mm, 3 dead": ("skirted", 2.0, 3),
 }
 """Sensitivity profile, standard deviation of the lateral offset of fibres in mm, and number of dead channels."""
-PLAN_CONTACT = Contact(radius=0.6)
-"""Contact of the baseline that believes the plan."""
+PLAN_CONTACT = Contact(radius=0.6)  # contact of the baseline that believes the plan
 
-WIDTH = 0.55
-"""Standard deviation of the Gaussian profile, grid units; the others are about as wide."""
-GAIN_V, GAIN_SD = -0.5, 0.2
-"""Response to a relative stretch of 1, V, and standard deviation of its logarithm over channels."""
-OFFSET_SCALE = 1.5
-"""Correlation length of lateral offsets along a fibre, grid units."""
+WIDTH = 0.55  # standard deviation of the Gaussian profile, grid units; the others are about as wide
+GAIN_V = -0.5  # response to a relative stretch of 1, V
+GAIN_SD = 0.2  # standard deviation of the logarithm of gains over channels
+OFFSET_SCALE = 1.5  # correlation length of lateral offsets along a fibre, grid units
 
 Predict = Callable[[Array], Array]
 
@@ -86,9 +83,8 @@ def printed_pad(
     turn, shift = rng.choice([-3.0, 3.0]), rng.uniform(2, 3, 2) * rng.choice([-1, 1], 2)
     wiring, dead = rng.permutation(fibres), set(rng.choice(fibres, n_dead, replace=False).tolist())
     gains_v = GAIN_V * np.exp(GAIN_SD * rng.standard_normal(fibres))
-    as_built_mm = [
-        plan.to_mm(path) for path in _offset_paths(PadPlan.from_morphology(plan), lateral_offset_mm / unit_mm, rng)
-    ]
+    as_built = _offset_paths(PadPlan.from_morphology(plan), lateral_offset_mm / unit_mm, rng)
+    as_built_mm = [plan.to_mm(path) for path in as_built]
     channel_fibres = [None if channel in dead else int(fibre) for channel, fibre in enumerate(wiring)]
     low, high = np.array(sensed_rectangle(plan.layout))
     width, height = (unit_mm * (high - low)).tolist()
@@ -173,7 +169,8 @@ def _evaluate(world: str, fitted: Identification | Predict) -> Mapping[str, floa
     """Return the relative error of responses at test positions, and of an identification its other results."""
     pad = printed(world)
     positions_mm = np.random.default_rng(1).uniform(-0.5, 0.5, (TEST, 2)) * pad.sensed_mm
-    stretch, live = pad.as_built_stretch(positions_mm), [c for c in pad.channels if c.fibre is not None]
+    stretch = pad.as_built_stretch(positions_mm)
+    live = [channel for channel in pad.channels if channel.fibre is not None]
     true = np.column_stack([channel.gain_v * stretch[:, channel.fibre] for channel in live])
     if not isinstance(fitted, Identification):
         return {"error": _relative_error(fitted(positions_mm)[:, [channel.channel for channel in live]], true)}

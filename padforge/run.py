@@ -190,7 +190,7 @@ def check_run(run: Run) -> None:
     if run.time_budget is not None and run.time_budget <= RESERVE_S:
         reason = f"more than {RESERVE_S:g}, which are reserved for what comes after the training"
         raise InputError(f"--time-budget: got {run.time_budget:g} s, expected {reason}")
-    split_presses(len(plan), localizer.split, localizer.test_share, np.random.default_rng(0))
+    split_presses(np.arange(len(plan)), localizer.split, localizer.test_share, np.random.default_rng(0))
     check_replaceable(run.out / "recording")
     check_design(run.spec, run.out, {"seed": run.seed}, _regenerated_files(), run.force)
     path = run.out / "localizer.json"

@@ -1,4 +1,4 @@
-"""Arrays that a recording consists of: their types, limits (no pad or clock goes beyond), and checks from outside."""
+"""Arrays that a recording consists of: their types, their limits, which no pad or clock exceeds, and checks."""
 
 from typing import Any
 
@@ -13,12 +13,15 @@ Indices = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
 MAX_FIBRES = 512
-MAX_VOLTS, MAX_MM, MAX_S, MAX_N = 1e3, 1e5, 1e10, 1e5
-"""Largest absolute reading, position, time and force (seconds since 1970 are 2e9)."""
-MIN_RATE_HZ, MAX_RATE_HZ = 1e-3, 1e6
+MAX_VOLTS = 1e3  # largest absolute reading, V
+MAX_MM = 1e5  # largest absolute position, mm
+MAX_S = 1e10  # largest absolute time, s; seconds since 1970 are 2e9
+MAX_N = 1e5  # largest absolute force, N
+MIN_RATE_HZ = 1e-3
+MAX_RATE_HZ = 1e6
 MAX_BYTES = 2**33  # size of the largest file of a recording
 MAX_INDEX = 2**53  # largest index that float64 holds exactly
-MIN_SCALE_V = 1e-9  # least standard deviation that an input is divided by: what varies less is constant
+MIN_SCALE_V = 1e-9  # minimum standard deviation, V, by which an input is divided; an input that varies less is constant
 
 
 def masked_mean(values: Array, mask: Mask) -> Array:
@@ -60,7 +63,7 @@ def check_magnitude(name: str, values: Array, limit: float, unit: str, missing: 
         row = int(np.argmin(valid.all(axis=1)))
         kind = "infinity" if missing else "NaN or infinity"
         raise InputError(f"{name} hold {kind} (first in row {row}), expected finite numbers")
-    beyond = (values > limit) | (values < -limit)  # without a copy of what may have gigabytes
+    beyond = (values > limit) | (values < -limit)  # no abs(), which would copy gigabytes
     if beyond.any():
         row = int(np.argmax(beyond.any(axis=1)))
         raise InputError(

@@ -17,7 +17,7 @@ from padforge.sense.live.pipeline import Live
 from padforge.sense.localizer.calibration import MAX_TIME_BUDGET_S, CalibrationData, calibrate, fit_model, fit_recording
 from padforge.sense.localizer.evaluation import Evaluation, distances, evaluate
 from padforge.sense.localizer.features import PressFeatures, compute_features, features_without_moments
-from padforge.sense.localizer.model import Localization, LocalizerModel
+from padforge.sense.localizer.model import Localization, LocalizerModel, fitted_model
 from padforge.sense.localizer.moments import MODULATED
 from padforge.sense.localizer.scaler import FeatureScaler
 from padforge.sense.recording.frames import framed
@@ -60,7 +60,7 @@ class Localizer(_Estimator):
         calibration_: the `Evaluation` on the test presses, after `fit` to a recording.
 
     Raises:
-        InputError: an option that `LocalizerSettings` has not.
+        InputError: `LocalizerSettings` has no such option.
     """
 
     _names = ("max_failures", "random_state", *OPTIONS)
@@ -108,13 +108,13 @@ class Localizer(_Estimator):
         time_budget: float | None = None,
         on_progress: OnProgress = ignore_progress,
     ) -> "Localizer":
-        """Train on a recording, a share of whose presses is held back for a test; or without a test.
+        """Train on a recording, and test on a share of its presses; or train on all presses given, without a test.
 
         Args:
-            X: a recording; or, without a test, presses of one, `recording[presses]`, or (Q, C, F) features of presses,
-                V, NaN where a fibre gave none.
+            X: a recording, which is also tested on; or presses of one, `recording[presses]`; or (Q, C, F) features of
+                presses, V, NaN where a fibre gave none.
             y: (Q, 2) positions, mm, with arrays; None for those of the recording.
-            time_budget: seconds to train for, with as many members as that is good for.
+            time_budget: seconds to train for, which decide on the number of members.
             on_progress: as in `calibrate`.
 
         Raises:
@@ -173,8 +173,7 @@ class Localizer(_Estimator):
 
         Args:
             X: as `predict`.
-            y: (Q, 2) true positions, mm; None for those of a recording, of which presses of unknown position are left
-                out.
+            y: (Q, 2) true positions, mm; None for those of a recording. Presses of unknown position are left out.
         """
         predicted = self.predict(X).positions_mm
         true = X.presses_mm if isinstance(X, Recording | PressSelection) and y is None else _array_positions(y)
@@ -184,7 +183,7 @@ class Localizer(_Estimator):
         """Evaluate for every set of up to `max_failures` failed fibres.
 
         Args:
-            recording: of the pad; of the recording of the training, only the presses that were held back count.
+            recording: of the pad; of the training recording, only the presses that were held back are used.
             max_failures: most fibres that fail at once; None for as many as in training.
 
         Raises:
@@ -198,7 +197,7 @@ class Localizer(_Estimator):
         """Begin to follow the pad as it is read: `live.update(time_s, volts)` returns what has happened.
 
         Args:
-            rate_hz: readings per second, at least as many as in the calibration or 13.3; more are averaged.
+            rate_hz: readings per second: at least 3/4 of the rate of the calibration, or of 13.3 if that is lower.
             fibres: as of `Live`.
             health: as of `Live`.
 
@@ -211,7 +210,7 @@ class Localizer(_Estimator):
         """Write `localizer.json` and `localizer.safetensors`.
 
         Args:
-            folder: where to; its localizer is replaced.
+            folder: destination; its localizer is replaced.
 
         Raises:
             InputError: not fitted, or the folder cannot be written.
@@ -235,16 +234,14 @@ class Localizer(_Estimator):
 
     @property
     def _fitted(self) -> LocalizerModel:
-        if not hasattr(self, "model_"):
-            raise InputError("the localizer is not fitted, expected fit or load before")
-        return self.model_
+        return fitted_model(self)
 
 
 class PressWindows(_Estimator):
     """Transformer from presses of a recording to what the localizer's networks see of them.
 
-    That is, for each fibre, its windows without the effect of its history and the modulations of its sensitivity,
-    scaled to about 1; 0 for a fibre that gave too few readings. In a pipeline a regressor follows it::
+    For each fibre these are its windows, without the effect of its history, and the modulations of its sensitivity, all
+    scaled to about 1; they are 0 for a fibre that gave too few readings. In a pipeline a regressor follows it::
 
         make_pipeline(PressWindows(), KNeighborsRegressor()).fit(recording, recording.presses_mm)
     """

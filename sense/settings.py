@@ -60,45 +60,28 @@ class RigSettings(Settings):
     drift_mv: float = Field(default=20.0, ge=0, le=1000, description="simulated pad: std of the drifting baseline, mV")
     creep: float = Field(default=0.3, ge=0, lt=1, description="simulated pad: share of a response lost by creep")
     hysteresis: float = Field(
-        default=0.65,
-        ge=0,
-        lt=1,
-        description="simulated pad: share of the response that remains, inverted, after it",
+        default=0.65, ge=0, lt=1, description="simulated pad: residue of a press as a share of its response, inverted"
     )
-    hysteresis_s: float = Field(default=30.0, ge=0.01, le=1e4, description="simulated pad: its time constant, s")
-    onset_width: float = Field(
-        default=0.75, ge=0.1, le=2, description="simulated pad: width of a press at its onset over that of the held one"
-    )
-    after_width: float = Field(
-        default=0.7, ge=0.1, le=2, description="simulated pad: width of what remains of a press over that of the press"
-    )
+    hysteresis_s: float = Field(default=30.0, ge=0.01, le=1e4, description="simulated pad: residue's time constant, s")
+    onset_width: float = Field(default=0.75, ge=0.1, le=2, description="simulated pad: onset width / press width")
+    after_width: float = Field(default=0.7, ge=0.1, le=2, description="simulated pad: residue width / press width")
     sensitivity: float = Field(
         default=0.6, ge=0, le=2, description="simulated pad: std of the logarithm of the sensitivity along a fibre"
     )
     own_sensitivity: float = Field(
-        default=1.0, ge=0, le=2, description="simulated pad: the same of what differs in onset, creep and what remains"
+        default=1.0, ge=0, le=2, description="simulated pad: std of what onset, creep and residue add to that logarithm"
     )
-    path_mm: float = Field(default=1.0, ge=0, le=10, description="simulated pad: std of the paths off their plan, mm")
-    memory: float = Field(
-        default=0.8, ge=0, le=1, description="simulated pad: share of what remains of a press that one there takes away"
-    )
-    memory_mm: float = Field(default=10.0, gt=0, le=1e3, description="simulated pad: distance by which that falls, mm")
-    gain_wander: float = Field(
-        default=0.06, ge=0, le=1, description="simulated pad: std of the gains that wander over minutes, share"
-    )
-    floor_mv: float = Field(
-        default=3.0, ge=0, le=1000, description="simulated pad: scatter of a response that does not grow with it, mV"
-    )
-    touch_s: float = Field(
-        default=0.025, ge=0, le=1, description="simulated pad: std over the pad of when it is touched, s"
-    )
-    scatter: float = Field(
-        default=0.17, ge=0, le=1, description="simulated pad: scatter of a response from press to press, share of it"
-    )
+    path_mm: float = Field(default=1.0, ge=0, le=10, description="simulated pad: std of paths about their plan, mm")
+    memory: float = Field(default=0.8, ge=0, le=1, description="simulated pad: share of residues that a press removes")
+    memory_mm: float = Field(default=10.0, gt=0, le=1e3, description="simulated pad: distance over which it falls, mm")
+    gain_wander: float = Field(default=0.06, ge=0, le=1, description="simulated pad: relative std of gains in minutes")
+    floor_mv: float = Field(default=3.0, ge=0, le=1000, description="simulated pad: scatter at zero response, mV")
+    touch_s: float = Field(default=0.025, ge=0, le=1, description="simulated pad: std over the pad of touch times, s")
+    scatter: float = Field(default=0.17, ge=0, le=1, description="simulated pad: scatter as a share of the response")
     scatter_common: float = Field(
-        default=0.7, ge=0, le=1, description="simulated pad: share of that variance common to all fibres"
+        default=0.7, ge=0, le=1, description="simulated pad: share of the variance of that scatter common to all fibres"
     )
-    host: str = Field(default="192.168.0.100", pattern=r"^[A-Za-z0-9._:-]{1,253}$", description="of the UR controller")
+    host: str = Field(default="192.168.0.100", pattern=r"^[A-Za-z0-9._:-]{1,253}$", description="UR controller address")
     board: str = Field(
         default="due",
         min_length=1,
@@ -112,15 +95,13 @@ class RigSettings(Settings):
     printer_port: Annotated[Annotated[str, Field(min_length=1, max_length=4096)] | None, *Unknown] = Field(
         default=None, description='serial port of the 3D printer, or "unknown"'
     )
-    printer_baud: int = Field(
-        default=115_200, ge=9600, le=2_000_000, description="speed of the 3D printer's port, baud"
-    )
+    printer_baud: int = Field(default=115_200, ge=9600, le=2_000_000, description="speed of the printer's port, baud")
     board_rate_hz: float = Field(default=1000.0, ge=1, le=10_000, description="samples a second, averaged to rate_hz")
     count_v: float = Field(
         default=1.0,
         gt=0,
         le=1000,
-        description='board "csv": volts of 1 in its lines, such as 0.00489 for 5 V of 10 bits',
+        description='board "csv": volts of a count in its lines, such as 0.00489 for 5 V and 10 bits',
     )
     channels: Annotated[tuple[Input, ...], BeforeValidator(as_tuple)] = Field(
         default=(), max_length=512, description="input of the board that each fibre is on, from 0; [] in order"
@@ -134,7 +115,7 @@ class RigSettings(Settings):
     pad_mm: Annotated[tuple[Millimetres, Millimetres] | None, BeforeValidator(as_tuple), *Unknown] = Field(
         default=None, description='the pad\'s centre [x, y] in the base frame, mm, or "unknown"'
     )
-    pad_angle_deg: float = Field(default=0.0, ge=-360, le=360, description="from the base's y axis to the pad's")
+    pad_angle_deg: float = Field(default=0.0, ge=-360, le=360, description="angle from the base's y axis to the pad's")
     mirrored: Annotated[bool | None, *Unknown] = Field(
         default=None,
         description='tracks up, so that x runs the other way: true, false, or "unknown": a holder\'s, or false',
@@ -145,7 +126,7 @@ class RigSettings(Settings):
     tcp_mm: Annotated[tuple[Millimetres, Millimetres, Millimetres] | None, BeforeValidator(as_tuple), *Unknown] = Field(
         default=None, description='the tip [x, y, z] from the flange, as set on the controller, or "unknown"'
     )
-    max_depth_mm: float = Field(default=6.0, gt=0, le=50, description="no press is deeper, mm")
+    max_depth_mm: float = Field(default=6.0, gt=0, le=50, description="maximum depth of a press, mm")
     clearance_mm: float = Field(default=10.0, ge=1, le=500, description="height above the surface between presses, mm")
     travel_mm_s: float = Field(default=100.0, gt=0, le=500, description="speed between presses, mm/s")
     press_mm_s: float = Field(default=40.0, gt=0, le=250, description="speed of pressing, mm/s")
@@ -181,7 +162,7 @@ class RigSettings(Settings):
             contact: contact that the pad is designed for.
 
         Raises:
-            InputError: no rig presses as deep.
+            InputError: a depth that no rig reaches.
         """
         if self.depth_mm is not None:
             return self
@@ -245,9 +226,8 @@ IDEAL_RIG = RigSettings(
     scatter=0.18,
     scatter_common=0.36,
 )
-"""A pad laid as planned, whose parts of a press respond alike."""
-SIMULATED = frozenset(IDEAL_RIG.model_fields_set | {"memory_mm"})
-"""Names of the settings of the simulated pad."""
+"""A pad whose fibres lie as planned, and respond to all parts of a press alike."""
+SIMULATED = frozenset(IDEAL_RIG.model_fields_set | {"memory_mm"})  # names of the settings of the simulated pad
 IDEAL = {"rig": IDEAL_RIG}
 
 
@@ -258,9 +238,7 @@ class LocalizerSettings(Settings):
         default="ensemble",
         description="one ensemble for every moment and loss of fibres, or published: 50 tanh, Levenberg-Marquardt",
     )
-    split: Split = Field(
-        default="random", description="presses held back for the test: drawn at random, or the last ones"
-    )
+    split: Split = Field(default="random", description="presses of the test: drawn at random, or the last ones")
     test_share: float = Field(default=0.15, gt=0, lt=1, description="share of the presses held back for the test")
     max_failures: int = Field(default=3, ge=0, le=8, description="train and test for up to this many failed fibres")
     members: int = Field(
@@ -278,7 +256,5 @@ class LocalizerSettings(Settings):
         description="passes through the presses, up to 9900 steps; in `padforge run` the default is 90",
     )
     batch: int = Field(default=256, ge=1, le=65_536, description="presses in a training step")
-    learning_rate: float = Field(
-        default=5e-3, gt=0, le=1, description="greatest learning rate of the one-cycle schedule"
-    )
+    learning_rate: float = Field(default=5e-3, gt=0, le=1, description="maximum rate of the one-cycle schedule")
     seed: int = Field(default=0, ge=0, le=2**32 - 1, description="seed of the split and of the training")

@@ -370,14 +370,14 @@ def search_for_twin(
 ) -> SearchResult:
     """Search for the next pad of a printed one, for its measured contact and scatter.
 
-    Three searches run: for the default contact, which needs no measurement; for the measured contact from random
-    starts; and for the measured contact from the default pad. Among their pads and straight fibres, `choose` takes
-    the best under the measured contact, but none that errs over 3 % more than the default pad or straight fibres, if it
-    can; its `candidate` is "twin", "from default", "default" or "straight fibres".
+    Three searches run: "default" for the default contact, which needs no measurement; "twin" for the measured contact;
+    and "from default" for the measured contact, which starts from the default pad. Among their pads and "straight
+    fibres" `choose` takes the best under the measured contact; its name is the `candidate` of the result.
 
-    `settings` are those of the searches for the measured contact, the first of which starts from `origin` if that is
-    stated. The options `run` are those of all three searches together.
+    `settings` are those of the searches for the measured contact; "twin" starts from `origin`, at random if that is
+    None. The options `run` are those of all three searches together.
     """
+    # 1. The searches; an interrupted one is the last
     run = run or SearchOptions()
     default = search(pad, None, default_settings, rules, run=_part_options(run, "default"))
     if default.stopped == "interrupted":
@@ -388,11 +388,12 @@ def search_for_twin(
     if twin.stopped != "interrupted":
         options = _part_options(run, "from default")
         results["from default"] = search(pad, contact, one_start, rules, origin=default.morphology, run=options)
+    # 2. The best of the pads that break no rule
     problem = build_problem(pad, contact, settings, rules)
-    pads = {"default": default.morphology, "straight fibres": Morphology.straight(pad.layout)}
-    pads |= {name: result.morphology for name, result in results.items()}
-    buildable = {name: each for name, each in pads.items() if not problem.violations(each)}
-    pads = buildable or {"twin": twin.morphology}
+    candidates = {"default": default.morphology, "straight fibres": Morphology.straight(pad.layout)}
+    candidates |= {name: result.morphology for name, result in results.items()}
+    pads = {name: each for name, each in candidates.items() if not problem.violations(each)}
+    pads = pads or {"twin": twin.morphology}
     with profiling.stage("judge"):
         errors = errors_by_contact(pads, {"": contact}, pad, settings)
     name = choose({name: np.array(values) for (_, name), values in errors.items()})
@@ -406,10 +407,10 @@ def search_for_twin(
 
 
 def choose(errors: Mapping[str, Array]) -> str:
-    """Return the pad of least mean log error among those within 3 % of the better reference at each number of failures.
+    """Return the name of the pad of least mean log error among those that err at most 3 % more than the references.
 
-    If there is none, the limit is the least that a pad keeps. Errors are with 0, 1, ... fibres failed, by the name of
-    the pad; the references are "default" and "straight fibres".
+    Errors (K,) are with 0, 1, ... failed fibres, by the name of the pad. At each of these numbers, the reference is the
+    better one of "default" and "straight fibres". If no pad keeps the 3 %, the lowest limit that one keeps replaces it.
     """
     references = [errors[name] for name in ("default", "straight fibres") if name in errors]
     ratios = {name: error / np.min(references or list(errors.values()), axis=0) for name, error in errors.items()}

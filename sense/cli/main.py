@@ -51,7 +51,7 @@ def import_(
     \b
     Without --columns a CSV has the columns time_s, fibre_0_v, fibre_1_v, ..., x_mm, y_mm, and optionally
     depth_mm, reached_mm, force_n; positions are filled while the probe is down and empty elsewhere. An .h5
-    or a bag is one that export wrote, a .mat one of the published study.
+    or a bag must be one that export wrote, a .mat one of the published study.
 
     \b
     --columns lists columns, datasets, variables or topics, separated by commas; * stands for any
@@ -131,7 +131,7 @@ def export(recording: Path, file: Path, kind: str | None, model: Path | None) ->
       /pad/place      PoseWithCovarianceStamped, commanded position; z is minus the depth
       /pad/reached, /pad/force
                       PointStamped, measured depth, and WrenchStamped, if they are known
-      /pad/recording  String, latched: JSON of what messages round, for an exact import
+      /pad/recording  String, latched: JSON of values that messages round, for an exact import
       /pad/touches, /pad/health
                       with --model: PoseWithCovarianceStamped at the end of a press, and DiagnosticArray
       /arm/pose       PoseStamped, of a recording made by an arm
@@ -140,11 +140,12 @@ def export(recording: Path, file: Path, kind: str | None, model: Path | None) ->
     from padforge.sense.formats.import_export import arm_states, export_file
 
     opened = read_recording(recording)
-    localization = faults = None
-    dead = ()
+    localization, faults, dead = None, None, ()
     if model:
-        localization, faults, _, detector, _ = predict_despite_faults(model, opened)
-        faults, dead = (faults, detector.model_.dead) if detector else (None, ())
+        prediction = predict_despite_faults(model, opened)
+        localization = prediction.localization
+        if prediction.detector:  # otherwise nothing is known of the fibres
+            faults, dead = prediction.faults, prediction.detector.model_.dead
     export_file(opened, file, kind or "", localization, faults, dead, arm_states(recording))
     echo(f"{recording} -> {file}")
 

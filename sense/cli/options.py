@@ -78,7 +78,8 @@ def pressed_line(recording: "Recording") -> str:
     unknown, area = int((~recording.has_position).sum()), area_mm(recording)
     over = "" if area is None else f" over {area[0]:.4g} x {area[1]:.4g} mm"
     missing = int(np.isnan(recording.readings).sum())
-    rate = f"{recording.rate_hz:.1f}" if recording.rate_hz >= 1 else f"{recording.rate_hz:.2g}"  # a wrong unit of time
+    # a rate below 1 Hz comes from a wrong unit of time
+    rate = f"{recording.rate_hz:.1f}" if recording.rate_hz >= 1 else f"{recording.rate_hz:.2g}"
     return (
         f"{len(recording.presses_mm)} presses{over}{f' ({unknown} of unknown position)' * (unknown > 0)}, "
         f"{len(recording.readings)} readings of {recording.fibres} fibres"
@@ -98,7 +99,7 @@ class Prediction(NamedTuple):
     faults: "list[FibreFault]"
     shifts: "list[DomainShift]"
     detector: "FaultDetector | None"
-    is_other_pad: bool  # then no fibre is reported as faulty or masked
+    is_other_pad: bool  # then no fibre is reported or masked as faulty
 
 
 def predict_despite_faults(

@@ -28,7 +28,7 @@ def check_rig(name: str, simulated: bool = True) -> None:
     """Raise InputError unless `--rig` is the name of a rig; "simulated" is allowed if `simulated`."""
     from importlib.metadata import entry_points
 
-    names = [*["simulated"] * simulated, "hand", *sorted(entry_points(group="padforge.arms").names)]
+    names = [*(["simulated"] if simulated else []), "hand", *sorted(entry_points(group="padforge.arms").names)]
     if name not in names:
         raise InputError(f"--rig is {name!r}, allowed are {', '.join(dict.fromkeys(names))}")
 
@@ -100,7 +100,7 @@ def record(
     simulated = rig == "simulated"
     if twin and not simulated:
         raise InputError("--twin is of the simulated pad, allowed with --rig simulated")
-    like = Twin.load(twin) if twin else None
+    twin_model = Twin.load(twin) if twin else None
     if not (simulated or morphology):
         morphology = target.parent / "morphology.json"  # a real pad has no default
         if not morphology.is_file():
@@ -118,12 +118,12 @@ def record(
         if plan == "adaptive":
             raise InputError("--plan is adaptive, which needs a real rig")
         deepest = deepest_contact(contact, planned_depths_mm(options))
-        if like is None and (notice := describe_large_strain(deepest)):
+        if twin_model is None and (notice := describe_large_strain(deepest)):
             _warn(notice)
-        pressed = like if like and not morphology else pad
-        if like and morphology and (ignored := like.ignored_effects()):
+        pressed = twin_model if twin_model and not morphology else pad
+        if twin_model and morphology and (ignored := twin_model.ignored_effects()):
             _warn(f"{twin}: {ignored}")
-        recording = operation.record_simulated(settings, pressed, target, overrides, inputs, like)
+        recording = operation.record_simulated(settings, pressed, target, overrides, inputs, twin_model)
     else:
         check_platform()
         inputs += [] if options.plan_file is None else [options.plan_file]
@@ -196,10 +196,9 @@ def _record_by_hand(config: "RigConfig", resume: bool) -> "Recording":
                 page.show(latest | {"ended": str(error or "") or "ended"})
 
         def show(view: dict[str, Any]) -> None:
-            if draw is None:
-                if view["message"] != latest.get("message", ""):
-                    common.echo(view["message"])
-            elif view["phase"] == "lift" != latest.get("phase"):
+            if draw is None and view["message"] != latest.get("message", ""):
+                common.echo(view["message"])
+            if draw is not None and view["phase"] == "lift" and latest.get("phase") != "lift":
                 click.echo("\a", nl=False)  # a sound, since the person looks at the pad
             latest.update(pad | view)
             page.show(dict(latest))
@@ -229,8 +228,9 @@ def doctor(rig: str, morphology: Path | None, spec: Path | None, as_json: bool) 
     \b
     padforge sense doctor --rig ur5
 
-    Ports, versions, rates, latency, and every channel's rest and noise; channels count from 1, as fibres do, inputs as
-    they are printed on the board. Without --morphology the inputs that [rig] channels names, or all, are examined.
+    Ports, versions, rates, latency, and the level at rest and the noise of every channel. Channels count from 1, as
+    fibres do, inputs as they are printed on the board. Without --morphology, the inputs that [rig] channels names, or
+    all, are examined.
     """
     from dataclasses import asdict
 

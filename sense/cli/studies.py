@@ -193,7 +193,7 @@ def scaling(names: tuple[str, ...], *, seed: int, grids: str | None, spec: Path 
 @_command("multicontact")
 @common.spec_option
 def multicontact(names: tuple[str, ...], *, seed: int, spec: Path | None) -> "Study":
-    """Number and positions of contacts at once (figure 9). Of two contacts, either comes first.
+    """Number and positions of contacts at once (figure 9). The order of two contacts does not count.
 
     The contact is the paper's, or what [contact] states; under a layer responses scatter by [search].
 
@@ -224,7 +224,7 @@ def drift(names: tuple[str, ...], *, seed: int) -> "Study":
 
 
 def _add_study(name: str, module: str, text: str, example: str) -> None:
-    """Add the command of a study without further options; `example` has the pads for its help."""
+    """Add the command of a study without further options; its help shows it with the pads `example`."""
 
     def make(names: tuple[str, ...], *, seed: int, spec: Path | None = None) -> "Study":
         from padforge.design.settings import read_contact
@@ -237,10 +237,10 @@ def _add_study(name: str, module: str, text: str, example: str) -> None:
     _command(name)(common.spec_option(make))
 
 
-_sensitivity = """Other tools and depths, trained with or not (figure 6).
+_sensitivity = """Tools and depths other than in training (figure 6).
 
-They have half to one and a half times the radius and the depth that [contact] states. If [contact] is a shape, as in
-the preset `published`, the objects are those of the paper, of sizes K and shapes D in grid units."""
+Radius and depth are 0.5, 1 and 1.5 times those that [contact] states. If [contact] is a shape, as in the preset
+`published`, the objects are the polygons of the paper, of radius K in grid units and with D sides."""
 _force = "Depth and force of a press, from the signals. A tool presses the layer of [contact]."
 _shape = "Which object was pressed, from the signals. Objects are a dome, a ball, a finger and a flat end."
 _strokes = "Follow a finger that slides over simulated pads. The localizers are trained on single presses of them."

@@ -151,8 +151,9 @@ class _LocalizerModule(nn.Module):
         self.features = _FeatureModule(model)
         self.networks = nn.ModuleDict({name: _NetworkModule(each) for name, each in model.networks.items()})
         self.bayes = _BayesModule(*model.corrected) if model.bayes else None
-        for name, array in zip(("now_factor", "now_offset"), scaler.latest_window_map(moments.N_TIMED), strict=True):
-            self.register_buffer(name, torch.from_numpy(array))
+        latest_factor, latest_offset = scaler.latest_window_map(moments.N_TIMED)
+        self.register_buffer("latest_factor", torch.from_numpy(latest_factor))
+        self.register_buffer("latest_offset", torch.from_numpy(latest_offset))
         self.scale_mm, self.measures = scaler.scale_mm, scaler.measures
         units = [self.scale_mm] * 3 + [measure.scale for measure in self.measures]
         self.register_buffer("interval_factors", torch.from_numpy(model.interval_factors * units).float())
@@ -212,16 +213,15 @@ class _LocalizerModule(nn.Module):
             return combine_members(network(x), torch)
 
         targets, std = predict_from(scaled, moments.N_PRESS_WINDOWS)
-        now = [
-            scaled[:, :, moments.EARLY_WINDOWS - 1 - k] * self.now_factor[:, k, moments.EARLY_WINDOWS - 1 - k]
-            + self.now_offset[:, k, moments.EARLY_WINDOWS - 1 - k]
-            for k in range(len(moments.LATEST_WINDOWS))
-        ]
-        modulation = scaled[:, :, n_timed + len(now) :]
-        soon, soon_std = predict_from(
-            torch.cat([scaled[:, :, :n_timed], torch.stack(now, dim=2), modulation], dim=2), moments.EARLY_WINDOWS
-        )
-        distance, expected = (torch.linalg.vector_norm(each[:, :2], dim=1) for each in (targets - soon, soon_std))
+        latest = []
+        for k in range(len(moments.LATEST_WINDOWS)):
+            window = moments.EARLY_WINDOWS - 1 - k
+            latest.append(scaled[:, :, window] * self.latest_factor[:, k, window] + self.latest_offset[:, k, window])
+        modulation = scaled[:, :, n_timed + len(latest) :]
+        early = torch.cat([scaled[:, :, :n_timed], torch.stack(latest, dim=2), modulation], dim=2)
+        early_targets, early_std = predict_from(early, moments.EARLY_WINDOWS)
+        distance = torch.linalg.vector_norm((targets - early_targets)[:, :2], dim=1)
+        expected = torch.linalg.vector_norm(early_std[:, :2], dim=1)
         return targets, std, distance / torch.clamp(expected, min=1e-9)
 
 

@@ -28,8 +28,7 @@ from padforge.sense.recording.recording import (
 )
 from padforge.sense.recording.tables import UNKNOWN, name_lines
 
-Arrays = Sequence[tuple[ColumnEntry, NDArray[Any]]]
-"""Arrays of a file, each with its entry of the mapping."""
+Arrays = Sequence[tuple[ColumnEntry, NDArray[Any]]]  # arrays of a file, each with its entry of the mapping
 MEASURES = {"depth": "depths_mm", "reached": "reached_mm", "force": "forces_n"}
 """Quantities with one value a press, and their attributes of a `Recording`."""
 MAX_GAP = 3  # maximum readings without a position that are bridged within a press
@@ -213,20 +212,10 @@ def _repair_times(
         if n_untimed > max(3, 0.05 * len(times_s)):
             raise InputError(f"time is missing in {n_untimed} of {int(is_reading.sum())} readings, expected it in each")
     times = times_s[rows]
-    steps = np.diff(times)
-    if not (steps <= 0).any():
+    if not (np.diff(times) <= 0).any():
         return rows, times
-    # 1. Add the wraps of clocks.
-    usual = float(np.median(steps[steps > 0])) if (steps > 0).any() else 0.0
-    offsets, n_wraps = np.zeros(len(times)), 0
-    for row in np.flatnonzero(steps < 0):
-        for wrap in WRAPS_S:
-            # A clock wraps just below its period, which spans many readings; otherwise two lines were swapped.
-            if 0 < steps[row] + wrap <= 5 * usual < 0.1 * wrap and 0 <= times[row] < wrap:
-                offsets[row + 1 :] += wrap
-                n_wraps += 1
-                break
-    times = times + offsets
+    # 1. Add the periods of a clock that wraps.
+    times, n_wraps = _unwrap(times)
     if n_wraps:
         notes.append(f"the clock began anew {'once' if n_wraps == 1 else f'{n_wraps} times'}; times go on")
     # 2. Leave out single times that go back, so that the longest sequence in order remains.
@@ -241,18 +230,40 @@ def _repair_times(
         notes.append(f"{name_rows(rows[late])} left out: times go back")
         times, rows = times[in_order], rows[in_order]
     # 3. Spread equal times.
-    starts = np.flatnonzero(np.append(True, np.diff(times) > 0))
-    if len(starts) < len(times):
-        if len(starts) == 1:
+    if n_equal := int((np.diff(times) == 0).sum()):
+        if n_equal == len(times) - 1:
             raise InputError(f"times are all {times[0]:g} s, expected every reading later than the one before")
-        notes.append(f"{len(times) - len(starts)} times equal the one before; they are spread between their neighbours")
-        # A shared time is that of the middle reading; at both ends readings are extrapolated at the mean rate.
-        middles = (starts + np.append(starts[1:], len(times)) - 1) / 2
-        interval = (times[-1] - times[0]) / (middles[-1] - middles[0])
-        ends_s = times[0] - interval * middles[0], times[-1] + interval * (len(times) - 1 - middles[-1])
-        knots = np.concatenate([[-1e-9], middles, [len(times) - 1 + 1e-9]])
-        times = np.interp(np.arange(len(times)), knots, np.concatenate([ends_s[:1], times[starts], ends_s[1:]]))
+        notes.append(f"{n_equal} times equal the one before; they are spread between their neighbours")
+        times = _spread_equal(times)
     return rows, times
+
+
+def _unwrap(times_s: Array) -> tuple[Array, int]:
+    """Add the periods of a clock that wraps to times (n,), s; return these, and the number of wraps."""
+    steps, offsets, n_wraps = np.diff(times_s), np.zeros(len(times_s)), 0
+    usual = float(np.median(steps[steps > 0])) if (steps > 0).any() else 0.0
+    for row in np.flatnonzero(steps < 0):
+        for wrap in WRAPS_S:
+            # A clock wraps just below its period, which spans many readings; otherwise two lines were swapped.
+            if 0 < steps[row] + wrap <= 5 * usual < 0.1 * wrap and 0 <= times_s[row] < wrap:
+                offsets[row + 1 :] += wrap
+                n_wraps += 1
+                break
+    return times_s + offsets, n_wraps
+
+
+def _spread_equal(times_s: Array) -> Array:
+    """Spread equal times among times (n,) that never descend, s.
+
+    The middle one of the readings of a shared time keeps it, the others are interpolated between these; at both ends
+    they are extrapolated at the mean rate.
+    """
+    starts = np.flatnonzero(np.append(True, np.diff(times_s) > 0))
+    middles, last = (starts + np.append(starts[1:], len(times_s)) - 1) / 2, len(times_s) - 1
+    interval = (times_s[-1] - times_s[0]) / (middles[-1] - middles[0])
+    first_s, last_s = times_s[0] - interval * middles[0], times_s[-1] + interval * (last - middles[-1])
+    knots = np.concatenate([[-1e-9], middles, [last + 1e-9]])
+    return np.interp(np.arange(len(times_s)), knots, np.concatenate([[first_s], times_s[starts], [last_s]]))
 
 
 def _longest_ascent(values: Array) -> Indices:

@@ -33,8 +33,6 @@ _READERS: dict[str, Callable[..., Recording]] = {
     **dict.fromkeys(SUFFIXES, import_bag),
 }
 _WRITERS: dict[str, Callable[[Recording, Path], None]] = {".csv": export_csv, ".h5": export_hdf5}
-FORMATS = ("lerobot",)
-"""Formats that are folders, without an extension."""
 
 
 def open_recording(path: str | Path) -> Recording:
@@ -81,12 +79,13 @@ def find_reader(path: Path) -> Callable[..., Recording]:
     """Return the function that imports a path, by its extension; InputError if there is none."""
     if _is_bag_folder(path):
         return import_bag
-    if path.suffix.lower() not in _READERS:
-        hint = f"; {_ADVICE[path.suffix.lower()]}" if path.suffix.lower() in _ADVICE else ""
+    extension = path.suffix.lower()
+    if extension not in _READERS:
+        hint = f"; {_ADVICE[extension]}" if extension in _ADVICE else ""
         raise InputError(
             f"{path}: ends in {path.suffix!r}, allowed are {', '.join(_READERS)}, or a rosbag2 folder{hint}"
         )
-    return _READERS[path.suffix.lower()]
+    return _READERS[extension]
 
 
 def describe_file(path: Path, encoding: str = "") -> list[str]:
@@ -112,10 +111,10 @@ def export_file(
     dead: Sequence[int] = (),
     states: Array | None = None,
 ) -> None:
-    """Write a recording as .csv, .h5 or .mcap, by the extension, or as a folder of a kind of `FORMATS`.
+    """Write a recording as .csv, .h5 or .mcap, by the extension, or as a LeRobot dataset if the kind is "lerobot".
 
-    Predicted positions are for .mcap and LeRobot; faults and dead fibres, as `export_bag` has them, and the states of
-    `arm_states` for .mcap.
+    Only .mcap and LeRobot hold predicted positions; only .mcap holds faults and dead fibres (see `export_bag`), and the
+    states that `arm_states` returns.
     """
     extension = path.suffix.lower()
     if kind == "lerobot":
@@ -123,8 +122,8 @@ def export_file(
     elif extension == ".mcap":
         export_bag(recording, path, localization, faults, dead, states)
     elif extension not in _WRITERS:
-        folders = ", ".join(f"--format {name}" for name in FORMATS)
-        raise InputError(f"{path}: ends in {path.suffix!r}, allowed are {', '.join(_WRITERS)}, .mcap, or {folders}")
+        allowed = f"{', '.join(_WRITERS)}, .mcap, or --format lerobot"
+        raise InputError(f"{path}: ends in {path.suffix!r}, allowed are {allowed}")
     elif localization is not None:
         raise InputError(f"{path}: predictions of a model can be written as .mcap or lerobot only")
     else:

@@ -24,8 +24,7 @@ if TYPE_CHECKING:
     from padforge.sense.health.fault_detector import FibreFault
     from padforge.sense.localizer.model import Localization
 
-Stamped = tuple[int, memoryview]
-"""Stamp of a message, ns, and the message as CDR."""
+Stamped = tuple[int, memoryview]  # stamp of a message, ns, and the message as CDR
 
 FORMAT = "padforge-ros/1"
 READINGS, PRESSED, PLACE = "/pad/readings", "/pad/pressed", "/pad/place"

@@ -44,8 +44,7 @@ if TYPE_CHECKING:
 
 SUFFIXES = (".mcap", ".db3", ".bag")
 METADATA = "metadata.yaml"  # a folder with this file is a rosbag2 bag
-QUANTITIES = ("fibres", "positions", "x", "y", "depth", "reached", "force", "press")
-"""Quantities that topics may hold."""
+QUANTITIES = ("fibres", "positions", "x", "y", "depth", "reached", "force", "press")  # quantities that topics may hold
 _FIELDS = dict.fromkeys(QUANTITIES, "data") | {
     "positions": r"(.*\.)?(position|point)\.[xy]|[xy]",
     "force": r"(.*\.)?force\.[xyz]|data",

@@ -88,7 +88,7 @@ class _PressRecord(NamedTuple):
     trace: Array  # shape (L, TRACE)
     inputs: Floats  # shape (L, N)
     targets: Array  # shape (L, T)
-    level: Array  # running level of the rests before the press; shape (L,)
+    level: Array  # running mean of the baseline before the press; shape (L,)
     is_warm: Mask  # whether that level is reliable; shape (L,)
 
 
@@ -162,7 +162,7 @@ class FaultMonitor:
         return faults
 
     def _report(self, fault: FibreFault) -> list[FibreFault]:
-        """Return what to report of a fault: also a misfit that it makes, or nothing of a response after a misfit."""
+        """Return the fault, with a misfit if it causes one; after a misfit, nothing for a fault of a response."""
         if fault.kind not in RESPONSE_FAULTS:
             return [fault]
         was_misfit = self._is_misfit
@@ -171,7 +171,8 @@ class FaultMonitor:
             return []
         if not self._is_misfit:
             return [fault]
-        since, score = (min(getattr(each, name) for each in self._response_faults) for name in ("since", "score"))
+        since = min(each.since for each in self._response_faults)
+        score = min(each.score for each in self._response_faults)
         return [fault, FibreFault(self.n_presses, since, tuple(sorted(self._suspected)), "misfit", score)]
 
     def _find_missing(self, trace: Array) -> list[FibreFault]:
@@ -196,7 +197,7 @@ class FaultMonitor:
         """Return traces, targets, and means and deviations predicted without failed fibres; shape (Q, L, ...) each."""
         _, traces, inputs, targets, _, is_warm = (np.stack(part) for part in zip(*records, strict=True))
         mean, std = predict_fibres(self.model.weights, inputs, ~failed & np.isfinite(traces).all(axis=2))
-        # A rest has no level to be compared with before some presses have defined one.
+        # A rest cannot be compared with its running level before some presses have defined one.
         targets[:, :, -1] = np.where(is_warm, targets[:, :, -1], np.nan)
         return traces, targets, mean, std
 
@@ -262,7 +263,7 @@ class FaultMonitor:
             yield _WiringFault("inverted", (fibre,), float(llrs[fibre]))
 
     def _swapped(self, pairs: Sequence[tuple[int, int]], first: int) -> Iterator[_WiringFault]:
-        """Yield the evidence that each pair is swapped."""
+        """Yield the evidence that each pair is swapped: each fibre responds and rests as predicted for the other."""
         records = self._records_since(first)
         pca, likelihoods = self.model.pca, self.model.likelihoods
         for pair in pairs:
@@ -280,8 +281,8 @@ class FaultMonitor:
             llr = np.nan_to_num(np.clip(difference, -MAX_LLR, MAX_LLR)).sum()
             # Rests of successive presses correlate: they count once.
             scale_v, level = pca.target_scale_v[this, -1], records[0].level[this]
-            as_is, if_swapped = ((rests[:, source].mean(axis=0) - level) / scale_v for source in (this, other))
-            llr += np.nan_to_num(np.clip(as_is**2 - if_swapped**2, -2 * MAX_LLR, 2 * MAX_LLR)).sum() / 2
+            as_wired, if_swapped = ((rests[:, source].mean(axis=0) - level) / scale_v for source in (this, other))
+            llr += np.nan_to_num(np.clip(as_wired**2 - if_swapped**2, -2 * MAX_LLR, 2 * MAX_LLR)).sum() / 2
             yield _WiringFault("swapped", pair, float(llr))
 
     def _classify(self, fibre: int, hypothesis: int, since: int) -> str:
@@ -309,7 +310,7 @@ class FaultDetector:
 
     Args:
         false_alarm_rate: false alarms a press, all fibres and kinds of fault together; 1e-12 to 0.1.
-        seed: of all that is random in `fit`.
+        seed: seed of the training.
 
     Attributes:
         model_: fitted model, for presses as they were commanded.
@@ -406,7 +407,7 @@ class FaultDetector:
         """Write both models.
 
         Args:
-            folder: where to; its models are replaced.
+            folder: destination; its models are replaced.
 
         Raises:
             InputError: `fit` or `load` was not called, or the folder cannot be written.

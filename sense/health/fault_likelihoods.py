@@ -26,9 +26,10 @@ MAX_STEP_LLR = 12.0  # the same of a step within a trace; below the threshold un
 STEPS = np.arange(3, TRACE - 2)  # readings of a trace where a step is tested; nearer to an end it may be a spike
 LIBRARY = 64  # other presses that an inconsistent response is compared with
 MAX_HEIGHT = 1e5  # a height that no sum reaches
-MIN_PEAKS = 30  # minimum number of highest peaks that a tail is fitted to
-MAX_PEAKS = 300  # maximum of the same; between the two, it is the highest tenth of all peaks
-MEDIAN_T, FAR_T = 0.7267, 6.869  # median and 0.999 quantile of |Student's t| with `T_DEGREES` degrees of freedom
+MIN_PEAKS = 30  # a tail is fitted to the highest tenth of the peaks, but to at least so many
+MAX_PEAKS = 300  # and at most so many
+MEDIAN_T = 0.7267  # median of |Student's t| with `T_DEGREES` degrees of freedom
+FAR_T = 6.869  # 0.999 quantile of the same
 MEDIAN_NORMAL = 0.6745  # median of |standard normal|
 QUIET = 10  # last readings of the hold and of the release that show the noise alone
 MIN_RELATIVE_NOISE = 1e-3  # noise of a fibre that reads without any, relative to its response
@@ -66,9 +67,8 @@ class FaultLikelihoods:
         log_noise_std = np.median(np.abs(log_noise - log_noise_mean), axis=0) / MEDIAN_NORMAL
         calibrated = np.hypot(std * std_scale, std_floor)
         offset_residual = ((targets - mean) / calibrated)[:, :, -1]
-        autocorr = np.clip(
-            [(offset_residual[1:] * offset_residual[:-1]).mean() / (offset_residual**2).mean()], 0.0, 0.95
-        )
+        autocov = (offset_residual[1:] * offset_residual[:-1]).mean()
+        autocorr = np.clip([autocov / (offset_residual**2).mean()], 0.0, 0.95)
         innovation_std = np.array([np.median(np.abs(offset_residual[1:] - autocorr * offset_residual[:-1])) / MEDIAN_T])
         library = rng.choice(len(traces), LIBRARY)
         return cls(
@@ -135,7 +135,7 @@ class FaultLikelihoods:
             _log_t(response, gain * mean, np.hypot(gain * std, self.noise_floor)).sum(axis=-1)
             for gain in GAINS.values()
         ]
-        # In chunks, since a press takes kilobytes a fibre with all of the library.
+        # In chunks, since the comparison of a press with the library takes kilobytes a fibre.
         parts = (response[first : first + _CHUNK, None] for first in range(0, len(response), _CHUNK))
         others = (_log_t(part, self.library_mean, self.library_std).sum(axis=-1) for part in parts)
         other = np.concatenate([np.logaddexp.reduce(each, axis=1) for each in others]) - np.log(LIBRARY)
@@ -221,7 +221,7 @@ class ExceedanceModel:
     def fit(cls, llrs: Sequence[tuple[Array, Array]]) -> "ExceedanceModel":
         """Fit to the ratios (Q, L, H), continuing and onset, of successive healthy presses, by the number of failures.
 
-        Those of several sets of failed fibres follow one another; the sums run on from one to the next.
+        The presses are repeated for several sets of failed fibres, and the sums continue from one set to the next.
 
         The slope is the mean excess of the highest tenth of the peaks, but at least 1, which exact likelihoods have
         (A. Wald). The level is so high that the model expects the highest peak at least once in Q presses.
@@ -243,7 +243,7 @@ def _fit_tail(llr_continuing: Array, llr_onset: Array) -> tuple[Array, Array]:
     level, slope = np.empty(heights.shape[2]), np.empty(heights.shape[2])
     for hypothesis in range(heights.shape[2]):
         peaks = np.sort(np.concatenate([_peaks(series) for series in heights[:, :, hypothesis].T]))
-        # Zeros, of sums that never left 0, complete a number of peaks that is too small for a tail.
+        # Zeros, the peaks of sums that never left 0, are added if there are too few peaks for a tail.
         peaks = np.concatenate([np.zeros(max(MIN_PEAKS + 1 - len(peaks), 0)), peaks])
         top = int(np.clip(len(peaks) // 10, MIN_PEAKS, MAX_PEAKS))
         base = peaks[-top - 1]

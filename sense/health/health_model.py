@@ -77,7 +77,7 @@ class HealthModel(HealthDocument):
         """Write NAME.safetensors and NAME.json; `load` restores every bit.
 
         Args:
-            folder: where to.
+            folder: destination.
             name: of the files.
 
         Raises:

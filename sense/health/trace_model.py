@@ -1,9 +1,9 @@
 """Prediction of every fibre's response to a press from the responses of the others: mean and standard deviation.
 
-The response of a fibre, its trace (the readings around a press) minus its rest, is reduced to principal components. An
-ensemble of networks with dropout of fibres predicts it, and the level of the rest, from the other valid fibres; and a
-standard deviation, so that what is hard to predict does not count as a fault. Heteroscedastic regression: D. A. Nix,
-A. S. Weigend, IEEE ICNN 1994; ensembles: B. Lakshminarayanan, A. Pritzel, C. Blundell, NeurIPS 2017.
+The trace of a fibre, its readings around a press, is its baseline, the mean at rest, plus its response, of which the
+principal components are used. An ensemble of networks with dropout of fibres predicts both from the other valid fibres,
+with standard deviations, so that what is hard to predict does not count as a fault. Heteroscedastic regression: D. A.
+Nix, A. S. Weigend, IEEE ICNN 1994; ensembles: B. Lakshminarayanan, A. Pritzel, C. Blundell, NeurIPS 2017.
 """
 
 from collections.abc import Mapping
@@ -81,8 +81,8 @@ def extract_traces(readings: Array, down_command: Indices, up_command: Indices) 
 class TraceHistory:
     """State of the fibres after earlier presses."""
 
-    level: Array  # running level of the rest; shape (L,), V; NaN before the first press
-    n_presses: Indices  # presses in it; shape (L,)
+    level: Array  # running mean of the baseline; shape (L,), V; NaN before the first press
+    n_presses: Indices  # presses in that mean; shape (L,)
     residue: Array  # decaying sum of earlier responses; shape (L, D)
 
     @classmethod
@@ -103,14 +103,14 @@ class TracePCA:
     def fit_transform(cls, traces: Array) -> tuple["TracePCA", Floats, Array]:
         """Fit to healthy traces (Q, L, TRACE); return also their inputs (Q, L, N) and targets (Q, L, T)."""
         responses = traces - traces[:, :, :REST].mean(axis=2, keepdims=True)
-        moments = np.einsum("qcw,qcv->cwv", responses, responses) / len(responses)
-        components = np.linalg.eigh(moments)[1][:, :, : -COMPONENTS - 1 : -1]
+        second_moments = np.einsum("qcw,qcv->cwv", responses, responses) / len(responses)
+        components = np.linalg.eigh(second_moments)[1][:, :, : -COMPONENTS - 1 : -1]
         fibres = traces.shape[1]
         pca = cls(components, np.ones((fibres, INPUTS)), np.ones((fibres, TARGETS)))
         history = TraceHistory.initial(fibres)
         inputs, targets = map(np.stack, zip(*[pca.project(trace, history) for trace in traces], strict=True))
         input_rms, target_rms = np.sqrt((inputs**2).mean(axis=0)), np.sqrt((targets**2).mean(axis=0))
-        # Small components stay smaller, and their noise with them.
+        # Geometric means of each rms and the fibre's largest: small inputs stay smaller, and their noise with them.
         input_scale = np.sqrt(input_rms * input_rms.max(axis=1, keepdims=True))
         pca = cls(components, *(np.where(scale > MIN_SCALE_V, scale, 1.0) for scale in (input_scale, target_rms)))
         return pca, *pca.scale(inputs, targets)

@@ -36,9 +36,10 @@ def hidden_host() -> str:
 
 
 def is_welcome(headers: Message, port: int) -> bool:
-    """Return whether a request is to this machine, and from no web page, one of this machine, or the Foxglove app.
+    """Return whether a request is to this machine, and from a program, a page of this machine, or the Foxglove app.
 
-    The origin "null" stands for a hidden one and is refused.
+    A program sends no origin, or one of a scheme other than http and https. The origin "null", by which a browser hides
+    that of a page, is refused.
     """
     origin = headers["Origin"]
     if not is_this_machine(headers["Host"] or "", port):
@@ -62,10 +63,10 @@ class _GateHandler(socketserver.StreamRequestHandler):
             return
         with socket.create_connection(self.server.target) as server:
             server.sendall(head)
-            answers = Thread(target=_forward, args=(lambda: server.recv(CHUNK), self.request), daemon=True)
-            answers.start()
+            replies = Thread(target=_forward, args=(lambda: server.recv(CHUNK), self.request), daemon=True)
+            replies.start()
             _forward(lambda: self.rfile.read1(CHUNK), server)  # pyright: ignore[reportAttributeAccessIssue]
-            answers.join()
+            replies.join()
 
     def _read_head(self) -> bytes:
         """Read the request of a WebSocket up to the empty line at its end."""

@@ -72,10 +72,10 @@ class PadSensor:
     def read(self) -> dict[str, float]:
         """Return the latest state by name: readings in V, NaN where missing, and the touch.
 
-        `pressed` is 1 while the pad is pressed. While `valid` is 1, position, radius, depth and force are those of the
-        current press, of two fingers the one that landed last, otherwise of the last press; they are 0 before the first
-        estimate. `unlike` is 1 if no single press explains the responses, for example with two fingers. Raises RigFault
-        if the board failed.
+        `pressed` is 1 while the pad is pressed. Position, radius, depth and force are those of the current press (with
+        two fingers, of the one that landed last) or, while there is none, of the last press; if `valid` is 0, there is
+        no estimate, and they are 0. `unlike` is 1 if no single press explains the responses, for example with two
+        fingers. Raises RigFault if the board failed.
         """
         if self._thread is None:
             raise InputError("the pad is not connected")
@@ -95,9 +95,8 @@ class PadSensor:
             board = open_board(self._rig, self._model, self._options, self._localizer.fibres)
             with closing(board):
                 stream = stream_board(board, self._localizer.rate_hz)
-                pipeline = Live(
-                    self._localizer, rate_hz=stream.rate_hz, fibres=stream.fibres, health=load_health(self._model)
-                )
+                health = load_health(self._model)
+                pipeline = Live(self._localizer, rate_hz=stream.rate_hz, fibres=stream.fibres, health=health)
                 for times_s, readings in stream.blocks:
                     pipeline.update(times_s, readings)
                     if len(times_s):

@@ -2,14 +2,14 @@
 
 It returns events: the position of a press at every reading from its touch to the end of its release, with radii that
 are valid at that moment; faulty fibres, which are masked from the next press on; and a notice if the latest presses are
-those of another pad, for which no fibre is masked. A second finger that lands while the first one rests is a press of
-its own, localized from the change since then; the position of the first one is no longer updated.
+those of another pad, on which no fibre counts as faulty. A second finger that lands while the first one rests is a
+press of its own, localized from the change since then; the position of the first one is no longer updated.
 """
 
 from collections import deque
 from dataclasses import asdict, dataclass, replace
 from math import hypot
-from typing import Any, Literal, Protocol
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -30,7 +30,7 @@ from padforge.sense.localizer.features import (
     valid_fibres,
     windows_from_rest,
 )
-from padforge.sense.localizer.model import MEASURE_COLUMNS, UNIFORM, LocalizerModel
+from padforge.sense.localizer.model import MEASURE_COLUMNS, UNIFORM, FittedLocalizer, LocalizerModel, fitted_model
 from padforge.sense.localizer.model_files import check_same_pad
 from padforge.sense.localizer.moments import (
     EARLY_WINDOWS,
@@ -182,26 +182,22 @@ class BufferedPress:
         Also returned are the indices in them of `down_command`, of `up_command` (n while the press is held), and of the
         end of the previous press.
         """
+        # 1. The opening, and the latest readings of a long press
         up_command = until if self.up_command is None else min(self.up_command, until)
         opening_end = min(self.down_command + OPENING, until)
-        latest = max(up_command - LATEST, opening_end)
         if self._opening is None:
             opening = buffer.rows(self.down_command - LEAD, opening_end)[:, 1:]
         else:
             n_after_until = self.down_command + OPENING - opening_end
             opening = self._opening[: len(self._opening) - n_after_until]
-        first, n_omitted = opening_end - len(opening), latest - opening_end
-        readings = np.concatenate([opening, buffer.rows(latest, until)[:, 1:]])
-        readings = readings - self.relaxation(np.append(np.arange(first, opening_end), np.arange(latest, until)))
-        up = up_command - first - n_omitted
+        latest_first = max(up_command - LATEST, opening_end)
+        latest = buffer.rows(latest_first, until)[:, 1:]
+        # 2. Their change by the other finger is subtracted
+        first = opening_end - len(opening)
+        rows = np.append(np.arange(first, opening_end), np.arange(latest_first, until))
+        readings = np.concatenate([opening, latest]) - self.relaxation(rows)
+        up = up_command - first - (latest_first - opening_end)
         return readings, self.down_command - first, up, max(self.previous_end - first, 0)
-
-
-class FittedLocalizer(Protocol):
-    """What `padforge.sense.Localizer` is once it is fitted."""
-
-    @property
-    def model_(self) -> LocalizerModel: ...
 
 
 class Live:
@@ -217,10 +213,11 @@ class Live:
         presses: the latest estimate of each of the last presses, oldest first.
         track: estimates of the latest press at the last positions to which it has moved, oldest first.
         faults: all faults so far, oldest first.
-        is_other_pad: whether the latest presses are those of another pad; then no fibre is masked.
+        is_other_pad: whether the latest presses are those of another pad; then only dead fibres of `health` are masked.
 
     Raises:
-        InputError: a rate out of range, a localizer that was fitted to arrays, or `check_same_pad` refuses a model.
+        InputError: a rate out of range, a localizer that is not fitted or was fitted to arrays, or `check_same_pad`
+            refuses a model.
     """
 
     def __init__(
@@ -232,8 +229,7 @@ class Live:
         health: HealthModel | None = None,
     ) -> None:
         rate_hz = check_float("rate_hz", rate_hz, MIN_RATE_HZ, MAX_RATE_HZ)
-        if not isinstance(localizer, LocalizerModel):
-            localizer = localizer.model_
+        localizer = fitted_model(localizer)
         fibres = localizer.fibres if fibres is None else fibres
         check_same_pad(localizer, "the localizer", fibres, rate_hz)
         if localizer.features == "array":
@@ -246,7 +242,8 @@ class Live:
         response_v = (np.abs(scaler.mean_v) + 2 * scaler.scale_v)[:, :n_windows].max(axis=1)
         self._response_v = np.where(response_v > 0, response_v, 1.0)  # typical maximum, the scale of the view
         self._detector = PressDetector(fibres)
-        self._frames, self._last_s = FrameStream(rate_hz, fibres), -np.inf  # frames, and time of the last reading
+        self._frames = FrameStream(rate_hz, fibres)
+        self._last_s = -np.inf  # time of the last reading
         self._buffer = RingBuffer(1 + fibres)  # times and voltages of frames
         self._presses: list[BufferedPress] = []  # current ones, in the order of their touches
         # A change that may be a second finger, and the estimate of the first one before it.
@@ -299,14 +296,11 @@ class Live:
         if len(times) and not times[0] > self._last_s:
             raise InputError(f"times begin at {times[0]:g} s, expected later than those of the last readings")
         self._last_s = float(times[-1]) if len(times) else self._last_s
-        for row in np.column_stack(self._frames.feed(times, rows)):
-            self._buffer.append(row)
-            for event in self._detector.update(row[:1], row[None, 1:]):
-                if event.down:
-                    events += self._begin(event.reading)
-                else:
-                    events += self._end(event.reading)
-            for reading in self._detector.further:
+        for frame in np.column_stack(self._frames.feed(times, rows)):  # time and voltages
+            self._buffer.append(frame)
+            for change in self._detector.update(frame[:1], frame[None, 1:]):
+                events += self._begin(change.reading) if change.down else self._end(change.reading)
+            for reading in self._detector.further:  # where a pad that was pressed is pressed further
                 self._suspect(reading)
             events += self._advance()
         return events
@@ -361,8 +355,8 @@ class Live:
         first = self._buffer.end - len(readings)
         down, previous_end = (np.array([max(index - first, 0)]) for index in (down_command, self._previous_end))
         baseline, history = mean_at_rest(readings, down, previous_end), compute_history(readings, down)
-        begin = self._n_presses, time_s, touched, down_command, self._previous_end
-        self._add(BufferedPress(*begin, baseline, baseline, history))
+        indices = touched, down_command, self._previous_end
+        self._add(BufferedPress(self._n_presses, time_s, *indices, baseline, baseline, history))
         return events
 
     def _add(self, press: BufferedPress) -> None:
@@ -379,12 +373,12 @@ class Live:
         self._candidate, held = None, self._held
         if not held or self._lift is not None:
             return []
-        command = max(self._buffer.command_index(released, RELEASE_DELAY_S), held[-1].touched)
+        up_command = max(self._buffer.command_index(released, RELEASE_DELAY_S), held[-1].touched)
         if len(held) > 1:
-            self._lift = command
+            self._lift = up_command
             return []
-        events = self._cut([press for press in self._presses if press is not held[0]], command)
-        held[0].release(command, self._buffer)
+        events = self._cut([press for press in self._presses if press is not held[0]], up_command)
+        held[0].release(up_command, self._buffer)
         return events
 
     def _suspect(self, touched: int) -> None:
@@ -401,9 +395,8 @@ class Live:
         before = first.fixed or self._estimate(first, down_command, False)
         if before.unlike:
             return
-        press = BufferedPress(
-            self._n_presses, time_s, touched, down_command, sunk_in, first.untouched, first.baseline, first.history
-        )
+        indices, before_press = (touched, down_command, sunk_in), (first.untouched, first.baseline, first.history)
+        press = BufferedPress(self._n_presses, time_s, *indices, *before_press)
         press.finger, press.other = 3 - first.finger, first  # the other one of fingers 1 and 2
         if first.fixed is None:
             first.course = self._course(first, down_command, before)
@@ -413,7 +406,7 @@ class Live:
         self._candidate = press, before
 
     def _course(self, press: BufferedPress, until: int, estimate: Estimate) -> PressCourse:
-        """Return the course expected of a press at an estimated position, scaled to its readings."""
+        """Return the expected course of a press at an estimated position, scaled to its readings."""
         features = self._features_of_working_fibres(press, until)
         return PressCourse.fit(self._localizer, features, np.array([estimate.x_mm, estimate.y_mm]))
 
@@ -433,14 +426,16 @@ class Live:
         """Start the candidate as a press if a second finger explains it; drop it once it is complete without that."""
         first, until = self._held[0], self._buffer.end
         press.store_opening(self._buffer)
-        n_complete = int(complete_windows(*(np.array([index]) for index in (press.down_command, until, until))).sum())
+        now = np.array([until])  # the press is held: its release may begin now at the earliest
+        n_complete = int(complete_windows(np.array([press.down_command]), now, now).sum())
         if n_complete < MIN_COMPLETE or first.course is None:
             return []
         estimate = self._estimate(press, until, False)
         distance = hypot(estimate.x_mm - before.x_mm, estimate.y_mm - before.y_mm)
         elsewhere, deepening = (self._course(press, until, each) for each in (estimate, before))
         is_elsewhere = distance > before.r90_mm + estimate.r90_mm and elsewhere.explained_share > MIN_EXPLAINED
-        if is_elsewhere and max(deepening.explained_share, elsewhere.share_explained_by(first.course)) < MAX_DEEPENING:
+        share_of_first = max(deepening.explained_share, elsewhere.share_explained_by(first.course))
+        if is_elsewhere and share_of_first < MAX_DEEPENING:
             events = self._cut([each for each in self._presses if each is not first], press.down_command)
             self._candidate, first.fixed = None, before
             self._add(press)
@@ -457,20 +452,22 @@ class Live:
                 press.fixed = self._estimate(press, lift, False)
                 press.course = self._course(press, lift, press.fixed)
         courses = [press.course for press in held if press.course is not None]
-        window = RELEASE_WINDOWS[LIFT_WINDOWS[0]][0], RELEASE_WINDOWS[LIFT_WINDOWS[-1]][1]
-        after, before = (self._mean(lift + first, lift + end) for first, end in (window, (-3, 0)))
+        # 1. The measured change, and the change that is expected if either finger lifts off
+        first, end = RELEASE_WINDOWS[LIFT_WINDOWS[0]][0], RELEASE_WINDOWS[LIFT_WINDOWS[-1]][1]
+        change = self._mean(lift + first, lift + end) - self._mean(lift - 3, lift)
         expected = np.array([course.changes_by_release[list(LIFT_WINDOWS)].mean(axis=0) for course in courses])
-        sets, mask = ([0], [1], [0, 1]), courses[0].fibre_mask & courses[1].fibre_mask
-        errors = [float((((after - before) - expected[released].sum(axis=0))[mask] ** 2).sum()) for released in sets]
+        # 2. The hypothesis of least squared error: the first finger, the second one, or both lift off
+        hypotheses, mask = ([0], [1], [0, 1]), courses[0].fibre_mask & courses[1].fibre_mask
+        errors = [float(((change - expected[fingers].sum(axis=0))[mask] ** 2).sum()) for fingers in hypotheses]
         best, second_best = np.argsort(errors)[:2]
-        released = sets[best]
+        released = hypotheses[best]
         if errors[best] > MAX_ERROR_RATIO * errors[second_best]:
             released = [1]  # a guess: either may be the one that is still held, so both positions become unknown
-            names, anywhere_mm = ("std_x_mm", "std_y_mm", "r50_mm", "r90_mm"), np.array(UNIFORM)[[0, 0, 1, 2]]
-            radii_mm = dict(zip(names, (self._localizer.scaler.scale_mm * anywhere_mm).tolist(), strict=True))
+            std_mm, r50_mm, r90_mm = (self._localizer.scaler.scale_mm * np.array(UNIFORM)).tolist()
+            unknown = {"std_x_mm": std_mm, "std_y_mm": std_mm, "r50_mm": r50_mm, "r90_mm": r90_mm}
             for press in held:
                 if press.fixed is not None:
-                    press.fixed = replace(press.fixed, unlike=True, **radii_mm)
+                    press.fixed = replace(press.fixed, unlike=True, **unknown)
                     events.append(self._show(press.fixed))
         elif released == [1]:
             held[1].fixed = None  # only its own release changes the readings now, and locates it better
@@ -485,52 +482,70 @@ class Live:
 
     def _follow(self, press: BufferedPress, cut: int | None = None) -> list[Event]:
         """Return the events of a press at the latest reading; with `cut`, the last ones of a press that ends there."""
-        until = self._buffer.end
-        if cut is not None:
-            until = max(cut, press.down_command + 1)
-            if press.up_command is None:
-                press.release(cut, self._buffer)
+        until = self._buffer.end if cut is None else max(cut, press.down_command + 1)
+        if cut is not None and press.up_command is None:
+            press.release(cut, self._buffer)
         press.store_opening(self._buffer)
         is_complete = False
         if press.up_command is not None:
             end = press.up_command + (0 if press.fixed else RELEASE)
             is_complete = until >= end or cut is not None
             until = min(until, end)
+        # published features need a complete press, and after a lift it is not yet known which finger rests
+        is_estimated_now = self._localizer.features == "windows" and self._lift is None
         events: list[Event] = []
-        if press.fixed is not None:
-            if is_complete:
-                events.append(self._show(replace(press.fixed, final=True)))
-        elif is_complete or (self._localizer.features == "windows" and self._lift is None):
-            # published features need a complete press, and after a lift it is not yet known which finger rests
+        if press.fixed is None and (is_complete or is_estimated_now):
             events.append(self._show(self._estimate(press, until, is_complete)))
-        if press.up_command is not None and is_complete:
-            if press.fixed is None and press.other is None:
-                events += [*self._check_pad(press, until), *self._check_fibres(press, until)]
-            elif self._monitor is not None:  # it skips this press, but numbers those after it
-                self._monitor.n_presses += 1
-            self._previous_end = max(self._previous_end, press.up_command)
-            self._presses.remove(press)
-            press.other = None  # otherwise fingers that take turns without a rest form an endless chain
+        elif press.fixed is not None and is_complete:
+            events.append(self._show(replace(press.fixed, final=True)))
+        return [*events, *self._finish(press, until)] if is_complete else events
+
+    def _finish(self, press: BufferedPress, end: int) -> list[Event]:
+        """Remove a complete press; return what it shows of the pad and its fibres, unless fingers overlapped."""
+        events: list[Event] = []
+        if press.fixed is None and press.other is None:
+            events += [*self._check_pad(press, end), *self._check_fibres(press, end)]
+        elif self._monitor is not None:  # it skips this press, but numbers those after it
+            self._monitor.n_presses += 1
+        assert press.up_command is not None
+        self._previous_end = max(self._previous_end, press.up_command)
+        self._presses.remove(press)
+        press.other = None  # otherwise fingers that take turns without a rest form an endless chain
         return events
 
     def _estimate(self, press: BufferedPress, until: int, final: bool) -> Estimate:
         scaled = self._localizer.scaler.transform(self._features_of_working_fibres(press, until))
         result = self._localizer.localize(scaled)
-        numbers = np.concatenate([result.positions_mm[0], result.std_mm[0], result.r50_mm, result.r90_mm]).tolist()
+        (x_mm, y_mm), (std_x_mm, std_y_mm) = result.positions_mm[0].tolist(), result.std_mm[0].tolist()
         measures = {
             column: float(values[0])
             for name, measure in result.measures.items()
             for column, values in zip(MEASURE_COLUMNS[name], (measure.values, measure.r90), strict=True)
         }
         now_s = float(self._buffer.rows(until - 1, until)[0, 0])
-        if press.up_command is None or until <= press.up_command:
-            moment = "touch", until - press.touched, now_s - press.time_s
-        else:
-            moment = "lift", until - press.up_command, now_s - press.up_s
-        failed = tuple(np.flatnonzero(~scaled.fibre_mask[0]).tolist())
-        unlike = bool(result.unlike is not None and result.unlike[0])
-        more = {"failed": failed, "unlike": unlike, "finger": press.finger}
-        return Estimate(press.number, press.time_s, now_s, *moment, final, *numbers, **more, **measures)
+        since: Literal["touch", "lift"] = "touch"
+        first, first_s = press.touched, press.time_s
+        if press.up_command is not None and until > press.up_command:
+            since, first, first_s = "lift", press.up_command, press.up_s
+        return Estimate(
+            press=press.number,
+            time_s=press.time_s,
+            now_s=now_s,
+            since=since,
+            readings=until - first,
+            since_s=now_s - first_s,
+            final=final,
+            x_mm=x_mm,
+            y_mm=y_mm,
+            std_x_mm=std_x_mm,
+            std_y_mm=std_y_mm,
+            r50_mm=float(result.r50_mm[0]),
+            r90_mm=float(result.r90_mm[0]),
+            failed=tuple(np.flatnonzero(~scaled.fibre_mask[0]).tolist()),
+            unlike=bool(result.unlike is not None and result.unlike[0]),
+            finger=press.finger,
+            **measures,
+        )
 
     def _features_of_working_fibres(self, press: BufferedPress, until: int) -> PressFeatures:
         features = self._features(press, until)

@@ -73,30 +73,22 @@ class FoxgloveOutput(contextlib.AbstractContextManager["FoxgloveOutput"]):
             self._scene.log(self._scene_update(message))
 
     def _scene_update(self, touch: Message) -> Any:
-        from foxglove.messages import (
-            Color,
-            CubePrimitive,
-            CylinderPrimitive,
-            Pose,
-            Quaternion,
-            SceneEntity,
-            SceneUpdate,
-            Vector3,
-        )
+        from foxglove import messages
 
         def solid(position: dict[str, float], *size_mm: float, color: tuple[float, ...]) -> dict[str, Any]:
-            pose = Pose(position=Vector3(**position), orientation=Quaternion(w=1.0))
-            size = Vector3(**{axis: mm / 1000 for axis, mm in zip("xyz", size_mm, strict=True)})
-            return {"pose": pose, "size": size, "color": Color(**dict(zip("rgba", color, strict=True)))}
+            pose = messages.Pose(position=messages.Vector3(**position), orientation=messages.Quaternion(w=1.0))
+            size = messages.Vector3(**{axis: mm / 1000 for axis, mm in zip("xyz", size_mm, strict=True)})
+            return {"pose": pose, "size": size, "color": messages.Color(**dict(zip("rgba", color, strict=True)))}
 
         x, y = self._centre_mm
         centre = {"x": x / 1000, "y": y / 1000, "z": 0.0}
         width, height = 2 * self._half_mm[0], 2 * self._half_mm[1]
-        area = CubePrimitive(**solid(centre, width, height, THICKNESS_MM / 2, color=GREY))
+        area = messages.CubePrimitive(**solid(centre, width, height, THICKNESS_MM / 2, color=GREY))
         diameter = 2 * touch.pad["r90_mm"]
         disc = solid(touch.msg["pose"]["pose"]["position"], diameter, diameter, THICKNESS_MM, color=BLUE)
-        discs = [CylinderPrimitive(**disc, bottom_scale=1.0, top_scale=1.0)]
-        return SceneUpdate(entities=[SceneEntity(frame_id=FRAME, id="touch", cubes=[area], cylinders=discs)])
+        discs = [messages.CylinderPrimitive(**disc, bottom_scale=1.0, top_scale=1.0)]
+        touch_entity = messages.SceneEntity(frame_id=FRAME, id="touch", cubes=[area], cylinders=discs)
+        return messages.SceneUpdate(entities=[touch_entity])
 
 
 def _json_schema(value: Any) -> dict[str, Any]:

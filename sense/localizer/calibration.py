@@ -31,7 +31,7 @@ from padforge.sense.localizer.evaluation import (
 )
 from padforge.sense.localizer.features import FeatureSet, PressFeatures, compute_features
 from padforge.sense.localizer.model import Localization, LocalizerModel
-from padforge.sense.localizer.moments import MODULATED, N_PRESS_WINDOWS, complete_at, count_complete
+from padforge.sense.localizer.moments import MODULATED, N_PRESS_WINDOWS, complete_at
 from padforge.sense.localizer.network import (
     MAX_LOG_ERROR,
     MIN_LOG_ERROR,
@@ -86,7 +86,7 @@ class Experience:
     def ratio(self, n_trained: int, failed_share: float) -> float:
         """Return the mean ratio of distance to expected radius when a share of the fibres has failed.
 
-        Errors on new presses then grow less, since they are large in training already.
+        Errors grow less from training to new presses then, since they are large in training already.
         """
         return self.mean_ratio * (1 - FAILURE_DECREASE * failed_share * (1 - 1 / self.growth(n_trained)))
 
@@ -154,9 +154,7 @@ def calibrate(
         raise InputError("time_budget is given: method published has no time limit, expected method ensemble")
     rng = np.random.default_rng(options.seed)
     positioned = np.flatnonzero(recording.has_position)
-    training, test = (
-        positioned[part] for part in split_presses(len(positioned), options.split, options.test_share, rng)
-    )
+    training, test = split_presses(positioned, options.split, options.test_share, rng)
     packages = ("safetensors", *["torch"] * (options.method == "published"))
     made_by = provenance("padforge sense calibrate", options.seed, packages=packages)
     made_by |= {"inputs": {"recording": recording.digest}, "recording_kind": recording.source.get("kind")}
@@ -327,11 +325,11 @@ def calibrate_uncertainty(
         experience = [Experience.at_moment(n_complete) for n_complete in range(1, len(moments) + 1)]
         expected = np.array([[each.ratio(n_trained, share) for share in failed_shares] for each in experience])
         prior_ratios = adapt_ratios(expected, predictions, positions_mm)
-    ratios = [[None] * levels] * len(moments) if prior_ratios is None else prior_ratios.tolist()
-    factors: list[list[Array]] = [
-        [conformal(sets, positions_mm, measures, ratio) for sets, ratio in zip(*of_moment, strict=True)]
-        for of_moment in zip(predictions, ratios, strict=True)
-    ]
+    factors: list[list[Array]] = []
+    for moment, by_level in enumerate(predictions):
+        ratios = [None] * levels if prior_ratios is None else prior_ratios[moment].tolist()
+        pairs = zip(by_level, ratios, strict=True)
+        factors.append([conformal(sets, positions_mm, measures, ratio) for sets, ratio in pairs])
     if len(moments) > 1:
         factors = [factors[0], *factors]  # a placeholder for 0 complete windows, where nothing is predicted
     n_presses = len(positions_mm) + PRIOR_PRESSES * (prior_ratios is not None)
@@ -382,9 +380,7 @@ def _calibrate_scales(
     mean of the scales is known from other pads, and the presses determine only the ratios between members.
     """
     positions = model.scaler.scale_positions(positions_mm)
-    subsets = [
-        failed for n_failed in range(levels) for failed in failure_subsets(model.fibres, n_failed, SCALE_SUBSETS)
-    ]
+    subsets = [failed for n in range(levels) for failed in failure_subsets(model.fibres, n, SCALE_SUBSETS)]
 
     # 1. Mean ratio of error to expected error of each member, by moment and set of failed fibres, shrunk towards the
     # expected ratio; the first axis of `outputs` and `ratios` holds the members of each of the networks `names` in turn
@@ -394,9 +390,11 @@ def _calibrate_scales(
     for n_complete, features in enumerate(moments, first):
         on_progress(n_complete - first, len(moments), "expected errors")
         growth = Experience.at_moment(n_complete).growth(n_trained) if n_trained else 1.0
-        rows = np.flatnonzero(count_complete(features.complete) == n_complete)  # the next press cut others short
-        names = active_networks(model.networks, n_complete, features.complete.shape[1], bool(model.bayes))
-        for failed in subsets if len(rows) else ():
+        rows = np.flatnonzero(features.n_complete == n_complete)  # the next press cut others short
+        if not len(rows):
+            continue
+        names = active_networks(model.networks, n_complete, features.n_timed, bool(model.bayes))
+        for failed in subsets:
             outputs = predict_members(model.networks, features[rows].without(failed), *model.corrected)
             predicted, log_error = (half[:, :, :2] for half in np.split(outputs, 2, axis=2))
             error = np.abs(predicted - positions[rows]).mean(axis=2)
@@ -440,11 +438,10 @@ def _split_training(
 ) -> tuple[Indices, Indices, Indices]:
     """Return presses for training, for early stopping if published, and for calibration."""
     share = CALIBRATION_SHARE[options.method]
-    train, held_back = (training[part] for part in split_presses(len(training), options.split, share, rng, 2))
+    train, held_back = split_presses(training, options.split, share, rng, 2)
     if options.method == "ensemble" or len(held_back) < 2:
         return train, held_back, held_back
-    early_stop, calibration = (held_back[part] for part in split_presses(len(held_back), options.split, 0.5, rng, 1))
-    return train, early_stop, calibration
+    return train, *split_presses(held_back, options.split, 0.5, rng, 1)
 
 
 def trainable_targets(recording: Recording, presses: Indices) -> dict[str, Array]:
@@ -480,18 +477,16 @@ def split_unseen(
     positioned = np.flatnonzero(recording.has_position)
     if model is not None and (test := held_back_presses(model, recording)) is not None:
         return np.setdiff1d(positioned, test), test
-    rng = np.random.default_rng(options.seed)
-    training, test = split_presses(len(positioned), options.split, options.test_share, rng)
-    return positioned[training], positioned[test]
+    return split_presses(positioned, options.split, options.test_share, np.random.default_rng(options.seed))
 
 
 def split_presses(
-    presses: int, split: str, share: float, rng: np.random.Generator, min_training: int = MIN_TRAINING
+    presses: Indices, split: str, share: float, rng: np.random.Generator, min_training: int = MIN_TRAINING
 ) -> tuple[Indices, Indices]:
-    """Split presses into those for training and a share that is held back; return ascending indices of both.
+    """Split presses into those for training and a share that is held back.
 
     Args:
-        presses: their number.
+        presses: ascending indices.
         split: "random", or "chronological" to hold the last presses back.
         share: of the presses held back.
         rng: for a random split.
@@ -501,11 +496,11 @@ def split_presses(
         InputError: fewer than `min_training` presses would be left.
     """
     # a further split of training presses, which has a lower `min_training`, holds back at least one
-    n_held_back = max(round(share * presses), 1 if min_training < MIN_TRAINING else 0)
-    if not 1 <= n_held_back <= presses - min_training:
+    n_held_back = max(round(share * len(presses)), 1 if min_training < MIN_TRAINING else 0)
+    if not 1 <= n_held_back <= len(presses) - min_training:
         raise InputError(
-            f"recording has {presses} presses of known position: a share of {share:g} holds {n_held_back} back, "
+            f"recording has {len(presses)} presses of known position: a share of {share:g} holds {n_held_back} back, "
             f"expected at least 1, and {min_training} to learn from"
         )
-    order = rng.permutation(presses) if split == "random" else np.arange(presses)
+    order = rng.permutation(presses) if split == "random" else presses
     return np.sort(order[:-n_held_back]), np.sort(order[-n_held_back:])

@@ -26,8 +26,8 @@ if TYPE_CHECKING:
     from pandas import DataFrame
 
 FORMAT = "padforge-calibration/1"
-BUILT_PAD = "simulated, by default with the scatter of a built pad, which itself errs 0.94 / 1.16 / 1.53 / 2.29 mm"
-"""Note on simulated errors, with the errors of the published recording with 0 to 3 of its 6 fibres failed."""
+SIMULATED_NOTE = "simulated, by default with the scatter of a built pad, which itself errs 0.94 / 1.16 / 1.53 / 2.29 mm"
+"""Note beside simulated errors. Its numbers are of the published recording, with 0 to 3 of its 6 fibres failed."""
 CELLS = 5  # cells along a side of the map of errors by position
 MOMENT_SETS = 3  # maximum sets of failed fibres of a size at each moment
 NO_MOMENTS: dict[str, Any] = {"by_moment": [], "focus": {}}
@@ -136,14 +136,8 @@ def evaluate(
     presses = model.scaled_features(recording)
     features, positions_mm = presses[test], recording.presses_mm[test]
     measures = {name: values[test] for name, values in recording.measures.items()}
-    rows, by_subset = errors_by_loss(
-        model.fibres,
-        levels,
-        lambda failed: model.predict_features(features, failed),
-        positions_mm,
-        measures,
-        on_progress,
-    )
+    predict = partial(model.predict_features, features)
+    rows, by_subset = errors_by_loss(model.fibres, levels, predict, positions_mm, measures, on_progress)
     prediction = model.predict_features(features)
     within_r90 = float((distances(prediction.positions_mm, positions_mm) <= prediction.r90_mm).mean())
     localization, is_other_pad = model.predict_features(presses), model.is_other_pad(features)
@@ -427,7 +421,7 @@ def calibration_lines(document: Mapping[str, Any]) -> list[str]:
         if names[0] in rows[0]:
             header = "failed  sets   mean    p95  in r90"
             lines += table(f"error of {kind} in {unit}", header, names, [f"{kind}_within_r90"])
-    return [*lines, *([BUILT_PAD] if is_simulated else []), *reserve_lines(document)]
+    return [*lines, *([SIMULATED_NOTE] if is_simulated else []), *reserve_lines(document)]
 
 
 def reserve_lines(document: Mapping[str, Any]) -> list[str]:

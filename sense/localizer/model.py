@@ -6,7 +6,7 @@ A localizer trained on presses of several depths also predicts depth, and force 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, ClassVar, Literal, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -27,7 +27,6 @@ from padforge.sense.localizer.moments import (
     RESIDUAL,
     SLIDE_NETWORK,
     complete_at,
-    count_complete,
 )
 from padforge.sense.localizer.network import Networks, Sliding, Weights, predict
 from padforge.sense.localizer.scaler import FeatureScaler, ScaledFeatures, array_field
@@ -301,8 +300,8 @@ class LocalizerModel(LocalizerDocument):
     def predict_features(self, presses: ScaledFeatures, failed: ArrayLike = ()) -> Localization:
         """Predict the positions of Q single presses.
 
-        A press without a valid fibre or without a complete window has the middle of the pressed area, and the radii of
-        an unknown position.
+        A press without a valid fibre (of method "published", with an invalid one) or without a complete window has the
+        middle of the pressed area, and the radii of an unknown position.
 
         Args:
             presses: scaled features.
@@ -312,19 +311,17 @@ class LocalizerModel(LocalizerDocument):
             InputError: `failed` are no indices of fibres, or all of them, or any for method "published".
         """
         presses = presses.without(self._check_failed(failed))
-        chunk = max(1, _CHUNK // self.fibres)
-        starts = range(0, max(len(presses), 1), chunk)
-        parts = [
-            predict(self.networks, presses[first : first + chunk], *self.corrected, self.sliding) for first in starts
-        ]
+        size = max(1, _CHUNK // self.fibres)
+        chunks = (presses[first : first + size] for first in range(0, max(len(presses), 1), size))
+        parts = [predict(self.networks, chunk, *self.corrected, self.sliding) for chunk in chunks]
         targets, std, slid = (np.concatenate(part) for part in zip(*parts, strict=True))
-        fibre_mask, n_complete = presses.fibre_mask, count_complete(presses.complete)
+        fibre_mask, n_complete = presses.fibre_mask, presses.n_complete
         level = np.minimum((~fibre_mask).sum(axis=1), self.max_failures)
         # the network of the touch locates a finger that slid, even when it rests again
         factors = self.interval_factors[np.where(slid, N_PRESS_WINDOWS - 1, n_complete), level]
         to_std, to_r50, to_r90 = factors[:, :3].T * self.scaler.scale_mm
         radius = np.hypot(*std[:, :2].T)
-        is_complete = n_complete > 0 if presses.complete.shape[1] else np.ones(len(presses), bool)
+        is_complete = n_complete > 0 if presses.n_timed else np.ones(len(presses), bool)
         has_fibres = fibre_mask.all(axis=1) if self.method == "published" else fibre_mask.any(axis=1)
         is_unknown = np.logical_not(is_complete & has_fibres)
         unknown_std_mm, unknown_r50_mm, unknown_r90_mm = np.array(UNIFORM) * self.scaler.scale_mm
@@ -403,3 +400,18 @@ class LocalizerModel(LocalizerDocument):
             residual_network=residual_network,
             single_press=tuple(SinglePressTest(**test) for test in tests),
         )
+
+
+class FittedLocalizer(Protocol):
+    """What `padforge.sense.Localizer` is once it is fitted."""
+
+    @property
+    def model_(self) -> LocalizerModel: ...
+
+
+def fitted_model(localizer: FittedLocalizer | LocalizerModel) -> LocalizerModel:
+    """Return the model of a localizer; InputError if it is not fitted."""
+    model = localizer if isinstance(localizer, LocalizerModel) else getattr(localizer, "model_", None)
+    if model is None:
+        raise InputError("the localizer is not fitted, expected fit or load before")
+    return model

@@ -17,7 +17,7 @@ from padforge.common.validation import InputError, check_path, check_type, short
 from padforge.sense.recording.frames import FRAME_S
 
 DOCUMENT_CONFIG = ConfigDict(extra="forbid", allow_inf_nan=False, strict=True)  # of dataclasses that are documents
-RATE_TOLERANCE = 0.25  # share by which there may be fewer readings a second than a model was learnt from
+RATE_TOLERANCE = 0.25  # share by which readings a second may be fewer than in the training of a model
 
 T = TypeVar("T")
 
@@ -29,9 +29,10 @@ class ModelFiles(NamedTuple):
     weights: Path
 
     def write(self, form: str, document: Mapping[str, Any], parts: Mapping[str, Any]) -> None:
-        """Write a document, with its format and "weights_sha256" added, and parts, together or not at all.
+        """Write a document and arrays, together or not at all; "format" and "weights_sha256" are added to the document.
 
-        Parts are arrays, or mappings, dataclasses and tuples of them, named by their path, such as `bayes.0.grid`.
+        Each of the `parts` is an array, or a mapping, dataclass or tuple of parts; the name of an array in the file is
+        its path, such as `bayes.0.grid`.
         """
         content = save(_flatten(parts))
         document = {"format": form, **document, "weights_sha256": hashlib.sha256(content).hexdigest()}
@@ -89,8 +90,8 @@ def select_arrays(arrays: Mapping[str, NDArray[Any]], prefix: str) -> dict[str, 
 def check_same_pad(model: Any, what: str, fibres: int, rate_hz: float) -> None:
     """Raise InputError if readings are of another number of fibres than a model, or too few for it in a second.
 
-    `what` is the name of the model in messages; it has `fibres` and `rate_hz`, as the readings. More readings than
-    there are frames (see `framed`) are averaged.
+    The model, whose name in messages is `what`, has its own `fibres` and `rate_hz`. Of a higher rate than that of
+    frames (see `framed`) only the frames count.
     """
     if fibres != model.fibres:
         raise InputError(f"readings are of {fibres} fibres, {what} was learnt from {model.fibres}")

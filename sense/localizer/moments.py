@@ -29,23 +29,20 @@ from typing import Any, Literal
 
 import numpy as np
 
-from padforge.sense.arrays import Indices, Mask
+from padforge.sense.arrays import Indices
 
 Window = tuple[int, int]
 
-REST: Window = (-10, 0)
-"""Frames at rest before the probe is sent down; their mean is the baseline of the other windows."""
+REST: Window = (-10, 0)  # frames at rest before the probe is sent down; their mean is the baseline of the other windows
 PRESS_WINDOWS: tuple[Window, ...] = ((1, 2), (2, 3), (3, 4), (4, 5), (5, 6), (6, 8), (8, 12), (12, 16), (16, 20))
 """Windows after the probe was sent down: fine while it sinks in, broad while it rests in the silicone."""
 RELEASE_WINDOWS: tuple[Window, ...] = ((0, 1), (1, 2), (2, 3), (3, 4), (4, 6), (6, 9), (9, 14), (14, 20))
 """Windows after the probe was sent up: the release depends on the position as much as the press does."""
 LATEST_WINDOWS: tuple[Window, ...] = ((-1, 0), (-2, -1))
 """Windows before the latest reading, or before the release if that is earlier: they locate a finger that moves."""
-PRESS_MIDDLES = np.array([(first + end - 1) / 2 for first, end in PRESS_WINDOWS])
-"""Middles of `PRESS_WINDOWS`."""
+PRESS_MIDDLES = np.array([(first + end - 1) / 2 for first, end in PRESS_WINDOWS])  # middles of `PRESS_WINDOWS`
 N_PRESS_WINDOWS = len(PRESS_WINDOWS)
-N_TIMED = len(PRESS_WINDOWS) + len(RELEASE_WINDOWS)
-"""Windows of a press that are complete one after the other."""
+N_TIMED = len(PRESS_WINDOWS) + len(RELEASE_WINDOWS)  # windows of a press that are complete one after the other
 MODULATED = slice(2, 5), slice(5, 9), slice(12, 17)
 """Groups of windows; the sensitivity of a group is modulated as one (see `response_model`)."""
 
@@ -82,35 +79,33 @@ class Phase:
         return isinstance(n_complete, int) and self.first <= n_complete < self.first + len(self.shares)
 
 
+def _half_at_last(n: int) -> tuple[float, ...]:
+    """Return n shares: a half at the last number of complete windows, and the other half divided among the others."""
+    return (*(0.5 / (n - 1),) * (n - 1), 0.5)
+
+
 PHASES: Mapping[int, Mapping[str, Phase]] = {
     N_TIMED: {
         "touched": Phase(1, (0.05, 0.12, 0.26, 0.15, 0.11, 0.09, 0.08, 0.07, 0.07), 1.4, sliding=0.3),
         "settled": Phase(N_PRESS_WINDOWS, (1.0,), 1.3),
-        "released": Phase(
-            N_PRESS_WINDOWS + 1,
-            (*(0.5 / (len(RELEASE_WINDOWS) - 1),) * (len(RELEASE_WINDOWS) - 1), 0.5),
-            1.7,
-        ),
+        "released": Phase(N_PRESS_WINDOWS + 1, _half_at_last(len(RELEASE_WINDOWS)), 1.7),
     },
-    N_PRESS_WINDOWS: {"held": Phase(1, (*(0.5 / (N_PRESS_WINDOWS - 1),) * (N_PRESS_WINDOWS - 1), 0.5), sliding=0.2)},
+    N_PRESS_WINDOWS: {"held": Phase(1, _half_at_last(N_PRESS_WINDOWS), sliding=0.2)},
     0: {"press": Phase(0, (1.0,))},
 }
-"""Phases by the name of their network, for each number of timed windows: all, those of the touch alone, or none if the
-features do not depend on the moment. Where phases overlap, the last one answers."""
-SLIDE_NETWORK = "touched"
-"""Network that follows a sliding finger; the others know fingers at rest alone."""
-RESIDUAL = "residual"
-"""Network that corrects the Bayesian localizers."""
-EARLY_WINDOWS = 5
-"""Complete windows soon after the touch, when a finger has not slid far."""
+"""Phases by the name of their network, for each number K of timed windows: of press and release, of the press alone, or
+none if the features do not depend on the moment. Where phases overlap, the last one answers."""
+SLIDE_NETWORK = "touched"  # network that follows a sliding finger; the others know fingers at rest alone
+RESIDUAL = "residual"  # network that corrects the Bayesian localizers
+EARLY_WINDOWS = 5  # complete windows soon after the touch, when a finger has not slid far
 SLIDE_THRESHOLD = 3.0
 """Distance from the position at `EARLY_WINDOWS`, in its standard deviations, above which a press counts as sliding;
 rarely exceeded at rest."""
 POSSIBLE_SLIDE_THRESHOLD = 1.75
 """The same, above which a press may be sliding and is not taken for two fingers; 5 % of pairs of fingers exceed it."""
 BAYES_STAGES = (12, 13, 14, 15, 17)
-"""Complete windows from which on a Bayesian localizer of its own answers. Before the release has shown, at 12, it errs
-by a third more than a network."""
+"""Numbers of complete windows from which on the next Bayesian localizer answers. Before 12 the
+release has not shown yet, and one errs by a third more than a network."""
 RESIDUAL_PHASE = Phase(BAYES_STAGES[0], (0.15, 0.1, 0.15, 0.1, 0.05, 0.45))
 """Phase of the network that corrects the Bayesian localizers."""
 
@@ -132,11 +127,6 @@ def complete_at(n_complete: int, down_command: Indices, up_command: Indices) -> 
     if n_complete <= N_PRESS_WINDOWS:
         return down_command + PRESS_WINDOWS[n_complete - 1][1]
     return up_command + RELEASE_WINDOWS[n_complete - N_PRESS_WINDOWS - 1][1]
-
-
-def count_complete(complete: Mask) -> Indices:
-    """Return the number (Q,) of complete windows of presses."""
-    return complete.sum(axis=1)
 
 
 def bayes_stage(n_complete: int, n_timed: int) -> int | None:

@@ -24,7 +24,6 @@ from padforge.sense.localizer.moments import (
     SLIDE_THRESHOLD,
     active_networks,
     bayes_stage,
-    count_complete,
 )
 from padforge.sense.localizer.scaler import ScaledFeatures
 
@@ -76,8 +75,7 @@ def forward(weights: Mapping[str, Any], x: Any, xp: Any = np) -> Any:
     return _activate(h, xp) @ weights["last.w"] + weights["last.b"]
 
 
-Networks = Mapping[str, Weights]
-"""Networks by phase, see `moments.PHASES`."""
+Networks = Mapping[str, Weights]  # networks by phase, see `moments.PHASES`
 
 
 def predict_members(
@@ -90,7 +88,7 @@ def predict_members(
 
     With `bayes`, the last member is the Bayesian localizer of the stage, corrected by the residual network.
     """
-    n_complete, n_timed = int(presses.complete[:1].sum()), presses.complete.shape[1]
+    n_complete, n_timed = int(presses.complete[:1].sum()), presses.n_timed
     is_published = "hidden.w" not in next(iter(networks.values()))
     x = (
         presses.inputs.reshape(len(presses), -1)
@@ -120,16 +118,15 @@ def predict(
         Scaled targets (Q, N) and their standard deviations, 0 where no window is complete; and whether a finger has
         slid (Q,).
     """
-    n_complete = count_complete(presses.complete)
+    n_complete = presses.n_complete
     first = next(iter(networks.values()))
     n_targets = first["last.w"].shape[2] // (2 if "hidden.w" in first else 1)
     targets, std = np.zeros((2, len(presses), n_targets), np.float32)
     for count in np.unique(n_complete).tolist():
-        if count or not presses.complete.shape[1]:
+        if count or not presses.n_timed:
             rows = np.flatnonzero(n_complete == count)
-            targets[rows], std[rows] = combine_members(
-                predict_members(networks, presses[rows], bayes, residual_network)
-            )
+            outputs = predict_members(networks, presses[rows], bayes, residual_network)
+            targets[rows], std[rows] = combine_members(outputs)
     slid = np.zeros(len(presses), bool)
     rows = np.flatnonzero(n_complete >= N_PRESS_WINDOWS)
     if sliding is not None and len(rows):
@@ -153,12 +150,12 @@ class Sliding:
 
     weights: Weights  # of `SLIDE_NETWORK`
     # (C, len(LATEST_WINDOWS), len(PRESS_WINDOWS)), see `FeatureScaler.latest_window_map`
-    now_factor: Floats
-    now_offset: Floats
+    latest_factor: Floats
+    latest_offset: Floats
 
     def follow(self, presses: ScaledFeatures) -> TrackedFinger:
         """Track the finger of presses whose touch is complete."""
-        n_timed = presses.complete.shape[1]
+        n_timed = presses.n_timed
 
         def predict_from(features: Floats, n_complete: int) -> tuple[Floats, Floats]:
             complete = presses.complete & (np.arange(n_timed) < n_complete)
@@ -169,9 +166,8 @@ class Sliding:
         early = presses.inputs.copy()
         for k in range(len(LATEST_WINDOWS)):
             window = EARLY_WINDOWS - 1 - k
-            early[:, :, n_timed + k] = (
-                early[:, :, window] * self.now_factor[:, k, window] + self.now_offset[:, k, window]
-            )
+            factor, offset = self.latest_factor[:, k, window], self.latest_offset[:, k, window]
+            early[:, :, n_timed + k] = early[:, :, window] * factor + offset
         early_targets, early_std = predict_from(early, EARLY_WINDOWS)
         distance = np.hypot(*(targets - early_targets)[:, :2].T)
         distance = distance / np.maximum(np.hypot(*early_std[:, :2].T), np.float32(1e-9))

@@ -46,8 +46,8 @@ class _Source(NamedTuple):
     table: Floats  # scaled response by position, over [-1, 1] in x and y; shape (S, S, C, F)
     residual: Floats  # features minus the response table, of each press; shape (Q, C, F)
     complete: Mask  # complete windows; shape (Q, K)
-    now_factor: Floats  # see `TrainingPresses`
-    now_offset: Floats
+    latest_factor: Floats  # see `TrainingPresses`
+    latest_offset: Floats
     depth_gain: float  # growth of the response with the scaled depth
     latest_noise: float
 
@@ -81,9 +81,9 @@ class PressSampler:
         if self.targets.shape[1] > 2:
             expected *= 1 + self.depth_gain * self.targets[:, 2:3]
         residual = (presses.inputs - expected.reshape(presses.inputs.shape)).astype(np.float32)
-        windows = presses.complete, presses.now_factor, presses.now_offset
+        windows = presses.complete, presses.latest_factor, presses.latest_offset
         self._source = _Source(np.ascontiguousarray(table), residual, *windows, float(self.depth_gain), LATEST_NOISE)
-        self._n_timed = presses.complete.shape[1]
+        self._n_timed = presses.n_timed
         self._bayes = tuple(stage.map_arrays(np.ascontiguousarray) for stage in bayes)
         self.n_inputs = fibres * (n_features + 1) + self._n_timed + (N_SUMMARY if bayes else 0)
         self._phase, self._speed, self._per_mm = phase, presses.speed, presses.per_mm
@@ -157,7 +157,7 @@ def _compute_inputs(
         fibre_mask: valid fibres; shape (B, C).
         moments: `_Moments` of the presses.
         noise: standard deviation of noise on the features.
-        rng: random number generator.
+        rng: of the noise.
         x: filled with 0; shape (B, I). Masked features, and windows that are not complete, stay 0.
     """
     side, (fibres, size), n_timed = len(source.table), source.residual.shape[1:], source.complete.shape[1]
@@ -198,7 +198,7 @@ def _compute_inputs(
             if has_latest:
                 for k in range(N_LATEST):
                     window = latest_windows[k]
-                    scaled = latest[k] * source.now_factor[c, k, window] + source.now_offset[c, k, window]
+                    scaled = latest[k] * source.latest_factor[c, k, window] + source.latest_offset[c, k, window]
                     features[n_timed + k] = scaled + source.latest_noise * rng.standard_normal()
             for f in range(size):
                 if complete[f]:

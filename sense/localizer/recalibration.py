@@ -124,7 +124,8 @@ def recalibrate(
     validation, halves = (CrossValidation(samples, n_folds, subsets) for n_folds in (FOLDS, 2))
     before = validation.predict([model] * FOLDS)
     total = FOLDS + 4 if model.method == "ensemble" else 1  # correction, folds, two halves, final fit
-    folds, after, changed, change = [model] * FOLDS, before, model, None
+    folds = [model] * FOLDS
+    after, changed, change = before, model, None  # predictions, model and name of the change that is kept so far
     candidates = [validation.candidate(None, before, before)]
 
     # 1. Correction

@@ -1,8 +1,8 @@
 """Priors of the response of a pad, from its plan or from the maps of an earlier pad.
 
 The signal of a fibre is linear in the sensitivity along it, and nearly linear in the lateral offset of its path from
-the plan. Both are smooth along the fibre, so that some ten numbers, which as many presses along it determine, define
-its whole map.
+the plan. Both are smooth along the fibre, so that some ten numbers define its whole map, and as many presses along it
+determine them.
 """
 
 import numpy as np
@@ -17,8 +17,8 @@ from padforge.sense.recording.recording import Recording
 
 N_NODES = 9  # points along a fibre between which its sensitivity and its lateral offset are linear
 CORRELATION_LENGTH = 0.2  # of both, as a share of the fibre
-OFFSET_MM = 2.0  # prior standard deviation of the lateral offset, over that of the logarithm of the sensitivity
-WIDTHS = 1.0, 0.7  # width of a press, and of its onset and residue, relative to that of the contact; see `[rig]`
+OFFSET_MM = 2.0  # prior standard deviation of the lateral offset, mm, if that of the logarithm of the sensitivity is 1
+WIDTHS = 1.0, 0.7  # widths of a held press, and of onset and residue, relative to that of the contact; see `[rig]`
 RBF_SIDE = 6  # basis functions along a side that scale the maps of an earlier pad
 RBF_STD = 0.4  # their standard deviation, scaled position
 
@@ -26,7 +26,7 @@ RBF_STD = 0.4  # their standard deviation, scaled position
 def planned_pad(recording: Recording, pad: Morphology | None = None) -> Morphology | None:
     """Return the plan of the pad of a recording: `pad`, or the one that the recording holds, if any.
 
-    The plan in a recording of a twin is ignored, since its position under the arm was another.
+    The plan in a recording of a twin is ignored, since the twin does not lie under the arm as planned.
 
     Raises:
         InputError: `pad` has another number of fibres than the recording.
@@ -41,14 +41,14 @@ def planned_pad(recording: Recording, pad: Morphology | None = None) -> Morpholo
 
 
 def stated_contact(recording: Recording) -> Contact:
-    """Return the contact that a simulated recording states; the default one of others."""
+    """Return the contact that a simulated recording states; the default one for any other recording."""
     return validate(Contact, recording.source.get("contact", {}), "recording: contact")
 
 
 def plan_prior(pad: Morphology, contact: Contact, origin_mm: Array, scale_mm: float) -> ResponsePrior:
     """Return the prior of a pad from its plan: fibres with varying sensitivity and lateral offset.
 
-    The plan is in the frame of the arm, whose position `origin_mm` (2,) is 0 when scaled; the distance `scale_mm` is 1.
+    The plan is in the frame of the arm. A scaled position is 0 at `origin_mm` (2,), and `scale_mm` is its unit.
     """
     # compiled kernels take long to import
     from padforge.design.contact import signals, widened
@@ -58,16 +58,19 @@ def plan_prior(pad: Morphology, contact: Contact, origin_mm: Array, scale_mm: fl
     grid = pad.to_grid(grid_positions(side).reshape(-1, 2) * scale_mm + origin_mm)
     nodes = np.linspace(0, 1, N_NODES)
     covariance = np.exp(-0.5 * ((nodes[:, None] - nodes) / CORRELATION_LENGTH) ** 2)
+    # Roots of the prior covariance: of offsets, and of log sensitivities, all of which also share a gain of variance 1
     smooth, with_gain = (np.linalg.cholesky(covariance + gain + 1e-6 * np.eye(N_NODES)) for gain in (0.0, 1.0))
+    hats = [np.tile(hat, (fibres, 1)) for hat in np.eye(N_NODES)]
     parts = []
     for width in WIDTHS:
-        pressed, hats = widened(contact, width), [np.tile(hat, (fibres, 1)) for hat in np.eye(N_NODES)]
+        # 1. Signal by the sensitivity at each node, scaled to a prior standard deviation of at most 1
+        pressed = widened(contact, width)
         maps = [signals(pad, grid, pressed, precision=LAYER_PRECISION, sensitivity=hat) for hat in hats]
         maps = np.stack(maps, axis=2).reshape(side, side, fibres, N_NODES)
         maps /= np.linalg.norm(maps @ with_gain, axis=3).max(axis=(0, 1))[:, None]
-        step = 2 / GRID_CELLS
-        offsets = [OFFSET_MM / scale_mm * slope @ smooth for slope in np.gradient(maps, step, axis=(0, 1))]
-        parts += [maps @ with_gain, *offsets]
+        # 2. Signal by the offset at each node, in x and in y
+        slopes = np.gradient(maps, 2 / GRID_CELLS, axis=(0, 1))
+        parts += [maps @ with_gain, *(OFFSET_MM / scale_mm * slope @ smooth for slope in slopes)]
     return ResponsePrior(np.concatenate(parts, axis=3))
 
 

@@ -52,6 +52,16 @@ class ScaledFeatures:
     def __len__(self) -> int:
         return len(self.inputs)
 
+    @property
+    def n_timed(self) -> int:
+        """Number of timed windows, K."""
+        return self.complete.shape[1]
+
+    @property
+    def n_complete(self) -> Indices:
+        """Number (Q,) of complete windows of each press."""
+        return self.complete.sum(axis=1)
+
     def without(self, failed: Iterable[int]) -> "ScaledFeatures":
         """Return the features with fibres masked in every press, by their indices."""
         working = ~np.isin(np.arange(self.fibre_mask.shape[1]), list(failed))
@@ -178,15 +188,15 @@ class FeatureScaler:
     ) -> "TrainingPresses":
         """Scale features and targets of presses; `rate_hz` of readings is needed only for training with slides."""
         scaled, targets = self.transform(features), self.scale_targets(positions_mm, measures)
-        now_factor, now_offset = self.latest_window_map(scaled.complete.shape[1])
+        latest_factor, latest_offset = self.latest_window_map(scaled.n_timed)
         return TrainingPresses(
             scaled.inputs,
             scaled.fibre_mask,
             scaled.complete,
             targets,
             depth_gain=self.depth_gain,
-            now_factor=now_factor,
-            now_offset=now_offset,
+            latest_factor=latest_factor,
+            latest_offset=latest_offset,
             per_mm=1 / self.scale_mm,
             speed=1 / (self.scale_mm * rate_hz),
         )
@@ -209,8 +219,8 @@ class TrainingPresses(ScaledFeatures):
 
     targets: Floats  # (Q, 2 + T)
     depth_gain: float  # see `FeatureScaler.depth_gain`
-    now_factor: Floats  # see `FeatureScaler.latest_window_map`
-    now_offset: Floats
+    latest_factor: Floats  # see `FeatureScaler.latest_window_map`
+    latest_offset: Floats
     per_mm: float  # scaled distance of 1 mm
     speed: float  # scaled distance that 1 mm/s covers per reading; 0 if presses do not slide
 

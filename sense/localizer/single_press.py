@@ -19,7 +19,7 @@ from scipy.special import stdtrit
 from padforge.design.objectives.fibre_loss import failure_subsets
 from padforge.sense.arrays import Array, Floats, Indices, Mask
 from padforge.sense.localizer.bayes import fit_projection, local_scatter
-from padforge.sense.localizer.moments import LATEST_WINDOWS, N_PRESS_WINDOWS, N_TIMED, count_complete
+from padforge.sense.localizer.moments import LATEST_WINDOWS, N_PRESS_WINDOWS, N_TIMED
 from padforge.sense.localizer.response_model import grid_positions, interpolate_grid
 from padforge.sense.localizer.scaler import ScaledFeatures, TrainingPresses
 
@@ -84,7 +84,7 @@ class SinglePressTest:
         determine them.
         """
         # 1. Discriminants of the windows that are complete
-        n_timed, side = presses.complete.shape[1], len(table)
+        n_timed, side = presses.n_timed, len(table)
         usable = np.ones(table.shape[3], bool)
         if n_timed:
             usable[n_complete : n_timed + len(LATEST_WINDOWS)] = False
@@ -93,9 +93,8 @@ class SinglePressTest:
         relative_depth = 1 + presses.depth_gain * presses.targets[:, 2:3] if presses.depth_gain else np.ones((1, 1))
         at_presses = relative_depth * interpolate_grid(table.reshape(side, side, -1), positions)
         residual = presses.inputs - at_presses.reshape(presses.inputs.shape)
-        projection = fit_projection(
-            table, residual, presses.fibre_mask, COMPONENTS, earlier.projection if earlier else None
-        )
+        earlier_projection = earlier.projection if earlier else None
+        projection = fit_projection(table, residual, presses.fibre_mask, COMPONENTS, earlier_projection)
         residual = np.einsum("qcf,cfd->qcd", residual, projection) * presses.fibre_mask[:, :, None]
         # 2. Responses and scatter on a coarse grid over the presses
         offset = np.einsum("cf,cfd->cd", centring * usable, projection)
@@ -232,8 +231,8 @@ def find_unlike(tests: Sequence[SinglePressTest], presses: ScaledFeatures) -> Ma
 
     The result is false for presses before the first stage.
     """
-    n_complete, unlike = count_complete(presses.complete), np.zeros(len(presses), bool)
-    numbers = stages(presses.complete.shape[1])
+    n_complete, unlike = presses.n_complete, np.zeros(len(presses), bool)
+    numbers = stages(presses.n_timed)
     for test, first, end in zip(tests, numbers, [*numbers[1:], np.inf], strict=True):
         rows = np.flatnonzero((n_complete >= first) & (n_complete < end))
         unlike[rows] = test.is_unlike(presses.inputs[rows], presses.fibre_mask[rows])

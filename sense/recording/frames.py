@@ -49,30 +49,38 @@ class FrameStream:
     def __init__(self, rate_hz: float, fibres: int) -> None:
         self._rate_hz = rate_hz
         self._start_s = np.nan  # of the next frame, by the clock without the excess of pauses
-        # The last reading of the latest frame and all later ones: time by that clock, total excess until then, volts.
-        self._pending = np.empty((0, 2 + fibres))
+        # The last reading of the latest frame and all n readings after it:
+        self._clock_s = np.empty(0)  # time by that clock; shape (n + 1,)
+        self._pauses_s = np.empty(0)  # total excess until then; shape (n + 1,)
+        self._readings = np.empty((0, fibres))  # shape (n + 1, C), V
 
     def feed(self, times_s: Array, readings: Array) -> tuple[Array, Array]:
         """Add readings (n, C), V, at ascending times (n,); return times (N,) and means (N, C) of complete frames."""
         if is_as_read(self._rate_hz) or not len(times_s):
             return times_s, readings
-        if not len(self._pending):  # assume a missing reading before the first one
-            self._pending = np.full((1, self._pending.shape[1]), np.nan)
-            self._pending[0, :2] = times_s[0] - 1 / self._rate_hz, 0.0
-        last_s, pause_s = self._pending[-1, :2].sum(), self._pending[-1, 1]
-        pauses_s = pause_s + np.cumsum(_excess_s(np.diff(times_s, prepend=last_s), self._rate_hz))
-        self._pending = np.vstack([self._pending, np.column_stack([times_s - pauses_s, pauses_s, readings])])
-        clock_s, pauses_s = self._pending[:, :2].T
-        edges = (clock_s[:-1] + clock_s[1:]) / 2  # the end of the last reading is unknown
+        if not len(self._clock_s):  # assume a missing reading before the first one
+            self._clock_s, self._pauses_s = times_s[:1] - 1 / self._rate_hz, np.zeros(1)
+            self._readings = np.full((1, readings.shape[1]), np.nan)
+        # 1. Subtract the excess of pauses from the times.
+        last_s = self._clock_s[-1] + self._pauses_s[-1]
+        pauses_s = self._pauses_s[-1] + np.cumsum(_excess_s(np.diff(times_s, prepend=last_s), self._rate_hz))
+        self._clock_s = np.append(self._clock_s, times_s - pauses_s)
+        self._pauses_s = np.append(self._pauses_s, pauses_s)
+        self._readings = np.vstack([self._readings, readings])
+        # 2. Average the readings over the frames that are complete.
+        edges = (self._clock_s[:-1] + self._clock_s[1:]) / 2  # the end of the last reading is unknown
         start_s = edges[0] if np.isnan(self._start_s) else self._start_s
         count = int((edges[-1] - start_s) / FRAME_S)
         frame_edges = start_s + FRAME_S * np.arange(count + 1)
-        means = time_means(edges, self._pending[1:-1, 2:], frame_edges) if count else np.empty((0, readings.shape[1]))
-        self._start_s = frame_edges[-1]
-        n_done = int(np.searchsorted(edges, self._start_s, side="right")) - 1  # readings that end before that time
-        self._pending = self._pending[n_done:]
+        means = time_means(edges, self._readings[1:-1], frame_edges) if count else np.empty((0, readings.shape[1]))
         middle_s = (frame_edges[:-1] + frame_edges[1:]) / 2
-        return middle_s + np.interp(middle_s, clock_s, pauses_s), means
+        frame_s = middle_s + np.interp(middle_s, self._clock_s, self._pauses_s)
+        # 3. Keep the last reading before the next frame, and all later ones.
+        self._start_s = frame_edges[-1]
+        n_done = int(np.searchsorted(edges, self._start_s, side="right")) - 1
+        self._clock_s, self._pauses_s = self._clock_s[n_done:], self._pauses_s[n_done:]
+        self._readings = self._readings[n_done:]
+        return frame_s, means
 
 
 def _excess_s(intervals_s: Array, rate_hz: float) -> Array:

@@ -34,7 +34,8 @@ from padforge.sense.arrays import MAX_FIBRES, MAX_INDEX, Array, check_numbers
 from padforge.sense.recording.block_file import BlockWriter, read_blocks, write_at
 
 FORMAT = "padforge-recording/1"
-START, JOURNAL, READINGS, STATES = FILES = "start.json", "journal.ndjson", "readings.bin", "states.bin"
+START, JOURNAL, READINGS, STATES = "start.json", "journal.ndjson", "readings.bin", "states.bin"
+FILES = START, JOURNAL, READINGS, STATES
 STATE_COLUMNS = ("time_s", "x_mm", "y_mm", "z_mm", "rx", "ry", "rz", "speed_mm_s", "force_n", "safety")
 """Columns of a state of the arm; force is NaN without a sensor, safety 1 normal and 0 stopped."""
 _NEW_START = UNFINISHED + START
@@ -152,8 +153,8 @@ class Recorder:
         times_s, _ = read_blocks(path / READINGS, fibres)
         if (journal and not len(times_s)) or not (np.diff(times_s) > 0).all():
             # No interruption can cause this, so nothing is cut off.
-            what = f"the readings of {len(journal)} presses of {fibres} fibres in the journal"
-            raise InputError(f"{path / READINGS}: not {what}")
+            expected = f"ascending readings of {fibres} fibres, for {len(journal)} presses in the journal"
+            raise InputError(f"{path / READINGS}: does not fit the recording, expected {expected}")
         self._path, self.fibres, self.last_s = path, fibres, -np.inf
         self._blocks, times_s = BlockWriter.resume(path / READINGS, fibres)
         self._update_last_time(times_s)

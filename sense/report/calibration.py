@@ -28,7 +28,7 @@ from padforge.sense.studies.fibre_loss import draw_errors_by_loss
 _log = logging.getLogger(__name__)
 
 FILES = ("localizer.json", "localizer.safetensors", "calibration.json", MAP, BY_LOSS, BY_MOMENT, *sorted(HEALTH_FILES))
-"""Names of all files of a calibration; those of health and of moments where these can be learnt."""
+"""Names of all files of a calibration. A recording may not suffice for those of health and of moments."""
 
 
 def calibrate_into(
@@ -72,7 +72,7 @@ def calibrate_into(
     # optional files of an earlier calibration must not stay
     with atomic_files(out, without={*HEALTH_FILES, MAP, BY_LOSS, BY_MOMENT}) as folder:
         model.save(folder)
-        check_replaceable(path, folder / path.name, FILES, force)  # other settings show in the result alone
+        check_replaceable(path, folder / path.name, FILES, force)  # by content, since provenance does not show settings
         if detector:
             detector.save(folder)
         write_json(folder / "calibration.json", evaluation.to_dict())

@@ -47,16 +47,15 @@ def identify_into(
         InputError: as `identify`, `out` cannot be written, or other files were made from the twin in it.
     """
     check_writable(out)
-    origin = provenance(
-        "padforge sense identify", seed, inputs or []
-    )  # minutes later they may differ from what was read
+    # now, since the files may change during the identification, which takes minutes
+    origin = provenance("padforge sense identify", seed, inputs or [])
     check_replaceable(out / TWIN, origin, force=force)
     with stage("identify"):
         result = identify_pad(recording, pad, contact, seed, on_progress)
     document = _document(result) | {"rig_mirrored": recording.mirrored, "provenance": origin}
     with atomic_files(out) as folder, stage("figures"):
         replace(result.twin, provenance=origin).save(folder / TWIN)
-        check_replaceable(out / TWIN, folder / TWIN, force=force)  # the same plan, but perhaps another recording
+        check_replaceable(out / TWIN, folder / TWIN, force=force)  # by content, since provenance does not show all
         write_json(folder / "identification.json", document)
         _draw_responses(result, folder / "twin_responses.png")
         _draw_plan(result, folder / "twin_plan.png")
@@ -205,7 +204,7 @@ def _channel_cells(row: Mapping[str, Any]) -> list[str]:
 
 
 def identification_sections(folder: Path, document: Mapping[str, Any]) -> list[PageSection]:
-    """Write the section of the report on an `identification.json` in `folder`. Raises errors as those of `sections`."""
+    """Write the section of the report on an `identification.json` in `folder`; errors are as in `sections`."""
     summary = (
         f"Identified from {document['presses']} presses: the pad lay {_pose(document)}. The twin explains"
         f" {document['explained']:.0%} of the responses to {document['held_out']} held-out presses, the plan as it is"

@@ -1,7 +1,7 @@
 """Sections of the HTML report on recording, calibration, fibre loss and studies.
 
-They raise the errors of Python where a document is not as padforge writes it, InputError for a figure of it that cannot
-be read.
+If a document is not as padforge writes it, they raise errors of Python, which the caller converts to an InputError
+(`reraise_as_input_error`). A figure that cannot be read raises InputError.
 """
 
 import json
@@ -14,15 +14,14 @@ from typing import Any
 from padforge.common.files import read_bytes
 from padforge.common.page import PageSection, collapsible, columns, figures, heading, paragraph, table
 from padforge.common.validation import InputError
-from padforge.sense.localizer.evaluation import BUILT_PAD, reserve_lines
+from padforge.sense.localizer.evaluation import SIMULATED_NOTE, reserve_lines
 from padforge.sense.recording.recording import Recording
 from padforge.sense.recording.run_directory import JOURNAL, read_journal
 
 MAP, BY_LOSS, BY_MOMENT = (f"figures/error_{name}.png" for name in ("map", "by_loss", "by_moment"))
 NUMBERS = ("one", "two", "three")
 
-Errors = Mapping[tuple[int, ...], float]
-"""Mean error, mm, by indices of failed fibres, ascending."""
+Errors = Mapping[tuple[int, ...], float]  # mean error, mm, by indices of failed fibres, ascending
 
 
 def recording_sections(folder: Path, document: Mapping[str, Any]) -> list[PageSection]:
@@ -75,6 +74,11 @@ def calibration_sections(folder: Path, document: Mapping[str, Any]) -> list[Page
     head = ["failed", "sets", "mean (mm)", "std", "worst", "median", "95 %", "in r50", "in r90"]
     shares = [[f"{row[f'within_r{k}']:.1%}" for k in (50, 90)] for row in rows]
     errors = [_error_cells(row, "median_mm", "p95_mm") + cells for row, cells in zip(rows, shares, strict=True)]
+    note = f"Errors are {SIMULATED_NOTE} with 0 / 1 / 2 / 3 of 6 fibres failed, after 4500 presses."
+    pictures = [
+        (folder / MAP, "True positions of presses, and the errors of the predicted ones."),
+        (folder / BY_LOSS, "Error by number of failed fibres."),
+    ]
     body = [
         paragraph(
             f"Errors on {document['test_presses']} {presses} never trained on ({split}).{one_network} Every position"
@@ -83,21 +87,12 @@ def calibration_sections(folder: Path, document: Mapping[str, Any]) -> list[Page
         table(head, errors),
         *_measure_errors(rows),
         *_moment_errors(folder, document.get("by_moment", [])),
-        *(
-            [paragraph(f"Errors are {BUILT_PAD} with 0 / 1 / 2 / 3 of 6 fibres failed, after 4500 presses.")]
-            * simulated
-        ),
-        *map(paragraph, reserve_lines(document)),
+        *map(paragraph, [*([note] if simulated else []), *reserve_lines(document)]),
         paragraph(
             "Mean, standard deviation and worst are over the sets of failed fibres; median and 95th percentile over all"
             " their presses."
         ),
-        figures(
-            [
-                (folder / MAP, "True positions of presses, and the errors of the predicted ones."),
-                (folder / BY_LOSS, "Error by number of failed fibres."),
-            ]
-        ),
+        figures(pictures),
         heading("Idle share"),
         paragraph("The share of presses in which a fibre changes by less than 2 % of its range."),
         table(["fibre", *map(str, range(1, len(idle) + 1))], [["idle", *idle]]),
@@ -149,7 +144,7 @@ def fibre_loss_sections(folder: Path, document: Mapping[str, Any]) -> list[PageS
     body = []
     for name, method in methods.items():
         errors = {tuple(row["failed"]): float(row["mean_mm"]) for row in method["by_subset"]}
-        if any(errors):
+        if errors.keys() - {()}:  # a fibre has failed in one of the sets
             body += [*([heading(name.capitalize())] if name else []), *_describe_losses(errors)]
     if not body:
         return []
@@ -167,14 +162,14 @@ def fibre_loss_sections(folder: Path, document: Mapping[str, Any]) -> list[PageS
 
 def _describe_losses(errors: Errors) -> Iterator[str]:
     """Describe the errors by set of failed fibres: the worst ones in words, all as tables."""
+    # 1. The worst set of each size, in words
     fibres = 1 + max(fibre for failed in errors for fibre in failed)
     counts = sorted({len(failed) for failed in errors} - {0})
     worst_sets = [max((each for each in errors if len(each) == count), key=errors.__getitem__) for count in counts]
-    worst = "; ".join(
-        f"of {_fibre_count(len(failed))}, {_names(failed)} ({errors[failed]:.2f} mm)" for failed in worst_sets
-    )
+    losses = [f"of {_fibre_count(len(each))}, {_names(each)} ({errors[each]:.2f} mm)" for each in worst_sets]
     intact = f" With all fibres the error is {errors[()]:.2f} mm." if () in errors else ""
-    yield paragraph(f"The worst loss: {worst}.{intact}")
+    yield paragraph(f"The worst loss: {'; '.join(losses)}.{intact}")
+    # 2. Errors without one and two fibres, and mean errors without each fibre
     pairs: list[str] = []
     if {1, 2} <= set(counts):
         few = {failed: error for failed, error in errors.items() if len(failed) <= 2}
@@ -192,6 +187,7 @@ def _describe_losses(errors: Errors) -> Iterator[str]:
     rows = [[fibre + 1, *(mean_with(fibre, count) for count in counts)] for fibre in range(fibres)]
     means = [table(head, rows), paragraph("Mean error over the sets of failed fibres that a fibre is in.")]
     yield columns(*([pairs] if pairs else []), means)
+    # 3. The ten worst sets
     ranked = sorted(errors.items(), key=lambda item: -item[1])[:10]
     rows = [[_names(failed), f"{error:.2f}"] for failed, error in ranked if failed]
     yield collapsible("The worst sets", [table(["failed", "mean (mm)"], rows)])
@@ -213,14 +209,15 @@ def _names(failed: Sequence[int]) -> str:
 def _loss_table(errors: Errors, fibres: int) -> str:
     """Write a triangle: the error without one fibre on its diagonal, without two below it; darker is worse."""
     low, high = min(errors.values()), max(errors.values())
+    # row and column in the table, whose first column has the numbers of the fibres
     cells = {(failed[-1], failed[0] + 1): error for failed, error in errors.items() if failed}
-    columns = range(1, fibres + 1)
+    numbers = range(1, fibres + 1)
     rows = [
-        [row + 1, *(f"{cells[row, column]:.2f}" if (row, column) in cells else "" for column in columns)]
+        [row + 1, *(f"{cells[row, column]:.2f}" if (row, column) in cells else "" for column in numbers)]
         for row in range(fibres)
     ]
     shades = {cell: (error - low) / ((high - low) or 1.0) for cell, error in cells.items()}
-    return table(["", *map(str, columns)], rows, shades)
+    return table(["", *map(str, numbers)], rows, shades)
 
 
 def find_studies(folder: Path) -> Iterator[tuple[Path, dict[str, Any]]]:

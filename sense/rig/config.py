@@ -136,17 +136,16 @@ def locate_on_bed(rig: RigSettings, folder: Path) -> RigSettings:
     box = (
         *(max(x - half_x, dx), min(x + half_x, width + dx)),
         *(max(y - half_y, dy), min(y + half_y, depth + dy)),
-        *(max(contact - rig.max_depth_mm, frame.walls_mm) - 1e-6, height + dz),
+        *(max(contact - rig.max_depth_mm, frame.walls_mm) - 1e-6, height + dz),  # less rounding of the deepest press
     )
-    return rig.model_copy(
-        update={
-            "pad_mm": (x, y),
-            "mirrored": frame.mirrored if rig.mirrored is None else rig.mirrored,
-            "contact_mm": contact,
-            "box_mm": rig.box_mm or box,
-            "pad_angle_deg": angle_deg,
-        }
-    )
+    located = {
+        "pad_mm": (x, y),
+        "mirrored": frame.mirrored if rig.mirrored is None else rig.mirrored,
+        "contact_mm": contact,
+        "box_mm": rig.box_mm or box,
+        "pad_angle_deg": angle_deg,
+    }
+    return rig.model_copy(update=located)
 
 
 @dataclass(frozen=True)
@@ -192,7 +191,7 @@ def plan_notice(config: RigConfig) -> str:
     """Return a notice that a resumed recording keeps its plan although `[rig]` sets another; "" if it does not."""
     stored, current = read_json(config.out / START, FORMAT)["source"]["rig"], config.rig.model_dump(mode="json")
     changed = [f"{key} = {stored.get(key)}" for key in _PLAN_KEYS if stored.get(key) != current[key]]
-    return f"{config.out}: goes on by the plan it was begun with, [rig] {', '.join(changed)}" if changed else ""
+    return f"{config.out}: keeps the plan that it was begun with, [rig] {', '.join(changed)}" if changed else ""
 
 
 def open_recorder(
@@ -208,7 +207,7 @@ def open_recorder(
     `presses` are x and y, or x, y and depth, of each press of the plan, mm, and `identities` the results of `connect`,
     by "arm" and "board". Raises InputError for a recording that was begun with another arm, tool or board.
     """
-    devices = json.loads(json.dumps({name: dict(identity) for name, identity in identities.items()}))
+    devices = json.loads(json.dumps({name: dict(identity) for name, identity in identities.items()}))  # as when read
     if resume:
         stored = read_json(folder / START, FORMAT)["source"]["devices"]
         for device, identity in devices.items():

@@ -82,16 +82,16 @@ def simulated_board_of(model: Path) -> SimulatedBoard:
     """Return the simulated pad on whose recording the model in a folder was trained; InputError if there is none."""
     path = model / RECORDED / START
     if not path.is_file():
-        raise InputError(f"{path}: not there, though it says which pad to simulate; name a model of `padforge run`")
+        raise InputError(f"{path}: is missing, and the pad to simulate is unknown; name a model of `padforge run`")
     source = read_json(path, FORMAT)["source"]
     if source.get("kind") != "simulated":
-        raise InputError(f"{path}: of no simulated pad, but --rig simulated needs one; --replay shows a recording")
+        raise InputError(f"{path}: is not of a simulated pad, as --rig simulated needs; --replay shows a recording")
     if "twin" in source:
-        raise InputError(f"{path}: of a pad simulated by its twin, which is not live; --replay shows a recording")
+        raise InputError(f"{path}: is of a pad simulated by its twin, which cannot be live; --replay shows a recording")
     try:
         pad = Morphology.from_dict(source["morphology"])
         rig = RigSettings(**source["rig"] | {"channels": ()})  # a simulated pad is not wired to inputs
         size = {key: source[key] for key in ("sensed_mm", "keep_out_mm") if key in source}
         return SimulatedBoard(pad, rig, Contact(**source["contact"]), PadSettings(**pad.layout.settings | size))
     except (KeyError, TypeError, ValueError) as error:
-        raise InputError(f"{path}: says of no pad that can be simulated ({error})") from error
+        raise InputError(f"{path}: describes no pad that can be simulated ({error})") from error

@@ -67,14 +67,19 @@ PAD = np.dtype(
 """State of the pad."""
 
 BLOCK_S = 0.03  # length of a block; a probe takes a tenth of a second to sink in
-FADE_S, SLOPE_S, NOISE_S = 2.5, 1.0, 10.0  # times in which a slope fades, a slope is learnt, and noise is learnt
+FADE_S = 2.5  # time in which a slope fades
+SLOPE_S = 1.0  # time in which a slope is learnt
+NOISE_S = 10.0  # time in which noise is learnt
 GAP_S = 1.0  # a fibre that is missing for longer is reset
 GIVE_UP_S = 1.0  # a run that lasts longer without agreement is noise that has grown
 WARM_UP_BLOCKS = 8  # blocks before the first change
 ROUGH_BLOCKS = 8  # noise learnt from n blocks is widened by ROUGH_BLOCKS / n
-LEVEL_ERROR, SLOPE_ERROR = 0.05, 0.4  # errors of level, and of slope per s, relative to a step that silicone settles to
-MAX_INNOVATION, MAX_GROWTH = 2.5, 3.0  # limits of the influence of a block on level, and on noise, standard deviations
-MIN_SHARE, MIN_V = 0.01, 1e-7  # least noise, relative to a typical press, and in V (smaller steps are rounding)
+LEVEL_ERROR = 0.05  # error of the level after a step, relative to the step, while silicone settles
+SLOPE_ERROR = 0.4  # error of the slope after a step, relative to the step, 1/s
+MAX_INNOVATION = 2.5  # limit of the influence of a block on the level, standard deviations
+MAX_GROWTH = 3.0  # limit of the influence of a block on the noise, standard deviations
+MIN_SHARE = 0.01  # minimum noise, relative to a typical press
+MIN_V = 1e-7  # minimum noise, V; smaller steps are rounding
 MIN_CORRELATION = 0.25  # correlation of successive innovations above which a level is modelled as a random walk
 MEAN_TO_STD = math.sqrt(math.pi / 2)  # standard deviation over mean absolute value of a normal distribution
 STALL_S = 0.5  # a change that does not grow for longer has ended
@@ -82,13 +87,15 @@ SETTLED = 0.1  # a change that grows by a smaller share of itself in a block has
 RELEASE_S = 1.0  # a step in the direction of a release, within this time after one, belongs to it
 MAX_STEP = 20.0  # limit of a whitened step, so that a broken fibre does not outweigh the others
 CLEAR_STEP = 5.0  # whitened step above which a fibre adds to the typical press in V
-MIN_PRESSES, MIN_AGREEMENT = 3, 0.5  # touches, and their agreement, from which on their direction is used
-TOUCH_RATE, LEVEL_RATE = 0.05, 0.15  # weights of the newest touch and level in their running means
+MIN_PRESSES = 3  # touches after which their direction is used
+MIN_AGREEMENT = 0.5  # minimum agreement of touches for their direction to be used
+TOUCH_RATE = 0.05  # weight of the newest touch in running means
+LEVEL_RATE = 0.15  # weight of the newest level in running means
 MIN_FURTHER = -0.1  # projection on the step of a press below which a change belongs to its release
 FURTHER = 2  # event: a pad that is pressed is pressed further
-INVERTED, MIN_INVERTED = 1.2, 0.4
-"""Rests and presses are confused if rest levels scatter more than INVERTED times as the levels under presses, and more
-than MIN_INVERTED times the size of a typical press."""
+# Rests and presses are confused if the scatter of rest levels exceeds both:
+INVERTED = 1.2  # times the scatter of the levels under presses
+MIN_INVERTED = 0.4  # times the size of a typical press
 
 
 class State(IntEnum):

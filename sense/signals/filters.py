@@ -26,7 +26,7 @@ def total_variation(readings: ArrayLike, lam: float, fidelity: Fidelity = "robus
     The fidelity "robust" is sum |y_i - x_i|: outliers do not count by their distance, and lam counts readings, whatever
     the unit of y: a bump of fewer than 2 lam readings is removed. "squares" is 1/2 sum (y_i - x_i)^2: lam has the unit
     of y, and a bump of n readings is lowered by 2 lam / n. The robust minimiser is often not unique: from the last
-    reading back, the middle of the choices is taken. Cost: O(R min(R, lam)) for "robust", O(R) for "squares".
+    reading backwards, the middle of all possible values is taken. Cost: O(R min(R, lam)) for "robust", else O(R).
 
     Args:
         readings: any real type, NaN where missing (x then has the value of the next reading, else of the last; a

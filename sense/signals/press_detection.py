@@ -16,7 +16,8 @@ from padforge.sense.signals.detector_kernels import FURTHER, Change, State, dete
 
 P_REJECT = 1e-3  # probability that white noise makes a block leave the levels
 P_ACCEPT = 1e-9  # probability that white noise passes for a change
-TOUCH_DELAY_S, RELEASE_DELAY_S = 0.16, 0.08  # from a command to its first effect: means of the published recording
+TOUCH_DELAY_S = 0.16  # time from the command down to its first effect, mean of the published recording
+RELEASE_DELAY_S = 0.08  # the same from the command up
 MAX_LEAD = 2  # readings before its command at which a press may show: commands are noted a little late
 
 

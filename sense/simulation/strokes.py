@@ -1,6 +1,6 @@
 """Simulated strokes: a finger that touches a simulated pad, slides over it in a straight line, and lifts.
 
-At any time a stroke is like a press at the present position of the finger that began with the stroke. Residues along
+At any time the pad responds as if the finger had pressed its present position since the stroke began. Residues along
 the stroke are not simulated, since nobody has measured them.
 """
 
@@ -42,11 +42,11 @@ def simulate_strokes(
     share = np.arange(n_held) / n_held
     paths = starts[:, None] + share[:, None] * (ends - starts)[:, None]
     depth = np.minimum((np.arange(n_held) + 1) / (rig.rate_hz * TRAVEL_S), 1.0) * rig.press_depths_mm[0]
-    built = np.random.default_rng(rig.seed)
-    make_plan(pad, rig, built)  # `simulate` samples the presses before the pad
+    pad_rng = np.random.default_rng(rig.seed)
+    make_plan(pad, rig, pad_rng)  # `simulate` samples the presses before the pad
     positions_mm = np.concatenate([np.repeat(starts[:, None], n_rest, axis=1), paths], axis=1).reshape(-1, 2)
     depths_mm = np.tile(np.append(np.zeros(n_rest), depth), strokes)
-    readings = LivePad(pad, contact, rig, rig.rate_hz, built).volts(positions_mm, depths_mm)
+    readings = LivePad(pad, contact, rig, rig.rate_hz, pad_rng).volts(positions_mm, depths_mm)
     first = rig.readings_per_press * np.arange(strokes) + n_rest
     recording = Recording(
         readings,

@@ -104,10 +104,9 @@ def _split(presses: Indices, seed: int) -> tuple[Indices, Indices, dict[str, Ind
     The last ones are held out first, the test presses then drawn from the others.
     """
     rng = np.random.default_rng([7, seed])
-    first, last = split_presses(len(presses), "chronological", TEST_SHARE, rng)
-    fitted, test = split_presses(len(first), "random", TEST_SHARE, rng)
-    training, validation = split_presses(len(fitted), "random", TEST_SHARE, rng)
-    return presses[fitted[training]], presses[fitted[validation]], {"test": presses[test], "last": presses[last]}
+    others, last = split_presses(presses, "chronological", TEST_SHARE, rng)
+    others, test = split_presses(others, "random", TEST_SHARE, rng)
+    return *split_presses(others, "random", TEST_SHARE, rng), {"test": test, "last": last}
 
 
 def level_indices(readings: int, down_command: Indices, up_command: Indices) -> Indices:

@@ -19,7 +19,7 @@ from padforge.common.parallel import State
 from padforge.common.plotting import FAINT, HORIZONTAL, INK, VERTICAL, add_caption, save_figure, style_axes
 from padforge.common.progress import OnProgress, ignore_progress
 from padforge.common.settings import or_default
-from padforge.common.validation import InputError, check_int
+from padforge.common.validation import InputError
 from padforge.design.objectives.fibre_loss import failure_subsets
 from padforge.sense import settings
 from padforge.sense.arrays import Array, Indices
@@ -27,7 +27,7 @@ from padforge.sense.localizer.calibration import fit_recording, split_unseen
 from padforge.sense.localizer.evaluation import Evaluation, errors_by_loss, errors_by_position
 from padforge.sense.localizer.model import Localization, LocalizerModel
 from padforge.sense.recording.recording import Recording
-from padforge.sense.studies.study import Task, compute_states, draw_error_map, failed_label
+from padforge.sense.studies.study import Task, check_failed, compute_states, draw_error_map, failed_label
 
 FORMAT = "padforge-fibre-loss/1"
 ONE, RETRAINED = "one network", "retrained"  # the two methods, as the document calls them
@@ -93,7 +93,7 @@ def fibre_loss_study(
         retrain: whether networks are retrained for every set.
         options: split, share and seed; the defaults if None.
         max_failures: most fibres that fail at once; at least one is left.
-        failed: indices of fibres without which errors are mapped too, however many; none if empty.
+        failed: indices of any number of fibres; errors are also mapped without all of them.
         on_progress: called with (networks done, total, "").
 
     Raises:
@@ -105,9 +105,7 @@ def fibre_loss_study(
     options = or_default("options", options, settings.LocalizerSettings)
     fibres = recording.fibres
     most = min(max_failures, fibres - 1)
-    chosen = tuple(sorted({check_int("failed fibre", fibre, 0, fibres - 1) for fibre in failed}))
-    if len(chosen) == fibres:
-        raise InputError(f"failed are all {fibres} fibres, at least one must be left")
+    chosen = check_failed(failed, fibres, "the recording")
     training, test = split_unseen(recording, localizer, options)
     levels = range(most + 1)
     positions_mm = recording.presses_mm[test]
@@ -159,13 +157,9 @@ def train_without(
 
 def fibre_loss_lines(result: FibreLoss) -> list[str]:
     """Format the errors of both methods as a table."""
+    keys = ("mean_mm", "std_mm", "max_mm")
     cells = [
-        [
-            name,
-            f"{row['n_failed']}",
-            f"{row['subsets']}",
-            *(f"{row[f'{key}_mm']:.2f}" for key in ("mean", "std", "max")),
-        ]
+        [name, str(row["n_failed"]), str(row["subsets"]), *(f"{row[key]:.2f}" for key in keys)]
         for name, method in result.methods.items()
         for row in method.errors
     ]
@@ -219,7 +213,7 @@ def _error_grid(cells: Sequence[Mapping[str, float]]) -> tuple[Array, tuple[floa
     """Return mean errors by row and column, NaN where nothing is pressed, and their extent, mm."""
     middles = np.array([[cell["x_mm"], cell["y_mm"]] for cell in cells])
     low, high = middles.min(axis=0), middles.max(axis=0)
-    # not every row or column need have a cell: nothing is pressed in holes
+    # the smallest step between rows or columns, some of which may lack a cell: nothing is pressed in holes
     side = np.array(
         [np.diff(np.unique(middles[:, axis])).min(initial=max(high[axis] - low[axis], 1)) for axis in (0, 1)]
     )

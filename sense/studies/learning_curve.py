@@ -81,7 +81,7 @@ def learning_curve(
     options = or_default("options", options, settings.LocalizerSettings)
     rng = np.random.default_rng(options.seed)
     presses = np.flatnonzero(recording.has_position)
-    training, test = (presses[part] for part in split_presses(len(presses), options.split, options.test_share, rng))
+    training, test = split_presses(presses, options.split, options.test_share, rng)
     if len(training) * SHARES[0] < MIN_PRESSES:
         raise InputError(
             f"recording has {len(training)} presses to train on, "
@@ -90,8 +90,7 @@ def learning_curve(
     order = rng.permutation(training)
     sizes = [round(share * len(order)) for share in SHARES]
     options = options.model_copy(update={"members": 1, "method": "ensemble"})
-    # as many steps as in a calibration on that many presses: with one short training for all, more presses would hardly
-    # lower the error
+    # as many steps as in a calibration on so many presses; otherwise more presses would hardly lower the error
     steps = [training_steps(size, options) for size in sizes]
 
     def test_errors(number: int) -> Array:

@@ -33,7 +33,7 @@ class PressModel:
     def respond(self, pad: Morphology, presses: Array, rng: np.random.Generator, present: Mask | None = None) -> Array:
         """Sample the responses (Q, F) to presses (Q, 2), or to C simultaneous ones (Q, C, 2), whose strains add.
 
-        Of simultaneous presses, `present` (Q, C) says which there are, all if None; positions are in grid units.
+        Positions are in grid units. `present` (Q, C) is false for simultaneous presses that are left out, if any.
         """
         compute = relative_stretch if self.is_scattered else signals
         response = compute(pad, presses.reshape(-1, 2), self.contact).reshape(*presses.shape[:-1], -1)

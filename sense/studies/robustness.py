@@ -10,7 +10,6 @@ from matplotlib.figure import Figure
 
 from padforge.common.parallel import State
 from padforge.common.plotting import CURVES, INK
-from padforge.common.validation import InputError
 from padforge.design.contact import grid_positions, signals, signals_quantized
 from padforge.design.morphology import Morphology
 from padforge.design.objectives.fibre_loss import failure_subsets
@@ -21,6 +20,7 @@ from padforge.sense.studies.study import (
     Study,
     StudyResult,
     Task,
+    check_failed,
     describe_pads,
     draw_error_map,
     failed_label,
@@ -30,11 +30,12 @@ from padforge.sense.studies.study import (
 RULES = {"published": signals_quantized, "exact": signals}
 """Signals of sampled fibres, as in the published figures, or exact."""
 MIN_NETWORKS = 16
-"""Networks of a level: where there are fewer sets of failed fibres, each is trained several times, since the error of a
-single network depends on its first weights."""
+"""Minimum networks for each number of failed fibres. If there are fewer sets of these, several networks are trained for
+each, since the error of a single network depends on its first weights."""
 MAX_SETS = 1024  # sets of failed fibres of one size that are evaluated; if there are more, a sample is drawn
 Respond = Callable[[Morphology, Array], Array]
-HIDDEN, TEST = 50, 2000  # neurons of a network, and fresh presses to test on
+HIDDEN = 50  # neurons of a network
+TEST = 2000  # fresh presses to test on
 SIDE = 33  # cells along a side of an error map
 
 
@@ -50,10 +51,9 @@ def robustness_study(
 ) -> Study:
     """Evaluate networks that are retrained for every set of failed fibres, as published, with error maps.
 
-    The contact is PUBLISHED_CONTACT if None, and `rule` one of RULES. Up to `max_failures` fibres fail at once, and at
-    least one is left. Errors are also mapped without all fibres of the indices `failed`, if there are any.
-
-    The number of presses is a square.
+    The contact is PUBLISHED_CONTACT if None, `rule` one of RULES, and the number of training presses a square. Up to
+    `max_failures` fibres fail at once, and at least one is left. If indices `failed` are given, errors are also mapped
+    without all these fibres.
 
     Raises:
         InputError: a pad has none of the `failed` fibres, or no others.
@@ -66,11 +66,9 @@ def robustness_study(
         for level in range(min(max_failures, pad.layout.fibres - 1) + 1)
         for part in split_batches(failure_subsets(pad.layout.fibres, level, MAX_SETS))
     ]
-    chosen = tuple(sorted(set(failed)))
+    chosen: tuple[int, ...] = ()
     for label, pad in pads.items():
-        if chosen and not (chosen[-1] < pad.layout.fibres and len(chosen) < pad.layout.fibres):
-            numbers = "+".join(str(fibre + 1) for fibre in chosen)
-            raise InputError(f"failed are {numbers}, allowed are some of the {pad.layout.fibres} fibres of {label}")
+        chosen = check_failed(failed, pad.layout.fibres, label)
     parts += [(label, [chosen]) for label in pads if chosen]
     sizes = {"hidden": HIDDEN, "test": TEST, "seed": seed}
     evaluate = partial(_evaluate, respond=partial(RULES[rule], contact=contact), side=side, **sizes)
@@ -105,9 +103,8 @@ def _evaluate(
         for repeat in range(repeats)
         for network, failed in zip(presses.fit(failures, hidden, repeat), failures, strict=True)
     ]
-    fresh, training, maps = (
-        np.array(part).reshape(repeats, len(failures), -1).mean(axis=0) for part in zip(*errors, strict=True)
-    )
+    by_repeat = (np.array(part).reshape(repeats, len(failures), -1) for part in zip(*errors, strict=True))
+    fresh, training, maps = (part.mean(axis=0) for part in by_repeat)
     return {"fresh": fresh[:, 0], "training": training[:, 0], "maps": maps.astype(np.float32)}
 
 
@@ -187,9 +184,9 @@ def _draw(document: Mapping[str, Any]) -> Figure:
     levels = 1 + max(row["n_failed"] for row in document["rows"])
     panels = {label: [panel for panel in document["maps"] if panel["pad"] == label] for label in labels}
     columns = max(map(len, panels.values()))
-    maps_each = 1 if columns == 1 else 2  # rows of maps of a pad: errors, and their change
-    figure = Figure(figsize=(max(7.2, 1.9 * columns), 3.6 + 1.75 * maps_each * len(labels)), layout="constrained")
-    height_ratios = [1.9] + [1.0] * maps_each * len(labels)
+    map_rows = 1 if columns == 1 else 2  # of a pad: errors, and their change
+    figure = Figure(figsize=(max(7.2, 1.9 * columns), 3.6 + 1.75 * map_rows * len(labels)), layout="constrained")
+    height_ratios = [1.9] + [1.0] * map_rows * len(labels)
     grid = figure.add_gridspec(len(height_ratios), columns, height_ratios=height_ratios)
     axes = figure.add_subplot(grid[0, :])
     width = 0.8 / len(labels)
@@ -207,7 +204,7 @@ def _draw(document: Mapping[str, Any]) -> Figure:
     axes.set_title(caption, loc="left", fontsize=8.5)
     highest = float(np.quantile([panel["errors"] for panel in document["maps"]], 0.99))
     for number, (label, (intact, *others)) in enumerate(panels.items()):
-        row = 1 + maps_each * number
+        row = 1 + map_rows * number
         for column, panel in enumerate([intact, *others]):
             axes = figure.add_subplot(grid[row, column], aspect="equal")
             title, row_label = failed_label(panel["failed"]), "" if column else label

@@ -25,13 +25,11 @@ from padforge.design.settings import Contact, SearchSettings
 from padforge.sense.arrays import Array
 from padforge.sense.studies.study import Study, StudyResult, Task, describe_pads, label_axes
 
-MEMBERS = 6
-"""Networks whose errors are averaged, since that of a single one depends on its first weights."""
+MEMBERS = 6  # networks whose errors are averaged, since that of a single one depends on its first weights
 SIDE, TEST, HIDDEN = 32, 2000, 50
 FACTORS = (0.5, 1.0, 1.5)  # of the radius of the tool and of its depth in a layer
 RADII, SIDES = (0.6, 0.8, 1.0), (4, 30)  # published sizes K, grid units, and shapes D of the object, a polygon
-SCATTER = SearchSettings().response_scatter
-"""Scatter of the responses of a layer, as measured on a built pad."""
+SCATTER = SearchSettings().response_scatter  # scatter of the responses of a layer, as measured on a built pad
 
 
 class _Objects(NamedTuple):

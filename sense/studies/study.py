@@ -19,7 +19,7 @@ from padforge.common.parallel import State, one_thread, run_tasks
 from padforge.common.plotting import FAINT, INK, save_figure, style_axes
 from padforge.common.progress import OnProgress, ignore_progress
 from padforge.common.settings import validate
-from padforge.common.validation import InputError
+from padforge.common.validation import InputError, check_int
 from padforge.design.morphology import Morphology
 from padforge.design.settings import PUBLISHED_PAD, Layout
 from padforge.sense.arrays import Array, Indices
@@ -256,6 +256,14 @@ def classification_scores(confusions: Array) -> dict[str, float]:
         "accuracy_percent": float(100 * np.trace(confusions) / total),
         "majority_percent": float(100 * confusions.sum(axis=1).max() / total),
     }
+
+
+def check_failed(failed: Sequence[int], fibres: int, source: str) -> tuple[int, ...]:
+    """Return ascending indices of failed fibres; InputError if the source has no such fibres, or no others."""
+    indices = {check_int(f"index of a failed fibre of {source}", index, 0, fibres - 1) for index in failed}
+    if len(indices) == fibres:
+        raise InputError(f"failed are all {fibres} fibres of {source}, at least one must be left")
+    return tuple(sorted(indices))
 
 
 def failed_label(failed: Sequence[int]) -> str:

@@ -292,7 +292,8 @@ class AsBuiltPad:
         within = ((planned >= low) & (planned <= high)).all(axis=1)
         # 1. rotation and shift that bring the fibres as built closest to the plan
         a, b = (points[within] - points[within].mean(axis=0) for points in (built, planned))
-        turn = float(np.arctan2((a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).sum(), (a * b).sum()))
+        cross = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
+        turn = float(np.arctan2(cross.sum(), (a * b).sum()))
         rotation = np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]])
         rotated = built @ rotation
         shift = (planned - rotated)[within].mean(axis=0)
@@ -300,12 +301,10 @@ class AsBuiltPad:
         offset = (rotated + shift - planned).reshape(len(self.fibres), self.plan.elements, 2)
         basis = evaluate_along_fibre(np.eye(N_OFFSET), self.plan.elements)[0][0].T
         coefficients = np.linalg.lstsq(basis, offset.transpose(1, 0, 2).reshape(self.plan.elements, -1), rcond=None)[0]
-        # 3. the transform rotates about the middle of the pad, step 1 about its corner
+        # 3. the same in the transform, which rotates about the middle of the pad, and not about its corner
         values, middle = self.values.copy(), np.array(self.plan.layout.extent) / 2
         values[0] += turn
-        # middle @ rotation - middle
-        centring = middle[0] * (rotation.sum(axis=0) - 1) + (middle[1] - middle[0]) * (rotation[1] - [0, 1])
-        values[1:3] = values[1:3] @ rotation + self.plan.layout.unit_mm * (centring + shift)
+        values[1:3] = values[1:3] @ rotation + self.plan.layout.unit_mm * (middle @ rotation - middle + shift)
         rows = values[N_SHARED:].reshape(-1, N_CHANNEL)
         rows[:, OFFSET] = coefficients.reshape(N_OFFSET, len(self.fibres), 2).transpose(1, 2, 0).reshape(len(rows), -1)
         return replace(self, values=values)

@@ -20,7 +20,7 @@ from padforge.sense.simulation.simulated_recording import measure_rig_settings
 from padforge.sense.twin.as_built import N_COARSE, AsBuiltPad, PadPlan
 from padforge.sense.twin.contact_fit import ContactFit, fit_contact
 from padforge.sense.twin.fitting import AsBuiltFit, Priors, estimate_scatter, fit_as_built, gain_wander
-from padforge.sense.twin.press_parts import smooth_maps, split_presses
+from padforge.sense.twin.press_parts import separate_parts, smooth_maps
 from padforge.sense.twin.responses import (
     Responses,
     compute_responses,
@@ -234,12 +234,12 @@ def identify_pad(
     readings, parts, residual, pressed = None, {}, None, training
     if statistics := measure_rig_settings(recording):
         on_progress(0, 1, "parts of a press")
-        split = split_presses(recording, ~held_out_mask, statistics["hysteresis_s"])
-        parts = {name: _fit_part(fit, getattr(split.parts, name).select(rows, live)) for name in PARTS}
-        residual = _residual_maps(split.parts, parts, live, ~held_out_mask)
-        pressed = split.pressed.select(rows, live)
-        wander = gain_wander(parts["held"].pad, split.pressed.select(np.arange(len(positions_mm)), live))
-        readings = TwinReadings(**statistics | split.rig, gain_wander=wander)
+        separated = separate_parts(recording, ~held_out_mask, statistics["hysteresis_s"])
+        parts = {name: _fit_part(fit, getattr(separated.parts, name).select(rows, live)) for name in PARTS}
+        residual = _residual_maps(separated.parts, parts, live, ~held_out_mask)
+        pressed = separated.pressed.select(rows, live)
+        wander = gain_wander(parts["held"].pad, separated.pressed.select(np.arange(len(positions_mm)), live))
+        readings = TwinReadings(**statistics | separated.rig, gain_wander=wander)
 
     # 6. Contact, by a fit of the layer that is believed to be pressed; and the scatter of responses
     on_plan = replace(best.on_plan.pad, plan=plan)

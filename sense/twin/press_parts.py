@@ -8,6 +8,7 @@ those that make such pairs most alike.
 """
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from scipy.optimize import minimize
@@ -41,7 +42,7 @@ MAX_EVALUATIONS = 40  # of that fit in each round
 
 
 @dataclass(frozen=True)
-class SplitPresses:
+class SeparatedPresses:
     """Parts of Q presses in all channels, without the earlier residues that they remove."""
 
     parts: PressParts[Responses]
@@ -49,8 +50,15 @@ class SplitPresses:
     rig: dict[str, float]  # settings of `[rig]`: those in BOUNDS, and `touch_s`
 
 
-def split_presses(recording: Recording, training: Mask, hysteresis_s: float) -> SplitPresses:
-    """Split the presses of known position of a recording; maps of their parts are fitted to those in `training`."""
+class Kernels(NamedTuple):
+    """Windows of a press by 1 V of each of its parts, in the order of `PressParts`, and of the residues it removes."""
+
+    parts: Array  # (4, F)
+    removed: Array  # (F,)
+
+
+def separate_parts(recording: Recording, training: Mask, hysteresis_s: float) -> SeparatedPresses:
+    """Separate the parts of the presses of known position; maps of these parts are fitted to presses in `training`."""
     presses = recording.down_command, recording.up_command, recording.presses_mm
     down, up, positions_mm = (part[recording.has_position] for part in presses)
     inputs = compute_features(recording.readings, down, up)
@@ -63,25 +71,28 @@ def split_presses(recording: Recording, training: Mask, hysteresis_s: float) -> 
         return interpolate_grid(smooth_maps(positions[training], windows[training], valid[training]), positions)
 
     rig = RigSettings(hysteresis_s=hysteresis_s, memory=0.7, memory_mm=9.0)  # where the fit of the memory starts
-    # kernels 0 to 3 are those of the parts, kernel 4 that of the residues that the press removes
-    kernels, replaced, parts = part_kernels(cycle, rig), np.zeros(valid.shape), np.empty((4, *valid.shape))
-    is_held = kernels[0] >= min(HELD, kernels[0].max())
+    kernels, removed, parts = part_kernels(cycle, rig), np.zeros(valid.shape), np.empty((4, *valid.shape))
+    held_kernel = PressParts(*kernels.parts).held
+    is_held = held_kernel >= min(HELD, held_kernel.max())
     pressed = timed[:, :, is_held].mean(axis=2)
     for _ in range(3):
-        windows = timed - replaced[:, :, None] * kernels[4]
+        # 1. Parts of each press, without the residues that it removes
+        windows = timed - removed[:, :, None] * kernels.removed
         residual = (windows - smoothed(windows))[training]
         for c in range(valid.shape[1]):
-            parts[:, :, c] = _split(windows[:, c], residual[:, c], kernels[:4])
-        held, residues = np.moveaxis(smoothed(np.moveaxis(parts[[0, 3]], 0, 2)), 2, 0)
+            parts[:, :, c] = _split(windows[:, c], residual[:, c], kernels.parts)
+        # 2. Residues that presses remove, by what earlier ones left
+        estimated = PressParts(*parts)
+        held, residues = np.moveaxis(smoothed(np.moveaxis(np.array([estimated.held, estimated.after]), 0, 2)), 2, 0)
         presses = positions_mm, *times_s, residues, held
-        rig = _fit_memory(presses, pressed / kernels[4, is_held].mean(), training, rig)
-        replaced, kernels = replaced_residues(*presses, rig), part_kernels(cycle, rig)
-    pressed = pressed - kernels[4, is_held].mean() * replaced
-    held, onset, creep, after = (Responses(positions_mm, part, valid) for part in parts)
+        rig = _fit_memory(presses, pressed / kernels.removed[is_held].mean(), training, rig)
+        removed, kernels = replaced_residues(*presses, rig), part_kernels(cycle, rig)
+    pressed = pressed - kernels.removed[is_held].mean() * removed
+    responses = PressParts(*(Responses(positions_mm, part, valid) for part in parts))
     # at most the greatest value of `[rig]`, which readings that are far apart would exceed
     touch_s = min(_touch_std(positions_mm, timed, is_held) / recording.rate_hz, 1.0)
     fitted = {name: getattr(rig, name) for name in BOUNDS} | {"touch_s": touch_s}
-    return SplitPresses(PressParts(held, onset, creep, after), Responses(positions_mm, pressed, valid), fitted)
+    return SeparatedPresses(responses, Responses(positions_mm, pressed, valid), fitted)
 
 
 def _touch_std(positions_mm: Array, windows: Array, is_held: Mask) -> float:
@@ -128,10 +139,10 @@ def _fit_memory(presses: tuple[Array, ...], pressed: Array, training: Mask, rig:
     return to_settings(minimize(misfit, start, method="Nelder-Mead", options=options).x)
 
 
-def part_kernels(cycle: Cycle, rig: RigSettings) -> Array:
-    """Compute the windows of a press by 1 V of each part, and of removed residues; shape (5, F)."""
+def part_kernels(cycle: Cycle, rig: RigSettings) -> Kernels:
+    """Compute the kernels of a press, averaged over its delays."""
     unit, out = np.zeros((5, 2, 5)), []
-    unit[:, 0] = np.eye(5)
+    unit[:, 0] = np.eye(5)  # the first press has 1 V of part c in channel c, and removes 1 V of residues in channel 4
     share = (np.arange(DELAYS) + 0.5) / DELAYS
     for touch_s, release_s in zip(*(low + share * (high - low) for low, high in (DELAY_S, RELEASE_S)), strict=True):
         # a press, and none in the cycle after it
@@ -142,7 +153,8 @@ def part_kernels(cycle: Cycle, rig: RigSettings) -> Array:
         readings = Viscoelasticity(cycle.rate_hz, rig)(strain)
         down, up = np.array([cycle.down_index]), np.array([cycle.readings])
         out.append(compute_features(readings, down, up).windows[0, :, :N_TIMED])
-    return np.mean(out, axis=0)
+    *parts, removed = np.mean(out, axis=0)
+    return Kernels(np.array(parts), removed)
 
 
 def smooth_maps(positions: Array, windows: Array, valid: Mask) -> Array:

@@ -25,8 +25,8 @@ def training_presses(
         np.ones((len(inputs), n_timed), dtype=bool),
         targets.astype(np.float32),
         depth_gain=0.0,
-        now_factor=factor,
-        now_offset=np.zeros_like(factor),
+        latest_factor=factor,
+        latest_offset=np.zeros_like(factor),
         per_mm=1 / 20,
         speed=speed,
     )

@@ -101,6 +101,7 @@ def test_what_programs_ask_of_signals_and_localizers_in_vain(
         "other fibres, live": lambda: Live(localizer, rate_hz=20.0, fibres=3),
         "arrays, live": lambda: of_arrays.live(20.0),
         "a localizer before its fit, live": lambda: Localizer().live(20.0),
+        "a localizer before its fit, handed to live": lambda: Live(Localizer(), rate_hz=20.0),
         "readings of before, live": lambda: live.update(recording.times_s[8:12], recording.readings[8:12]),
         "lines for all without a token": lambda: JsonLines("0.0.0.0", 0),
         "a viewer without an address": lambda: RerunOutput("localhost:9876", 2, [1.0, 2.0], [20.0, 10.0]),

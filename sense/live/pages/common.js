@@ -1,4 +1,4 @@
-// Shared by the pages of a pad that is pressed: earlier presses, which fade, and the fibres' bars.
+// Parts that live.html and hand.html share: earlier presses, the older the fainter, and a bar for each fibre.
 function trailElements(view, before) {
   const {x, y} = frame(view)
   return before.map((press, index) => svgElement("circle", {

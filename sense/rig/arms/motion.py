@@ -81,7 +81,8 @@ class StraightMove:
 
     def distance_mm(self, position: Position) -> float:
         """Return the distance of a position from the path."""
-        path, offset = ([b - a for a, b in zip(self.start, end, strict=True)] for end in (self.end, position))
+        path = [b - a for a, b in zip(self.start, self.end, strict=True)]
+        offset = [b - a for a, b in zip(self.start, position, strict=True)]
         fraction = sum(a * b for a, b in zip(path, offset, strict=True)) / self.length_mm**2 if self.length_mm else 0.0
-        fraction = min(max(fraction, 0.0), 1.0)  # of the path, at the foot of the perpendicular
+        fraction = min(max(fraction, 0.0), 1.0)  # of the path, at its point nearest to the position
         return math.dist(offset, [fraction * value for value in path])

@@ -43,6 +43,8 @@ SETTINGS = ("G21", "G90", "M220 S100", "M211 S1", "M84 S0")
 _POLL_S = 0.03  # pause between two requests for the position
 _TOLERANCE_MM = 0.05  # tolerance of a position at rest: its last decimal and one motor step
 _START_S = 0.1  # time for which a firmware waits for further moves before it starts the first
+_MAX_LATE_S = 1.2  # a move that lasts longer than planned by more than this is implausible
+_MAX_OFF_PATH_MM = 1.0  # a position farther from the straight path is implausible
 _MAX_IMPLAUSIBLE = 3  # implausible positions in a row; fewer are noise
 
 
@@ -54,7 +56,8 @@ class NozzleThread(threading.Thread):
     ) -> None:
         super().__init__(name="printer", daemon=True)
         self._link, self._rig, self._max_mm_s, self._max_mm_s2 = link, rig, max_mm_s, max_mm_s2
-        self._position = self._reported = position  # the last one at rest, and the last one reported
+        self._position = position  # the last one at rest
+        self._reported = position  # the last one that was reported
         self._move: StraightMove | None = None
         self._move_start_s, self._acceleration, self._n_implausible = 0.0, 0.0, 0
         self._commands: queue.Queue[tuple[Callable[[], None], Future[None]]] = queue.Queue()
@@ -157,20 +160,21 @@ class NozzleThread(threading.Thread):
         position = self._ask_position("M114 R", None)
         now_s = clock.now()
         elapsed_s = now_s - self._move_start_s
-        if math.dist(position, move.end) <= _TOLERANCE_MM:
-            if elapsed_s >= move.duration_s:
-                self._add_state(now_s, position)
-                self._link.execute("M400")
-                self._check_at_rest(move.end)
-                self._stop_at(move.end)
-                return
-            position = move.position(elapsed_s - _START_S)  # the firmware reports no real-time position
-        is_late = elapsed_s > move.duration_s + 1.2
-        implausible = is_late or move.distance_mm(position) > 1.0  # from the straight path
-        self._n_implausible = self._n_implausible + 1 if implausible else 0
+        is_at_end = math.dist(position, move.end) <= _TOLERANCE_MM
+        if is_at_end and elapsed_s >= move.duration_s:
+            self._add_state(now_s, position)
+            self._link.execute("M400")
+            self._check_at_rest(move.end)
+            self._stop_at(move.end)
+            return
+        if is_at_end:  # too early: the firmware reports its target, and no real-time position
+            position = move.position(elapsed_s - _START_S)
+        is_late = elapsed_s > move.duration_s + _MAX_LATE_S
+        is_off_path = move.distance_mm(position) > _MAX_OFF_PATH_MM
+        self._n_implausible = self._n_implausible + 1 if is_late or is_off_path else 0
         if self._n_implausible >= _MAX_IMPLAUSIBLE:
             self._raise_displaced(f"is at {_format(position)}", move.end)
-        if not implausible:
+        if not self._n_implausible:
             self._add_state(now_s, position)
 
     def _quick_stop(self) -> None:

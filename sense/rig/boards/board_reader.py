@@ -4,7 +4,7 @@ import threading
 from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -150,7 +150,11 @@ def select_inputs(inputs: Sequence[int], n_inputs: int) -> tuple[int, ...]:
     return tuple(inputs) or tuple(range(n_inputs))
 
 
-Point = tuple[float, float]
+class Point(NamedTuple):
+    """Arrival of a block."""
+
+    nominal_s: float  # time by the board since the first block
+    delay_s: float  # arrival since that of the first block, less this time
 
 
 class SampleClock:
@@ -165,10 +169,9 @@ class SampleClock:
     def __init__(self, period_s: float, max_skew: float) -> None:
         self._period_s, self._max_skew = period_s, max_skew
         self._origin: tuple[int, float] | None = None  # index and arrival of the first block
-        # Points are (nominal time, delay), s; the fitted line is delay = offset + slope * nominal time.
         self._bucket_min: Point | None = None  # of the current bucket
         self._buckets: deque[Point] = deque(maxlen=60)  # minima of complete buckets
-        self._offset = self._slope = 0.0
+        self._offset = self._slope = 0.0  # of the fitted line, delay = offset + slope * nominal time
         self._last: tuple[int, float] | None = None  # index and time returned last
 
     def observe(self, index: int, arrival_s: float) -> None:
@@ -179,13 +182,13 @@ class SampleClock:
         nominal_s = (index - start) * self._period_s
         delay_s = arrival_s - start_s - nominal_s
         minimum = self._bucket_min
-        is_new_bucket = minimum is None or nominal_s // _BUCKET_S > minimum[0] // _BUCKET_S
+        is_new_bucket = minimum is None or nominal_s // _BUCKET_S > minimum.nominal_s // _BUCKET_S
         if minimum is not None and is_new_bucket:
             self._buckets.append(minimum)
             self._offset, self._slope = _fit_lower_line(list(self._buckets), self._max_skew)
         residual = delay_s - self._slope * nominal_s
-        if minimum is None or is_new_bucket or residual < minimum[1] - self._slope * minimum[0]:
-            self._bucket_min = (nominal_s, delay_s)
+        if minimum is None or is_new_bucket or residual < minimum.delay_s - self._slope * minimum.nominal_s:
+            self._bucket_min = Point(nominal_s, delay_s)
         self._offset = min(self._offset, residual)
 
     def times(self, indices: Indices) -> Array:
@@ -209,24 +212,24 @@ class SampleClock:
 
 
 def _fit_lower_line(points: list[Point], max_slope: float) -> tuple[float, float]:
-    """Return offset and slope of the line below all `points`, in ascending x, that is highest at their mean x.
+    """Return offset and slope of the line below all `points`, in order of time, that is highest at their mean time.
 
-    Without the limit of the slope, it is the edge of the lower convex hull at the mean x.
+    Without the limit of the slope, it is the edge of the lower convex hull at the mean time.
     """
     hull: list[Point] = []  # lower convex hull, by Andrew's monotone chain
     for point in points:
         while len(hull) > 1 and _slope(hull[-2], point) <= _slope(hull[-2], hull[-1]):
             hull.pop()
         hull.append(point)
-    mean_x = sum(x for x, _ in points) / len(points)
-    edge = next((i for i in range(1, len(hull)) if hull[i][0] >= mean_x), 0)
+    mean_s = sum(point.nominal_s for point in points) / len(points)
+    edge = next((i for i in range(1, len(hull)) if hull[i].nominal_s >= mean_s), 0)
     slope = _slope(hull[edge - 1], hull[edge]) if edge else 0.0
     slope = min(max(slope, -max_slope), max_slope)
-    return min(y - slope * x for x, y in points), slope
+    return min(point.delay_s - slope * point.nominal_s for point in points), slope
 
 
 def _slope(a: Point, b: Point) -> float:
-    return (b[1] - a[1]) / (b[0] - a[0])
+    return (b.delay_s - a.delay_s) / (b.nominal_s - a.nominal_s)
 
 
 class SampleAssembler(ABC):

@@ -62,7 +62,7 @@ class CsvBoard(SerialBoard):
         start_s = clock.now()
         while (elapsed_s := clock.now() - start_s) < _START_S + LISTEN_S:
             now_s, data = stream.receive()
-            received += data[: _MIN_LINES * 100]
+            received += data[: _MIN_LINES * 100]  # for the description of a wrong stream
             lines += [(now_s, numbers) for numbers in self._decode(data) if elapsed_s > _START_S and numbers]
         if len(lines) < _MIN_LINES:
             message, advice = describe_lines(bytes(received))
@@ -90,7 +90,7 @@ class CsvBoard(SerialBoard):
         level_v = float(np.median(np.abs(table[:, columns]))) * self._count_v
         warning = "its lines have no header and no check: what is damaged or lost is not seen"
         if level_v > 50.0:  # probably counts of a converter
-            warning += f"; they rest at {level_v:.4g}: if that are counts, [rig] count_v is the volts of one"
+            warning += f"; they rest at {level_v:.4g}: if these are counts, set [rig] count_v to the volts of one"
         return {
             "channels": len(inputs),
             "inputs": list(inputs),

@@ -50,9 +50,9 @@ def calibrate_shortly(
 def test_split_presses_partitions(presses: int, share: float, split: str, seed: int) -> None:
     if not 1 <= round(share * presses) <= presses - 3:
         with pytest.raises(InputError, match="holds"):
-            split_presses(presses, split, share, np.random.default_rng(seed))
+            split_presses(np.arange(presses), split, share, np.random.default_rng(seed))
         return
-    training, test = split_presses(presses, split, share, np.random.default_rng(seed))
+    training, test = split_presses(np.arange(presses), split, share, np.random.default_rng(seed))
     assert len(test) == round(share * presses)
     assert np.array_equal(np.sort(np.concatenate([training, test])), np.arange(presses))
     assert split == "random" or training.max() < test.min()

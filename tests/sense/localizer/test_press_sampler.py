@@ -80,7 +80,7 @@ def test_a_resting_finger_is_where_its_latest_windows_were(count: int) -> None:
     presses, table = make_presses(waves(), 1.0, 0.1)
     rng = np.random.default_rng(2)
     factor, offset = rng.standard_normal((2, FIBRES, len(LATEST_WINDOWS), N_PRESS_WINDOWS)).astype(np.float32)
-    presses = replace(presses, now_factor=factor, now_offset=offset)
+    presses = replace(presses, latest_factor=factor, latest_offset=offset)
     rows, features, _ = draw(presses, table, Phase(count, (1.0,)))
     np.testing.assert_allclose(features[:, :, :count], presses.inputs[rows][:, :, :count], atol=1e-5)
     scaled = factor * presses.inputs[rows][:, :, None, :N_PRESS_WINDOWS] + offset

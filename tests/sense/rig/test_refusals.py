@@ -276,6 +276,6 @@ def test_recordings_are_not_resumed_in_these_words(golden, tmp_path: Path) -> No
     }
     golden("rig/refusals_to_resume.txt", refusal_table(rows))
     assert plan_notice(replace(config, rig=rig(seed=9, presses=30))) == (
-        f"{run}: goes on by the plan it was begun with, [rig] presses = 6, seed = 0"
+        f"{run}: keeps the plan that it was begun with, [rig] presses = 6, seed = 0"
     )
     assert plan_notice(config) == ""

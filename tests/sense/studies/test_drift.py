@@ -85,9 +85,9 @@ def test_networks_do_not_depend_on_positions_of_test_presses(
     """Errors of test presses that are said to be 50 m to the right, and to the left, add up if predicted alike."""
     monkeypatch.setattr(drift, "COMPENSATIONS", ("baseline",))
     known, rng, far_mm = np.flatnonzero(recorded.has_position), np.random.default_rng([7, 0]), 5e4
-    first, last = split_presses(len(known), "chronological", drift.TEST_SHARE, rng)
-    _, test = split_presses(len(first), "random", drift.TEST_SHARE, rng)
-    held_out = np.isin(np.arange(len(recorded.presses_mm)), known[np.append(test, last)])
+    others, last = split_presses(known, "chronological", drift.TEST_SHARE, rng)
+    _, test = split_presses(others, "random", drift.TEST_SHARE, rng)
+    held_out = np.isin(np.arange(len(recorded.presses_mm)), np.append(test, last))
 
     def errors(shift_mm: float) -> dict[str, np.ndarray]:
         positions_mm = recorded.presses_mm + np.where(held_out[:, None], [shift_mm, 0.0], 0.0)

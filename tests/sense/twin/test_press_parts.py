@@ -7,7 +7,7 @@ from padforge.design import Contact, Morphology
 from padforge.sense import Recording, RigSettings, simulate
 from padforge.sense.simulation.built_pad import build_pad
 from padforge.sense.simulation.pad_model import SUPPLY_V, Cycle, resistance_changes
-from padforge.sense.twin.press_parts import SplitPresses, part_kernels, split_presses
+from padforge.sense.twin.press_parts import SeparatedPresses, part_kernels, separate_parts
 
 PAD = Morphology.random(2, knots=3, seed=5)
 RIG = RigSettings(presses=500, seed=1, scatter=0.0, floor_mv=0.0, gain_wander=0.0, drift_mv=0.0, hysteresis_s=12.0)
@@ -19,11 +19,11 @@ def recording() -> Recording:
 
 
 @pytest.fixture(scope="module")
-def split(recording: Recording) -> SplitPresses:
-    return split_presses(recording, np.arange(500) % 7 != 0, hysteresis_s=20.0)
+def split(recording: Recording) -> SeparatedPresses:
+    return separate_parts(recording, np.arange(500) % 7 != 0, hysteresis_s=20.0)
 
 
-def test_parts_memory_and_touch_are_those_that_were_simulated(recording: Recording, split: SplitPresses) -> None:
+def test_parts_memory_and_touch_are_those_that_were_simulated(recording: Recording, split: SeparatedPresses) -> None:
     depths_mm = np.full(500, RIG.press_depths_mm)
     changes = resistance_changes(build_pad(PAD, RIG), recording.presses_mm, depths_mm, Contact(), RIG)
     rest_v = np.median(recording.readings[:10], axis=0)
@@ -55,7 +55,7 @@ def test_parts_memory_and_touch_are_those_that_were_simulated(recording: Recordi
 
 def test_kernels_of_a_press() -> None:
     """It is held by its last windows, creeps meanwhile, and leaves what remains inverted; what it takes adds to it."""
-    held, onset, creep, after, replaced = part_kernels(Cycle(40, 13.3), RigSettings(hysteresis_s=1e4))
+    (held, onset, creep, after), replaced = part_kernels(Cycle(40, 13.3), RigSettings(hysteresis_s=1e4))
     assert held[6:9] == pytest.approx(1, abs=0.05)
     assert held[13:] == pytest.approx(0, abs=1e-9)
     assert onset[1] > held[1]
