@@ -110,8 +110,9 @@ def is_precise(error: float, pieces: int) -> bool:
 def _has_turn(span: Any, a: float, b: float, law: Any) -> bool:
     """Return whether a fibre turns from its axis to a steep rise within [a, b] so sharply that quadrature may miss it.
 
-    The turn is where the rise dv/ds is about the run dt/ds. It takes a fraction of about run / max_rise of [a, b], in
-    which the length per s is wrong by about the run. Up to a ratio of 8 the quadrature converges fast.
+    The turn is where the rise dv/ds is about as large as the run dt/ds. It takes a fraction of about run / max_rise of
+    [a, b]; nodes that miss it misjudge the length per s there by about the run. Quadrature converges fast if max_rise
+    is at most 8 times the smallest rise or the run.
     """
     if law.length == MANHATTAN:
         return False
@@ -158,7 +159,7 @@ _SIGN_CERTAIN_FACTOR = 1e6  # the sign of a value is certain if it is this many 
 
 @kernel
 def _expand_square(span: Any, a: float, b: float, radius: float, p: Any) -> None:
-    """Expand the squared distance less that of a circle in u, for s = a + (b - a) u, into the coefficients p (7,)."""
+    """Expand t^2 + v^2 - radius^2 in powers of u, with s = a + (b - a) u, into the coefficients p (7,)."""
     w = b - a
     t0, t1 = span[0] + span[1] * a, span[1] * w
     v0, v3 = evaluate_cubic(span, a), span[5] * w**3
@@ -343,7 +344,7 @@ def find_stretches_inside(
 ) -> Any:
     """Find the stretches of [a, b] inside a press, and return their number.
 
-    The arguments are no tuple, since taking an array out of a tuple costs as much as all other steps.
+    Arrays are separate arguments, since taking one out of a tuple costs as much as all other steps.
 
     Args:
         span: coefficients r, h, e0, e1, e2, e3 of the span; shape (6,).
@@ -357,7 +358,7 @@ def find_stretches_inside(
         out: receives begin and end of each stretch.
     """
     r, h, inner = span[0], span[1], extents[4]
-    # 1. Most spans lie wholly inside or outside, as does the box of their ends, since they are monotone.
+    # 1. Most spans lie wholly inside or outside, and so does the box of their ends, since spans are monotone.
     t_start, t_end, v_start, v_end = r + h * a, r + h * b, evaluate_cubic(span, a), evaluate_cubic(span, b)
     far_t, far_v = max(abs(t_start), abs(t_end)), max(abs(v_start), abs(v_end))
     if far_t * far_t + far_v * far_v < inner * inner:

@@ -46,10 +46,10 @@ def sum_excess_turns(
 ) -> float:
     """Integrate the relative excess of the turn within `window` of arc length over window / radius.
 
-    Windows begin at samples and, with `all_bends`, also end at samples: as the turn is linear between samples, it is
-    largest in one of these. At both ends a fibre continues straight as a lead, which it may meet at a corner. On a pad
-    that is worn bent, fibres turn by `rolled` at right angles to the plane of the pad; leads do not. The gradient is by
-    the turns and the ends of the windows.
+    Windows begin at samples and, with `all_bends`, also end at samples: since the turn is linear between samples, the
+    window of the largest turn is one of these. At both ends a fibre continues straight as a lead, which it may meet at
+    a corner. On a pad that is worn bent, fibres also turn by the angle `rolled` per window at right angles to the plane
+    of the pad; leads do not. The gradient includes the turns and the ends of the windows.
     """
     fibres, n = arc.shape
     size, total, n_directions = n + 4, 0.0, 2 if all_bends else 1
