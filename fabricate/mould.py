@@ -60,7 +60,7 @@ def cylinder(x: float, y: float, diameter_mm: float, sides: int = 64) -> shapely
 
 
 def _tray(outline: BaseGeometry, hollows: Iterable[BaseGeometry], floor: float, depth: float, flare: float = 0) -> Body:
-    """Build an open tray with rectangular hollows of a depth; walls lean outwards by `flare` from floor to rim."""
+    """Build an open tray with rectangular hollows; their walls lean outwards by `flare` from floor to rim."""
     rim, flare_per_mm = floor + depth, flare / depth
     cuts = tuple(Prism(hollow, floor, rim + 1, flare + flare_per_mm) for hollow in hollows)  # to 1 mm above the rim
     return Body((Prism(outline, 0, rim),), cuts)
@@ -95,7 +95,8 @@ def ridge_prisms(
 ) -> list[Prism]:
     """Build the terraces of the ridges of some fibres of a layer, the upper first; a ridge without taper has one.
 
-    `top_outline` is that of the uppermost terrace; the others deviate by `tolerance_mm`, or by that of the settings.
+    `top_outline` is the outline of the uppermost terrace. The outlines of the others deviate by at most `tolerance_mm`,
+    by default that of the settings.
     """
     floor, height = plan.settings.mould.floor_mm, plan.heights_mm[plan.layer_indices[fibres[0]]]
     prisms = []

@@ -134,7 +134,7 @@ class Spec:
         return cls(tables, str(path), sections)
 
     def section(self, model: type[AnySettings], **overrides: Any) -> AnySettings:
-        """Return the validated section.
+        """Return the validated section of a model.
 
         Args:
             model: model of the section.
@@ -147,14 +147,9 @@ class Spec:
         return validate(model, {**self.stated(model), **changes}, f"{self.source}: [{model.section()}]", changes)
 
     def replaced(self, tables: Mapping[str, Mapping[str, Any]], source: str = "") -> "Spec":
-        """Return a copy of these settings with other values.
-
-        Args:
-            tables: other values, by section and key.
-            source: name of the source in errors; that of these settings if empty.
-        """
+        """Return a copy with other values, by section and key; errors name its `source`, by default that of `self`."""
         source = source or self.source
-        Spec(tables, source)  # checks them
+        Spec(tables, source)  # checks the tables
         names = {*self._tables, *tables}
         return Spec({name: {**self._tables.get(name, {}), **tables.get(name, {})} for name in names}, source)
 
@@ -217,7 +212,7 @@ def _key_path(loc: Sequence[str | int], model: type[Settings], values: object) -
             path += f".{item}"
         else:
             continue
-        with suppress(LookupError, TypeError):  # the value here is no table or list
+        with suppress(LookupError, TypeError):  # this value is not a table or list
             values = cast("Any", values)[item]
     return path.removeprefix(".")
 
@@ -239,7 +234,7 @@ def commented_toml(models: Mapping[str, type[Settings]], preset: Mapping[str, Se
 def settings_schema(models: Mapping[str, type[Settings]]) -> dict[str, Any]:
     """Return the JSON Schema of a `pad.toml`, with which editors complete and check it.
 
-    It uses draft 7, the latest one that editors for TOML support. It leaves out rules across keys.
+    It uses draft 7, the latest one that editors for TOML support, and does not express rules across keys.
     """
     from pydantic.json_schema import models_json_schema  # slow to import, and needed by one command only
 
