@@ -61,11 +61,8 @@ def read_variants(
 
     Varied values are TOML, such as "pad.grid=3,4,6". They apply to settings, not to morphologies, and to the default
     settings if there are no sources. If they vary the thickness of the pad or the depths of the fibres in `[contact]`,
-    the mould follows.
-
-    Raises:
-        InputError: an invalid file, key or value, two variants of one name, fewer than two variants, or more than
-            MAX_VARIANTS.
+    the mould follows. InputError is raised for invalid files, keys and values, for two variants of one name, and unless
+    there are 2 to MAX_VARIANTS.
     """
     varied = [_parse_varied(text) for text in vary]
     variants = []
@@ -116,13 +113,9 @@ def compare(
     """Design and make every variant in its own folder, evaluate it, and write comparison.json and comparison.png.
 
     Each pad and straight fibres of its layout are evaluated by their expected errors (`errors_by_contact`) on the
-    pad's own sensed area, under its own contact and under the others that a search for it serves.
-
-    Returns:
-        The document: a row per variant, with errors in mm with 0, 1, ... failed fibres.
-
-    Raises:
-        KeyboardInterrupt: a search was interrupted; the finished pads are in their folders.
+    pad's own sensed area, under its own contact and under the others that a search for it serves. Returned is the
+    document, with a row for each variant. KeyboardInterrupt is raised if a search was interrupted; the finished pads
+    are in their folders then.
     """
     rows = []
     for variant in variants:

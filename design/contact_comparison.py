@@ -25,8 +25,7 @@ def errors_by_contact(
 ) -> dict[tuple[str, str], list[float]]:
     """Compute the expected errors of pads of one layout under every contact, with the same random numbers.
 
-    Returns:
-        Errors, mm, with 0, 1, ... fibres failed, by the names of contact and pad.
+    Errors, in mm, are with 0, 1, ... fibres failed, by the names of contact and pad.
     """
     names = list(product(contacts, pads))
     with threadpool_limits(1, "blas"):  # else the first task to end lifts the limit that the others run under

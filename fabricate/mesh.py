@@ -24,11 +24,9 @@ Numbers = NDArray[np.int64]
 _log = logging.getLogger(__name__)
 
 _STL_RECORD = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
-
 _STL_TITLE_BYTES = 1000  # an STL that is text has its first facet within these
 _STL_HEAD_BYTES = 84  # header of a binary STL, and its number of triangles
-SEPARATION_MM = 1e-4
-"""Distance by which coincident vertices are separated: far below what prints, far above the resolution of a float."""
+SEPARATION_MM = 1e-4  # by which coincident vertices are separated: far below what prints, far above float resolution
 
 
 def build_mesh(body: Body) -> Manifold:

@@ -17,8 +17,8 @@ from padforge.common.validation import InputError
 from padforge.fabricate.plan import Plan, offset_box
 from padforge.fabricate.settings import WELL_MM, WELL_RIM_MM, WELL_SLOT_MM
 
+# printed bodies, and their colours in CAD programs and slicers
 BODY_COLOURS = {"mould": "#8FA3B8", "lid": "#D9C27E", "conductive": "#6F8F72", "holder": "#B0886E"}
-"""The printed bodies, and their colours in CAD programs and slicers."""
 INTO_FLOOR_MM = 0.2  # overlap of a part with the solid below it, so that no two faces coincide
 LID_MM = 3.0  # thickness of the lid
 _VENT_MM = 1.5  # diameter of the lid's vents
@@ -28,8 +28,7 @@ _FUNNEL_MM = 6.0  # height of the spout's funnel
 _FUNNEL_WALL_MM = 2.0
 _FUNNEL_FLARE_MM = _FUNNEL_MM * math.tan(math.radians(30.0))  # increase of the funnel's radius up to its top
 _PIN_CLEARANCE_MM = 0.3  # difference in diameter between the lid's holes and the pins
-HOLDER_WALL_MM = 1.0
-"""Height of the holder's walls above its floor, far below the pad's surface, so that no probe touches them."""
+HOLDER_WALL_MM = 1.0  # height of the holder's walls above its floor, far below the pad's surface, where no probe goes
 HOLDER_PLAY_MM = 0.2  # clearance on every side of the pad in its holder
 
 Position = tuple[float, float]

@@ -95,7 +95,11 @@ class PrinterSettings(Settings):
         return self.nozzle_mm * (2 if self.resin else 1)
 
     def is_whole_layers(self, height_mm: float) -> bool:
-        """Return whether a height is a whole number of layers."""
+        """Return whether a height is a whole number of layers.
+
+        Args:
+            height_mm: height.
+        """
         layers = height_mm / self.layer_mm
         return round(layers) > 0 and abs(layers - round(layers)) <= 1e-6
 
@@ -151,7 +155,7 @@ class FabricationSettings:
     """All settings of a mould and of fibre placement, except the paths of the fibres, which the morphology has.
 
     `pad` has the deep family, keep-outs, leads and bending radius. `contact`, if settings state one, is assumed for a
-    morphology that does not state the contact it was designed for.
+    morphology that does not state the contact that it was designed for.
     """
 
     mould: MouldSettings = field(default_factory=MouldSettings)
@@ -176,6 +180,9 @@ class FabricationSettings:
     @classmethod
     def from_spec(cls, spec: Spec) -> "FabricationSettings":
         """Read the sections of a `pad.toml`.
+
+        Args:
+            spec: settings file.
 
         Raises:
             InputError: a key is unknown or a value out of range, or the mould contradicts `[contact]`.
@@ -228,7 +235,14 @@ class FabricationSettings:
         return max(self.rules.min_mean_bend_radius_mm, self.fibre.material.min_bend_radius_mm or 0)
 
     def require_consistent(self, layout: Layout) -> None:
-        """Raise InputError if settings contradict each other or the pitches of `layout`."""
+        """Check that settings do not contradict each other or the pitch of the pad.
+
+        Args:
+            layout: fibres and pitch.
+
+        Raises:
+            InputError: settings contradict each other.
+        """
         mould = self.mould
         pitches = (layout.pitch_y_mm, layout.horizontals), (layout.pitch_x_mm, layout.verticals)
         pitch_mm = min(pitch for pitch, count in pitches if count)

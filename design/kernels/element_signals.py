@@ -47,31 +47,18 @@ need more.
 
 
 class Elements(NamedTuple):
-    """Fibres cut into E elements: fine ones for near presses, then coarse ones for far presses.
+    """Fibres cut into E elements: fine ones for near presses, then coarse ones for far presses."""
 
-    Attributes:
-        horizontals: number of fibres, the first ones, that run along x.
-        starts: first fine element of each span and, in the last column, the end of the last span; shape (F, n).
-        far_starts: the same of coarse elements; shape (F, n).
-        along: coordinates along the axis of the fibre; shape (E,), grid units.
-        across: coordinates across it; shape (E,), grid units.
-        length: lengths; shape (E,), grid units.
-        tangent_along: unit tangents, along the axis; shape (E,).
-        tangent_across: unit tangents, across it; shape (E,).
-        share: positions on the span, from 0 to 1; shape (E,).
-        weight: quadrature weights, relative to the span; shape (E,).
-    """
-
-    horizontals: int
-    starts: Any
-    far_starts: Any
-    along: Array
-    across: Array
-    length: Array
-    tangent_along: Array
-    tangent_across: Array
-    share: Array
-    weight: Array
+    horizontals: int  # number of fibres, the first ones, that run along x
+    starts: Any  # first fine element of each span and, in the last column, the end of the last span; shape (F, n)
+    far_starts: Any  # the same of coarse elements; shape (F, n)
+    along: Array  # coordinates along the axis of the fibre; shape (E,), grid units
+    across: Array  # coordinates across it; shape (E,), grid units
+    length: Array  # lengths; shape (E,), grid units
+    tangent_along: Array  # unit tangents, along the axis; shape (E,)
+    tangent_across: Array  # unit tangents, across it; shape (E,)
+    share: Array  # positions on the span, from 0 to 1; shape (E,)
+    weight: Array  # quadrature weights, relative to the span; shape (E,)
 
 
 def weight_table(law: WeightLaw) -> Array:
@@ -166,22 +153,10 @@ def _count_pieces(h: float, rise: float, d0: float, d1: float, longest: float) -
 def _count_elements(
     along: Any, across: Any, slope: Any, horizontals: int, low: Any, high: Any, nodes: int, spacing: float, total: int
 ) -> Any:
-    """Count pieces and elements of spans.
+    """Return the number of pieces and the first element of each span, both (F, n), and in the last column their end.
 
-    Args:
-        along: knots along the fibres; shape (F, n).
-        across: knots across the fibres; shape (F, n).
-        slope: slopes at the knots; shape (F, n).
-        horizontals: number of fibres that run along x.
-        low: lower corner of the rectangle outside which spans get no pieces; shape (2,).
-        high: upper corner; shape (2,).
-        nodes: elements of a piece.
-        spacing: maximum mean length of an element.
-        total: number of elements before the first span.
-
-    Returns:
-        Number of pieces of each span, and its first element; both of shape (F, n). The last column of the latter has
-        the end of the last span.
+    A piece has `nodes` elements, of a mean length of at most `spacing`; `total` elements precede the first span. Spans
+    outside the rectangle from `low` to `high`, both (2,), get no pieces.
     """
     fibres, n = along.shape
     pieces, starts = np.zeros((fibres, n), np.int64), np.zeros((fibres, n), np.int64)

@@ -26,8 +26,7 @@ from padforge.design.kernels.exact_signals import (
 from padforge.design.kernels.geometry import EPS, INVERSE, MANHATTAN, UNIFORM, find_touched_range, select_frame, weigh
 from padforge.design.kernels.pchip import piece_of
 
-MIN_SINE = 0.02
-"""Minimum sine of the angle between fibre and boundary, without which the derivative would be unbounded."""
+MIN_SINE = 0.02  # minimum sine of the angle between fibre and boundary; the derivative would be unbounded without it
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(12)
 
 

@@ -52,10 +52,8 @@ GAUSS = np.array(
         0.417959183673469387755102040816327,
     ]
 )
-MAX_HALVINGS = 48
-"""Maximum depth of the halved intervals of a quadrature."""
-PRECISION = 1e-11
-"""Maximum relative error of a piece without a closed form."""
+MAX_HALVINGS = 48  # maximum depth of the halved intervals of a quadrature
+PRECISION = 1e-11  # maximum relative error of a piece without a closed form
 
 
 @kernel

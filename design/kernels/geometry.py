@@ -16,30 +16,19 @@ Array = NDArray[np.float64]
 EPS = 2.0**-52
 UNIFORM, INVERSE_SQUARE, INVERSE, PROFILE = 0, 1, 2, 3
 MANHATTAN, EUCLIDEAN = 0, 1
-DEGREE = 7
-"""Degree of the polynomials of a layer's profile; those of splines are cubic, with their other coefficients 0."""
-PLAIN = 1
-"""First column of the coefficients of w in a row of a profile."""
-DIRECTED = 2 + DEGREE
-"""First column of the coefficients of v."""
-COLUMNS = 3 + 2 * DEGREE
-"""Number of columns of a profile."""
+DEGREE = 7  # of the polynomials of a layer's profile; those of splines are cubic, with further coefficients 0
+PLAIN = 1  # first column of the coefficients of w in a row of a profile
+DIRECTED = 2 + DEGREE  # first column of the coefficients of v
+COLUMNS = 3 + 2 * DEGREE  # number of columns of a profile
 
 
 class Ends(NamedTuple):
-    """Positions of fibre ends: horizontal i (from 0) at the height (i + 1) spacing_y, vertical i at (i + 1) spacing_x.
+    """Positions of fibre ends: horizontal i, from 0, at the height (i + 1) spacing_y, vertical i at (i + 1) spacing_x."""
 
-    Attributes:
-        horizontals: number of horizontals.
-        verticals: number of verticals.
-        spacing_y: distance of horizontals, grid units.
-        spacing_x: distance of verticals, grid units.
-    """
-
-    horizontals: int
-    verticals: int
-    spacing_y: float
-    spacing_x: float
+    horizontals: int  # number of horizontals
+    verticals: int  # number of verticals
+    spacing_y: float  # distance of horizontals, grid units
+    spacing_x: float  # distance of verticals, grid units
 
 
 class WeightLaw(NamedTuple):
@@ -49,28 +38,17 @@ class WeightLaw(NamedTuple):
     the direction to the centre; v is 0 at d = 0. It has a table for each family, since their fibres may lie at
     different depths. A row of the table has a squared distance, and the coefficients of the polynomials w and v in the
     excess over that squared distance, which hold up to that of the next row.
-
-    Attributes:
-        radius: circumradius of the shape, or the distance at which a profile ends.
-        weight: UNIFORM, INVERSE_SQUARE, INVERSE or PROFILE.
-        length: MANHATTAN or EUCLIDEAN.
-        profile: the tables; shape (2, B, COLUMNS), or (B, COLUMNS) in the frame of a family.
-        bins: row of the profile at the beginning of each of equal steps of the squared distance.
-        bin_rate: steps per squared distance.
-        directional: whether v is not 0.
-        near: distance from which the profile is smooth enough for a coarse quadrature.
-        edge: distance of the edge of a contact, at which the profile bends most; 0 if there is none.
     """
 
-    radius: float
-    weight: int
-    length: int
-    profile: Array = np.empty((2, 0, COLUMNS))
-    bins: NDArray[np.int32] = np.empty(0, np.int32)
-    bin_rate: float = 0.0
-    directional: bool = False
-    near: float = math.inf
-    edge: float = 0.0
+    radius: float  # circumradius of the shape, or the distance at which a profile ends
+    weight: int  # UNIFORM, INVERSE_SQUARE, INVERSE or PROFILE
+    length: int  # MANHATTAN or EUCLIDEAN
+    profile: Array = np.empty((2, 0, COLUMNS))  # the tables; without the first axis in the frame of a family
+    bins: NDArray[np.int32] = np.empty(0, np.int32)  # row at the beginning of each of equal steps of squared distance
+    bin_rate: float = 0.0  # steps per squared distance
+    directional: bool = False  # whether v is not 0
+    near: float = math.inf  # distance from which the profile is smooth enough for a coarse quadrature
+    edge: float = 0.0  # distance of the edge of a contact, at which the profile bends most; 0 if there is none
 
 
 @kernel

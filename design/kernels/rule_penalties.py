@@ -17,10 +17,8 @@ import numpy as np
 from padforge.common.compilation import kernel
 from padforge.design.kernels.pchip import add_value_gradient, extremes, pchip_value
 
-STEEPNESS = 10.0
-"""Coefficient of the square in the cost of a small distance."""
-REACH = 6.0
-"""Standard deviations beyond which the density of a crossing is neglected, since it is below 1e-7."""
+STEEPNESS = 10.0  # coefficient of the square in the cost of a small distance
+REACH = 6.0  # standard deviations beyond which the density of a crossing is neglected, since it is below 1e-7
 
 
 @kernel

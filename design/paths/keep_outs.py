@@ -41,14 +41,10 @@ def is_outside(positions: NDArray[np.float64], pad: PadSettings) -> NDArray[np.b
 
 
 class _Passage:
-    """Lanes on which the fibres of a family pass the box of a keep-out, with smooth transitions before and after it.
+    """Lanes on which the k fibres of a family pass the box of a keep-out, with smooth transitions before and after it.
 
-    Attributes:
-        begin: coordinate along the fibres from which they are on their lanes, grid units.
-        end: coordinate up to which they are.
-        lanes: coordinate across, on its lane, of each fibre; shape (k,), grid units.
-        transitions: lengths of the transitions before `begin` and after `end`, grid units.
-        marks: coordinates along at which the transitions begin and end.
+    From `begin` to `end` along the axis fibres are at `lanes` (k,) across it; `transitions` are the lengths before and
+    after, and `marks` the coordinates along at which transitions begin and end. All are in grid units.
     """
 
     def __init__(self, box: Array, family: int, pad: PadSettings, rules: RulesSettings) -> None:

@@ -13,8 +13,8 @@ from padforge.common.files import check_file
 from padforge.common.validation import InputError
 
 MAX_BYTES = 2**33  # size limit of a file
+# classes of MATLAB 7.3 whose datasets are not matrices of numbers
 _OBJECTS = ("cell", "char", "table", "timetable", "string", "datetime", "duration", "categorical")
-"""Classes of MATLAB 7.3 whose datasets are not matrices of numbers."""
 
 
 class Hdf5Reader:

@@ -95,15 +95,9 @@ class Spec:
         source: str = "built-in defaults",
         sections: Collection[str] | None = None,
     ) -> None:
-        """Check the names of sections; their contents are validated by `section`.
+        """Check that `tables` has only the allowed `sections`, any if None; `section` validates their contents.
 
-        Args:
-            tables: sections by name.
-            source: name of the source in errors.
-            sections: allowed names; any if None.
-
-        Raises:
-            InputError: a section is unknown, or not a table.
+        Errors name the `source`.
         """
         allowed = check_mapping("tables", tables) if sections is None else sections
         if unknown := [name for name in tables if name not in allowed]:
@@ -114,15 +108,7 @@ class Spec:
 
     @classmethod
     def load(cls, path: Path | None, sections: Collection[str] | None = None) -> "Spec":
-        """Read a TOML file.
-
-        Args:
-            path: the file; None for the defaults.
-            sections: allowed names; any if None.
-
-        Raises:
-            InputError: the file cannot be read, is not TOML, or has an unknown section.
-        """
+        """Read a TOML file with the allowed `sections`, any if None; a `path` of None stands for the defaults."""
         if path is None:
             return cls({})
         path = check_path("path", path)
@@ -134,14 +120,9 @@ class Spec:
         return cls(tables, str(path), sections)
 
     def section(self, model: type[AnySettings], **overrides: Any) -> AnySettings:
-        """Return the validated section of a model.
+        """Return the validated section of a model; raise InputError if a key is unknown or a value out of range.
 
-        Args:
-            model: model of the section.
-            **overrides: values that replace those of the file, unless None; their errors do not name the file.
-
-        Raises:
-            InputError: a key is unknown or a value out of range.
+        Overrides that are not None replace values of the file; errors in them do not name the file.
         """
         changes = {key: value for key, value in overrides.items() if value is not None}
         return validate(model, {**self.stated(model), **changes}, f"{self.source}: [{model.section()}]", changes)
