@@ -28,7 +28,7 @@ _FUNNEL_MM = 6.0  # height of the spout's funnel
 _FUNNEL_WALL_MM = 2.0
 _FUNNEL_FLARE_MM = _FUNNEL_MM * math.tan(math.radians(30.0))  # increase of the funnel's radius up to its top
 _PIN_CLEARANCE_MM = 0.3  # difference in diameter between the lid's holes and the pins
-HOLDER_WALL_MM = 1.0  # height of the holder's walls above its floor, far below the pad's surface, where no probe goes
+HOLDER_WALL_MM = 1.0  # height of the holder's walls above its floor, far below the pad's surface and any probe
 HOLDER_PLAY_MM = 0.2  # clearance on every side of the pad in its holder
 
 Position = tuple[float, float]

@@ -23,7 +23,7 @@ COLUMNS = 3 + 2 * DEGREE  # number of columns of a profile
 
 
 class Ends(NamedTuple):
-    """Positions of fibre ends: horizontal i, from 0, at the height (i + 1) spacing_y, vertical i at (i + 1) spacing_x."""
+    """Fibre ends: horizontal i, from 0, is at the height (i + 1) spacing_y, vertical i at x = (i + 1) spacing_x."""
 
     horizontals: int  # number of horizontals
     verticals: int  # number of verticals
