@@ -240,18 +240,18 @@ def _find_between_lines(
     start: float,
     after: float,
     lines: Any,
-    near: Any,
+    may_cross: Any,
     tolerance: float,
     scratch: Any,
     stretches: Any,
     count_inside: Any,
 ) -> Any:
-    """Append the stretches of [start, after] on which the span is between two lines; `near` says which may cross it."""
+    """Append the stretches of [start, after] on which the span, which `may_cross` either line, is between both."""
     roots, work, p, _ = scratch
     (upper_start, upper_end, lower_start, lower_end), count = lines, np.int64(0)
-    if near[0]:
+    if may_cross[0]:
         count = _find_line_roots(span, start, after, upper_start, upper_end, tolerance, roots, count, work, p)
-    if near[1]:
+    if may_cross[1]:
         count = _find_line_roots(span, start, after, lower_start, lower_end, tolerance, roots, count, work, p)
     shell_sort(roots, count)
     begin = start
@@ -261,10 +261,8 @@ def _find_between_lines(
         for share in _PROBES:
             s = begin + share * (end - begin)
             x, v = (s - start) / (after - start), evaluate_cubic(span, s)
-            to_upper, to_lower = (
-                upper_start + (upper_end - upper_start) * x - v,
-                v - lower_start - (lower_end - lower_start) * x,
-            )
+            to_upper = upper_start + (upper_end - upper_start) * x - v
+            to_lower = v - lower_start - (lower_end - lower_start) * x
             above = to_upper if abs(to_upper) > abs(above) else above
             below = to_lower if abs(to_lower) > abs(below) else below
             if min(abs(above), abs(below)) > _SIGN_CERTAIN_FACTOR * tolerance:

@@ -248,10 +248,8 @@ def sum_crossings(
                 if flat > 0 and sine < 1 - 1e-9:
                     grad_sine = -weights[1] * area * density / limit / math.sqrt(1 - sine * sine)
                     grad_area += grad_sine / (lp * lq + 1e-12)
-                    grad_lp, grad_lq = (
-                        -grad_sine * sine * lq / (lp * lq + 1e-12),
-                        -grad_sine * sine * lp / (lp * lq + 1e-12),
-                    )
+                    grad_lp = -grad_sine * sine * lq / (lp * lq + 1e-12)
+                    grad_lq = -grad_sine * sine * lp / (lp * lq + 1e-12)
                 sign = 1.0 if product > 0 else -1.0 if product < 0 else 0.0
                 dpx, dpy = grad_area * sign * qy + grad_lp * px / lp, -grad_area * sign * qx + grad_lp * py / lp
                 dqx, dqy = -grad_area * sign * py + grad_lq * qx / lq, grad_area * sign * px + grad_lq * qy / lq

@@ -99,9 +99,8 @@ def _overlaps(mean: Array, jacobian: Array, log_det: Array, count: int) -> Array
     inner[..., :2, :2], inner[..., 2:, 2:] = diagonal[:count, None], diagonal
     inner[..., :2, 2:] = np.tensordot(half[:count], half, axes=(1, 1)).transpose(0, 2, 1, 3)
     inner[..., 2:, :2] = inner[..., :2, 2:].swapaxes(-1, -2)
-    along = np.concatenate(
-        [offset @ half[:count], (offset.swapaxes(0, 1) @ half).swapaxes(0, 1)], axis=-1
-    )  # W^T offset
+    by_cell = [offset @ half[:count], (offset.swapaxes(0, 1) @ half).swapaxes(0, 1)]
+    along = np.concatenate(by_cell, axis=-1)  # W^T offset
     square = (offset**2).sum(axis=-1) - (along * np.linalg.solve(inner, along[..., None])[..., 0]).sum(axis=-1)
     distance = square / 8 + (np.linalg.slogdet(inner)[1] - (log_det[:count, None] + log_det[None]) / 2) / 2
     return np.exp(-distance)
