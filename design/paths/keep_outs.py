@@ -105,7 +105,7 @@ def pass_keep_outs(knots: Array, pad: PadSettings, rules: RulesSettings) -> Arra
 def straight_paths(pad: PadSettings, rules: RulesSettings, count: int) -> Array:
     """Return the knots (F, count + 2, 2) of straight fibres, which pass keep-outs if the rules are enforced.
 
-    Knots lie at the marks of the passages, or are evenly spaced if there are more marks than knots.
+    Knots include the marks of the passages, unless these are more than `count`.
     """
     layout = pad.layout
     marks = []
