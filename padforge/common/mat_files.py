@@ -61,7 +61,7 @@ class Hdf5Reader:
     def read(self, name: str) -> NDArray[Any]:
         """Read the values of a dataset; raise InputError if they are not real numbers."""
         if (dataset := self._datasets.get(name)) is None:
-            raise InputError(f"{name} is not a dataset with all of its values in this file")
+            raise InputError(f"{name} is not readable, expected a dataset with all of its values in this file")
         if getattr(dataset, "size", 0) is None or not self.is_numeric(name):
             raise InputError(f"{name} holds {dataset.dtype} values, expected an array of real numbers")
         return np.asarray(dataset[()])
