@@ -178,7 +178,7 @@ def score(morphology: Path, spec: Path | None, twin: Path | None) -> None:
     pad, settings, pad_settings, violations = _load_and_check(morphology, spec, twin)
     contact, search, rules = read_contact(settings), settings.section(SearchSettings), settings.section(RulesSettings)
     terms = score_terms(
-        pad, contact, search.max_failures, rules=rules, size=pad_settings, scatter=search.response_scatter
+        pad, contact, search.max_failures, rules=rules, pad_settings=pad_settings, scatter=search.response_scatter
     )
     _echo_large_strain(contact)
     common.show_result({"terms": terms, "violations": list(map(asdict, violations))}, [], as_json=True)

@@ -13,6 +13,7 @@ from padforge.common.command_line import text_table
 from padforge.common.files import provenance, write_json
 from padforge.common.plotting import CURVES, FAINT, add_caption, add_title, new_figure, save_figure, style_axes
 from padforge.common.profiling import stage
+from padforge.common.progress import OnProgress
 from padforge.common.settings import Spec
 from padforge.common.validation import InputError, short_repr
 from padforge.design.contact import half_width_mm
@@ -27,10 +28,9 @@ from padforge.design.settings import Contact, PadSettings, RulesSettings, Search
 FORMAT, NAME = "padforge-comparison/1", "comparison.json"
 MAX_VARIANTS = 64
 MODELS = (PadSettings, Contact, SearchSettings, RulesSettings)  # settings of a design, which may be varied
-# makes the mould of a pad in a folder, and returns its costs by the keys of COSTS
 MakePad = Callable[[Morphology, Spec, Path], Mapping[str, Any]]
-# columns that not every pad has, with their units
-COSTS = {
+"""Makes the mould of a pad in a folder, and returns its costs by the keys of COSTS."""
+COSTS = {  # heading and unit of the columns that not every pad has
     "half_width_mm": ("width", "mm"),
     "force_n": ("force", "N"),
     "strain_percent": ("strain", "%"),
@@ -59,12 +59,10 @@ def read_variants(
 ) -> list[Variant]:
     """Return the pads to compare: morphologies, and settings (.toml) under every combination of varied values.
 
-    These are TOML, such as "pad.grid=3,4,6", and apply to settings only, the default ones if there are no sources. The
-    mould follows the thickness of the pad and the depths of fibres that vary in `[contact]`.
-
-    Raises:
-        InputError: an invalid file, key or value, two variants of one name, fewer than two variants, or more than
-            MAX_VARIANTS.
+    Varied values are TOML, such as "pad.grid=3,4,6". They apply to settings, not to morphologies, and to the default
+    settings if there are no sources. If they vary the thickness of the pad or the depths of the fibres in `[contact]`,
+    the mould follows. InputError is raised for invalid files, keys and values, for two variants of one name, and unless
+    there are 2 to MAX_VARIANTS.
     """
     varied = [_parse_varied(text) for text in vary]
     variants = []
@@ -112,35 +110,33 @@ def _parse_varied(text: str) -> list[tuple[str, str, Any]]:
 def compare(
     variants: Sequence[Variant], out: Path, options: SearchOptions, seed: int | None, make_pad: MakePad
 ) -> dict[str, Any]:
-    """Design and make every variant in its own folder, evaluate all alike, and write comparison.json and .png.
+    """Design and make every variant in its own folder, evaluate it, and write comparison.json and comparison.png.
 
-    A pad is evaluated by its expected errors on its own sensed area, under its own contact and the others that a search
-    for it serves, beside straight fibres of the same layout (`errors_by_contact`).
-
-    Returns:
-        The document: a row per variant, with errors in mm with 0, 1, ... failed fibres.
-
-    Raises:
-        KeyboardInterrupt: a search was interrupted; the finished pads are in their folders.
+    Each pad and straight fibres of its layout are evaluated by their expected errors (`errors_by_contact`) on the
+    pad's own sensed area, under its own contact and under the others that a search for it serves. Returned is the
+    document, with a row for each variant. KeyboardInterrupt is raised if a search was interrupted; the finished pads
+    are in their folders then.
     """
     rows = []
     for variant in variants:
         folder, pad = out / variant.folder, variant.pad
         if pad is None:
-
-            def report(done: int, total: int, what: str, name: str = variant.name) -> None:
-                options.on_progress(done, total, f"{name}, {what}")
-
-            _, result = run_design(variant.spec, folder, {"seed": seed}, options=replace(options, on_progress=report))
+            on_progress = _name_progress(options.on_progress, variant.name)
+            named = replace(options, on_progress=on_progress)
+            _, result = run_design(variant.spec, folder, {"seed": seed}, options=named)
             if result.stopped == "interrupted":
                 raise KeyboardInterrupt  # ends the comparison, not only this search
             pad = result.morphology
         rows.append(_evaluate(variant, pad, seed) | dict(make_pad(pad, variant.spec, folder)))
-    origin = provenance("padforge design compare", seed)
-    document = {"format": FORMAT, "rows": rows, "provenance": origin}
+    document = {"format": FORMAT, "rows": rows, "provenance": provenance("padforge design compare", seed)}
     write_json(out / NAME, document)
     _draw_comparison(rows, out / "comparison.png")
     return document
+
+
+def _name_progress(on_progress: OnProgress, name: str) -> OnProgress:
+    """Return a callback that puts a name before each message."""
+    return lambda done, total, what: on_progress(done, total, f"{name}, {what}")
 
 
 def _evaluate(variant: Variant, pad: Morphology, seed: int | None) -> dict[str, Any]:
@@ -174,9 +170,9 @@ def _evaluate(variant: Variant, pad: Morphology, seed: int | None) -> dict[str, 
 def comparison_lines(document: Mapping[str, Any]) -> list[str]:
     """Format a comparison as two tables of text, of costs and of errors, within 100 columns for short names.
 
-    Widths are half widths of a press, strains the greatest stretch of a fibre under it, cast the silicone, and faults
-    failed checks of the mould. Below a pad that differs from straight fibres are the errors of these, and of both under
-    other contacts.
+    In the first, `width` is the half width of a press, `strain` the greatest stretch of a fibre under it, `cast` the
+    volume of silicone, and `faults` the number of failed checks of the mould. In the second, a pad that differs from
+    straight fibres is followed by the errors of straight fibres, and by those of both under other contacts.
     """
     rows = document["rows"]
     costs = {key: heads for key, heads in COSTS.items() if any(key in row for row in rows)}
@@ -199,7 +195,7 @@ def comparison_lines(document: Mapping[str, Any]) -> list[str]:
 
 
 def _draw_comparison(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
-    """Draw the errors by failed fibres, and those with none and most failed by length of fibre."""
+    """Draw errors over the number of failed fibres, and errors with none and with most failed over fibre length."""
     figure, _ = new_figure(9.6, 4.2)
     figure.clear()
     by_failures, by_length = figure.subplots(1, 2)

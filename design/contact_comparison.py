@@ -23,12 +23,12 @@ FORMAT, NAME = "padforge-contacts/1", "contacts.json"
 def errors_by_contact(
     pads: Mapping[str, Morphology], contacts: Mapping[str, Contact], pad_settings: PadSettings, search: SearchSettings
 ) -> dict[tuple[str, str], list[float]]:
-    """Compute the expected errors of pads of one layout under every contact, all by the same random numbers.
+    """Compute the expected errors of pads of one layout under every contact, with the same random numbers.
 
-    They are in mm, with 0, 1, ... fibres failed, by the names of contact and pad.
+    Errors, in mm, are with 0, 1, ... fibres failed, by the names of contact and pad.
     """
     names = list(product(contacts, pads))
-    with threadpool_limits(1, "blas"):  # around those of the tasks, which would lift them for one another
+    with threadpool_limits(1, "blas"):  # else the first task to end lifts the limit that the others run under
         tasks = (((c, p), partial(expected_errors, pads[p], contacts[c], search, pad_settings)) for c, p in names)
         errors = dict(run_tasks(tasks))
     return {(c, p): [pads[p].unit_mm * error for error in errors[c, p]] for c, p in names}

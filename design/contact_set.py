@@ -4,7 +4,7 @@ from padforge.design.contact import half_width_mm, widened
 from padforge.design.settings import MEASURED_STD_MM, PUBLISHED_CONTACT, Contact, SearchSettings
 
 UNCERTAINTY = 0.1
-"""Relative uncertainty of the width of a measured profile, by which profiles from parts of one recording differ."""
+"""Relative uncertainty of the width of a measured profile: profiles from parts of one recording differ by as much."""
 
 
 def served_contacts(assumed: Contact, search: SearchSettings) -> dict[str, Contact]:
@@ -20,29 +20,29 @@ def served_contacts(assumed: Contact, search: SearchSettings) -> dict[str, Conta
 def _plausible_contacts(assumed: Contact) -> dict[str, Contact]:
     """Return contacts that the assumed one may turn out to be.
 
-    The share in which a press stretches fibres is the least certain part of a layer: on the built pad an isotropic
-    profile explains as much as the directions of a layer do. So a pad serves the layer, and the measured isotropic
-    profile at 0.75 and at 1.25 of its width, which grows with the width of the press as that of the layer does. Fibres
-    that are only pressed flat respond in between. A profile was measured, so that only its width is uncertain. A shape
-    is a convention, to be served as it is.
+    - Of a layer, the least certain part is how much a press stretches fibres: on the built pad an isotropic profile
+      explains the responses as well as a layer does. So the others are the measured isotropic profile at 0.75 and at
+      1.25 of its width, in proportion to the width of the layer. Fibres that are only pressed flat respond in between.
+    - A profile was measured, so only its width is uncertain.
+    - A shape is a convention and has no others.
     """
     if assumed.model == "layer":
         scale = half_width_mm(assumed) / half_width_mm(Contact())
         return {
             f"isotropic, {half_width_mm(profile):.2g} mm": profile
-            for profile in (widened(Contact(model="profile"), scale * share) for share in (0.75, 1.25))
+            for profile in (widened(Contact(model="profile"), scale * factor) for factor in (0.75, 1.25))
         }
     if assumed.model == "profile":
-        shares = {"narrower": 1 - UNCERTAINTY, "wider": 1 + UNCERTAINTY}
-        return {f"{UNCERTAINTY:.0%} {name}": widened(assumed, share) for name, share in shares.items()}
+        factors = {"narrower": 1 - UNCERTAINTY, "wider": 1 + UNCERTAINTY}
+        return {f"{UNCERTAINTY:.0%} {name}": widened(assumed, factor) for name, factor in factors.items()}
     return {}
 
 
 def judged_contacts(assumed: Contact, search: SearchSettings) -> dict[str, Contact]:
     """Return the contacts that a pad is judged by, by name: those that a search serves, and others; none twice.
 
-    Beside a layer the others are presses by a tool half as large or half as deep, and fibres that respond to being
-    pressed flat alone; beside another contact they are narrower and wider profiles, and the published disc.
+    Beside a layer the others are a tool of half the radius, a press of half the depth, and fibres that respond only to
+    being pressed flat. Beside another contact they are Gaussian profiles of three widths, and the published shape.
     """
     if assumed.model == "layer":
         tool_mm, depth_mm = assumed.tool_radius_mm / 2, assumed.depth_mm / 2

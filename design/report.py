@@ -46,20 +46,17 @@ TOLERANCE = 1e-3  # deviation of drawn curves from exact ones, grid units
 def draw_plan(
     pad: Morphology, contact: Contact, violations: "Sequence[Violation]" = (), keep_out_mm: Sequence[Corners] = ()
 ) -> "Figure":
-    """Draw the plan of a pad.
+    """Draw the plan of a pad, with axes in mm from its centre.
 
     Crossings within a family are ringed, broken rules marked with a red cross, keep-outs hatched; the contact is drawn
-    at the centre. Fibres are numbered from 1 at their starts, as in the mould. An SVG names them, so that it can be
-    imported again.
+    at the centre. Fibres are numbered from 1 at their starts, as in the mould. An SVG holds their names, so that it can
+    be imported again.
 
     Args:
         pad: the pad.
         contact: the contact.
         violations: broken rules, as `check_rules` returns them.
         keep_out_mm: polygons that fibres must avoid, mm from the centre of the pad.
-
-    Returns:
-        A matplotlib figure with axes in mm from the centre of the pad.
     """
     from matplotlib.figure import Figure
     from matplotlib.patches import Polygon, Rectangle
@@ -81,12 +78,12 @@ def draw_plan(
         ha, va, dx, dy = (("right", "center", 0.02, 0), ("center", "top", 0, 0.02))[family]
         axes.text(x[0] - dx * half, y[0] - dy * half, str(fibre + 1), color=color, fontsize=9, ha=ha, va=va)
 
-    markers = [
-        (pad.to_mm(c.position), pad.layout.family(c.first) == pad.layout.family(c.second)) for c in crossings(pad)
-    ]
-    for same, size, color in ((False, 10, INK), (True, 40, ALARM)):
-        points = np.array([position for position, is_same in markers if is_same == same]).reshape(-1, 2)
-        axes.scatter(*points.T, s=size, facecolor="none" if same else color, edgecolor=color, linewidth=0.8, zorder=3)
+    across, same = [], []  # positions of crossings of the families, and of crossings within one
+    for c in crossings(pad):
+        (same if pad.layout.family(c.first) == pad.layout.family(c.second) else across).append(pad.to_mm(c.position))
+    for positions, size, face, edge in ((across, 10, INK, INK), (same, 40, "none", ALARM)):
+        points = np.array(positions).reshape(-1, 2)
+        axes.scatter(*points.T, s=size, facecolor=face, edgecolor=edge, linewidth=0.8, zorder=3)
     axes.add_patch(_contact_patch(contact, pad.unit_mm))
     points = np.array([v.place_mm for v in violations if v.place_mm is not None]).reshape(-1, 2)
     axes.scatter(*points.T, marker="x", s=50, color=ALARM, linewidth=1.8, zorder=4)
@@ -94,10 +91,9 @@ def draw_plan(
     x_limit, y_limit = width + 0.08 * half, height + 0.08 * half
     axes.set(xlabel="x (mm)", ylabel="y (mm)", xlim=(-x_limit, x_limit), ylim=(-y_limit, y_limit))
     axes.spines[["top", "right"]].set_visible(False)
-    n_same = sum(same for _, same in markers)
     axes.set_title(
-        f"{pad.layout}, {len(markers)} crossings"
-        + (f", {n_same} within a family" if n_same else "")
+        f"{pad.layout}, {len(across) + len(same)} crossings"
+        + (f", {len(same)} within a family" if same else "")
         + (f", {len(violations)} violation{'s' * (len(violations) > 1)} of rules" if violations else ""),
         fontsize=10,
         color=ALARM if violations else INK,
@@ -106,7 +102,7 @@ def draw_plan(
 
 
 def _contact_patch(contact: Contact, unit_mm: float) -> "Circle | Polygon":
-    """Return the outline of a contact, or the circle at half of the largest weight of a measured profile."""
+    """Return the outline of a shape, or the circle at half of the largest weight of a layer or a profile."""
     from matplotlib.patches import Circle, Polygon
 
     style = {"color": INK, "alpha": 0.15, "linewidth": 0}
@@ -186,7 +182,7 @@ def _size_text(sides_mm: Iterable[float]) -> str:
 
 
 def draw_press(contact: Contact, pitch_mm: float) -> "Figure":
-    """Draw a press into a layer in section, beside the weights of elements of fibres by their distance from it.
+    """Draw the section of a layer under a press, and the weight of a fibre element over its distance from the press.
 
     Vertical fibres, `pitch_mm` apart, cross the section.
     """
@@ -237,7 +233,7 @@ def _tool_surface(contact: Contact, x: Array) -> Array:
 
 
 def _sink(press: LayerPress, r: Array, height_mm: float) -> Array:
-    """Return how far the silicone at a height is down, mm: the integral of its vertical strain from the base."""
+    """Return the downward displacement of the silicone at a height, mm: the integral of its strain from the base."""
     heights = (np.arange(6) + 0.5) / 6 * height_mm
     return np.sum([press.strains(r, z, FIBRE_BLUR_MM).compressive for z in heights], axis=0) * height_mm / 6
 
@@ -245,11 +241,11 @@ def _sink(press: LayerPress, r: Array, height_mm: float) -> Array:
 def press_sections(
     document: Mapping[str, Any], max_strain: float | None, silicone: tuple[str, float] | None = None
 ) -> list[PageSection]:
-    """Return the section on the press that a pad is designed for, with its picture; none unless it is into a layer.
+    """Return the section on the press that a pad is designed for, with its picture; none if it has no layer.
 
     Args:
         document: `design.json` of the pad; a damaged one raises any of the built-in errors.
-        max_strain: elongation that the fibres bear, relative to their length; None if unknown.
+        max_strain: maximum strain of the fibres; None if unknown.
         silicone: name and Young's modulus, kPa; None for Ecoflex 00-20.
     """
     settings = document["provenance"]["settings"]
@@ -263,16 +259,16 @@ def press_sections(
     families = zip(FAMILIES, contact.fibre_depths_mm, half_widths_mm(contact), fibre_strains(contact), strict=True)
     for name, depth, width, (squeeze, stretch) in families:
         result = "-" if max_strain is None else "pass" if stretch <= max_strain else "warn"
-        bears = "-" if max_strain is None else f"{max_strain:.0%}"
-        rows.append([name, depth, f"{width:.1f}", f"{squeeze:.0%}", f"{stretch:.0%}", bears, result])
+        allowed = "-" if max_strain is None else f"{max_strain:.0%}"
+        rows.append([name, depth, f"{width:.1f}", f"{squeeze:.0%}", f"{stretch:.0%}", allowed, result])
     lead = (
         f"A {contact.tool} of {contact.tool_radius_mm:g} mm, pressed {contact.depth_mm:g} mm deep into silicone of"
         f" {contact.thickness_mm:g} mm, touches it within {press.contact_radius_mm:.1f} mm and takes"
-        f" {force_n:.1f} N on {silicone_name}. Fibres respond to being pressed flat and stretched, by the strains"
-        " of an elastic layer, which are small ones: large presses exceed what it says."
+        f" {force_n:.1f} N on {silicone_name}. Fibres respond to being pressed flat and stretched. The strains are"
+        " those of a linear elastic layer, which holds for small strains only."
     )
     caption = "The press in section, true to scale, and the weight of an element of a fibre by its distance from it."
-    head = ["fibres", "depth (mm)", "half width (mm)", "pressed flat by", "stretched by", "they bear", "result"]
+    head = ["fibres", "depth (mm)", "half width (mm)", "pressed flat by", "stretched by", "maximum strain", "result"]
     with TemporaryDirectory() as temporary:
         path = Path(temporary) / "press.png"
         save_figure(draw_press(contact, PadSettings(**settings["pad"]).layout.pitch_x_mm), path)
@@ -296,7 +292,7 @@ def contact_lines(document: Mapping[str, Any]) -> list[str]:
 
 
 def _shares_of_straight(document: Mapping[str, Any]) -> dict[str, list[float]]:
-    """Return the errors of the designed pad over those of straight fibres, by contact."""
+    """Return the ratios of the errors of the designed pad to those of straight fibres, by contact."""
     errors = {(row["contact"], row["pad"]): row["errors_mm"] for row in document["rows"]}
     return {
         contact: [a / b for a, b in zip(errors[contact, "designed"], errors[contact, "straight"], strict=True)]
@@ -305,13 +301,13 @@ def _shares_of_straight(document: Mapping[str, Any]) -> dict[str, list[float]]:
 
 
 def contact_sections(folder: Path, document: Mapping[str, Any]) -> list[PageSection]:
-    """Return how the simulated errors in a `contacts.json` depend on the contact model; see `design_sections`."""
+    """Return the section on how the errors in a `contacts.json` depend on the contact model; see `design_sections`."""
     rows, scatter = document["rows"], document["scatter"]
     levels = range(max(len(row["errors_mm"]) for row in rows))
     lead = (
         "The contact is assumed until a printed pad is identified. Here the pad, and straight fibres of the same pad,"
-        " are judged under other contacts as well: expected error in mm of a localizer that has learnt each, by one"
-        f" reading of each fibre with a scatter of {float(scatter['share']):.0%} of the response and"
+        " are judged under other contacts as well: expected error in mm of a localizer that is trained under each, by"
+        f" one reading of each fibre with a scatter of {float(scatter['share']):.0%} of the response and"
         f" {float(scatter['floor']):.1%} of full scale. Where rows differ, errors depend on the contact as"
         " much as on the pad; where straight fibres are better, optimising has not paid off."
     )

@@ -220,7 +220,7 @@ class Contact(Settings, frozen=True):
     tool_radius_mm: float = Field(default=8.4, ge=0.1, le=1000, description="tip radius of the tool, mm")
     depth_mm: float = Field(default=PRESS_DEPTH_MM, ge=0.01, le=100, description="depth of the press, of a layer, mm")
     thickness_mm: float = Field(default=SILICONE_MM, ge=0.1, le=1000, description="thickness of the pad, mm")
-    base: Base = Field(default="slipping", description="what the pad does on what it lies on")
+    base: Base = Field(default="slipping", description="boundary condition between the pad and what it lies on")
     fibre_depths_mm: Annotated[FibreDepths, BeforeValidator(as_tuple)] = Field(
         default=FIBRE_DEPTHS_MM, description="depth of the [horizontal, vertical] fibres below the pressed face, mm"
     )
@@ -430,20 +430,24 @@ class RulesSettings(Settings):
             degrees or more: they have 0.8 mm / sin(angle) in common.
     """
 
-    enforce: bool = Field(default=True, description="false drops every rule: a choice to design the unbuildable")
+    enforce: bool = Field(default=True, description="false disables all rules: the pad may then not be buildable")
     min_mean_bend_radius_mm: RuleMm = Field(
-        default=1.0, description="least bend radius of a fibre, in the mean over half of it along the fibre, mm"
+        default=1.0, description="minimum bend radius of a fibre, as the mean over half that length, mm"
     )
-    min_gap_mm: RuleMm = Field(default=0.8, description="least gap of centre lines in a family, or folds of one, mm")
-    same_family_crossings: int = Field(default=0, ge=0, description="crossings allowed between fibres of one family")
-    max_crossings: MaxCrossings = Field(default=None, description='crossings of families (at least grid^2), or "any"')
-    min_crossing_angle_deg: float = Field(default=0.0, ge=0, le=90, description="least angle of crossings, degrees")
+    min_gap_mm: RuleMm = Field(
+        default=0.8, description="minimum gap of centre lines in a family, or within a folded fibre, mm"
+    )
+    same_family_crossings: int = Field(default=0, ge=0, description="maximum crossings between fibres of one family")
+    max_crossings: MaxCrossings = Field(
+        default=None, description='maximum crossings of the families (at least grid^2), or "any"'
+    )
+    min_crossing_angle_deg: float = Field(default=0.0, ge=0, le=90, description="minimum angle of crossings, degrees")
     max_common_track_mm: MaxCommon = Field(
-        default=2.0, description='length for which a horizontal may run on a vertical, within 0.4 mm, mm, or "any"'
+        default=2.0, description='maximum length of a horizontal within 0.4 mm of a vertical, mm, or "any"'
     )
-    border_mm: RuleMm = Field(default=2.0, description="least distance of a fibre to the border, mm")
-    keep_out_mm: RuleMm = Field(default=1.5, description="least distance of a fibre to a keep-out of [pad], mm")
-    max_length_mm: float = Field(default=500.0, gt=0, le=1e6, description="greatest length of a fibre, mm")
+    border_mm: RuleMm = Field(default=2.0, description="minimum distance of a fibre to the border, mm")
+    keep_out_mm: RuleMm = Field(default=1.5, description="minimum distance of a fibre to a keep-out of [pad], mm")
+    max_length_mm: float = Field(default=500.0, gt=0, le=1e6, description="maximum length of a fibre, mm")
 
 
 def _check_contacts(value: object) -> object:
@@ -632,7 +636,7 @@ class PadSettings(Settings):
         bent_radius_mm: None for a flat pad. It is cast flat in either case.
     """
 
-    grid: int = Field(default=4, ge=1, le=256, description="fibres per family (M), where the next two do not say")
+    grid: int = Field(default=4, ge=1, le=256, description="fibres per family (M), unless the next two state it")
     horizontals: Count = Field(default=None, description='fibres along x, or as "grid"; 0: a strip of fibres across it')
     verticals: Count = Field(default=None, description='fibres along y, or as "grid"; 0: a strip of fibres across it')
     pitch_mm: Annotated[PitchMm | tuple[PitchMm, PitchMm], BeforeValidator(_check_pitches)] = Field(
@@ -652,7 +656,7 @@ class PadSettings(Settings):
     )
     keep_out_mm: Annotated[tuple[_StatedKeepOut, ...], Field(max_length=64), BeforeValidator(as_tuple)] = Field(
         default=(),
-        description="what no fibre enters: holes [x, y, diameter], polygons [[x, y], ...]; from the middle, mm",
+        description="keep-outs: holes [x, y, diameter], polygons [[x, y], ...]; mm from the middle",
     )
     bent_radius_mm: BentRadius = Field(default=None, description='radius of a cylinder about y it is on, mm, or "flat"')
 

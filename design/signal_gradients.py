@@ -16,20 +16,20 @@ from padforge.design.morphology import Array, fibre_ends
 from padforge.design.settings import Contact, Layout
 
 Differentiate = Callable[[Array], Array]
-"""From the derivatives (F, Q) of a value by signals to those (3, F, n) by along, across and slope of the curves."""
+"""Takes the gradient (F, Q) of a value by the signals; returns that (3, F, n) by along, across and slope."""
 
 
 @dataclass(frozen=True)
 class FibreCurves:
     """The PCHIP curves of a pad's fibres, grid units.
 
-    Gradients (3, F, n) are by the knots along and across the fibres and by the slopes there, as if those were
-    independent of the knots; `by_knots` then adds what the slopes depend on.
+    Gradients (3, F, n) are by the knots along and across the fibres and by the slopes there, treated as independent;
+    `by_knots` adds the part of the gradient by the slopes to that by the knots.
     """
 
-    along: Array  # knots along the fibres; float64, shape (F, n)
-    across: Array  # and across them; shape (F, n)
-    layout: Layout  # where fibres end
+    along: Array  # coordinates of the knots along the fibres; float64, shape (F, n)
+    across: Array  # coordinates of the knots across them; shape (F, n)
+    layout: Layout  # positions of the fibre ends
 
     @cached_property
     def slope(self) -> Array:
@@ -37,18 +37,18 @@ class FibreCurves:
         return population_slopes(self.along[None], self.across[None])[0]
 
     def by_knots(self, gradient: Array) -> Array:
-        """Return the gradient (2, F, n) by the knots alone of a value that has the gradient (3, F, n)."""
+        """Return the gradient (2, F, n) by knots, on which slopes depend, of a value with the gradient (3, F, n)."""
         return gradient[:2] + fibre_slopes_gradient(self.along, self.across, self.slope, gradient[2])
 
     def lengths(self) -> tuple[Array, Array]:
-        """Compute the arc lengths (F,), to 1e-3 where fibres are steep, and each one's gradient (3, F, n)."""
+        """Compute the arc lengths (F,), to 1e-3 where fibres are steep, and the gradient of each; shape (3, F, n)."""
         gradient = np.empty((3, *self.along.shape))
         return arc_lengths_gradient(self.along, self.across, self.slope, gradient), gradient
 
     def signals(self, presses: Array, contact: Contact) -> tuple[Array, Differentiate]:
-        """Compute the signals (F, Q) of presses (Q, 2), grid units for weights without unit, and what differentiates.
+        """Compute the signals (F, Q) of presses (Q, 2), and return them with the function of their reverse pass.
 
-        They are exact for a shape, and of the `search_precision` for a layer or a profile.
+        Signals are exact for a shape, and have the `search_precision` for a layer or a profile.
         """
         t, v, d, unit_mm = self.along, self.across, self.slope, self.layout.unit_mm
         out = np.zeros((len(presses), len(t)))
@@ -57,10 +57,11 @@ class FibreCurves:
             spacings = element_spacings(contact, unit_mm, search_precision(contact))
             elements = fibre_elements(t, v, d, self.layout.horizontals, presses, law, spacings)
             element_signals(t, v, elements, presses, law, table, out)
-            kernel = lambda upstream: elements_gradient(t, v, d, elements, presses, upstream, law, table)  # noqa: E731
+            pull_back = lambda upstream: elements_gradient(t, v, d, elements, presses, upstream, law, table)  # noqa: E731
         else:
             shape, ends = press_shape(contact, unit_mm), fibre_ends(self.layout)
             curves, max_offsets = (t[None], v[None], d[None]), compute_max_offsets(v[None], self.layout)
             exact_signals(curves, max_offsets, ends, presses, shape, 0, len(presses), out[None])
-            kernel = lambda upstream: signals_gradient(t, v, d, max_offsets[0], ends, presses, upstream, shape)  # noqa: E731
-        return out.T, lambda grad_signals: np.asarray(kernel(np.ascontiguousarray(grad_signals.T)))
+            offsets = max_offsets[0]
+            pull_back = lambda upstream: signals_gradient(t, v, d, offsets, ends, presses, upstream, shape)  # noqa: E731
+        return out.T, lambda grad_signals: np.asarray(pull_back(np.ascontiguousarray(grad_signals.T)))

@@ -24,7 +24,7 @@ _MARKS = {"pass": "ok  ", "warn": "warn", "fail": "FAIL"}
 
 
 class BuildByDefault(click.Group):
-    """A group whose default command is `build`."""
+    """A group of commands of which `build` is the default."""
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         """Insert `build` before arguments that start with neither a command nor a help option."""
@@ -51,7 +51,7 @@ class _FormatsOption(click.Option):
     def get_help_record(self, ctx: click.Context) -> tuple[str, str] | None:
         from padforge.fabricate.export import FORMATS
 
-        self.help = f"Which files of the mould to write, of {', '.join(FORMATS)}."
+        self.help = f"Formats of the files to write, of {', '.join(FORMATS)}."
         return super().get_help_record(ctx)
 
 
@@ -163,8 +163,8 @@ def _line(finding: dict[str, Any]) -> str:
 def mould_costs(pad: "Morphology", spec: "Spec", folder: Path) -> dict[str, float]:
     """Build the mould of a pad, write fabrication.json and .stl to `folder`, and return its costs.
 
-    The strain of fibres under a press is one of them if the contact is a layer, its force if in addition the modulus of
-    the silicone is known.
+    If the contact is a layer they include the strain of fibres under a press, and the force of the press if the modulus
+    of the silicone is known.
     """
     from padforge.design.contact import contact_press, fibre_strains
     from padforge.design.layer import reduced_modulus_kpa

@@ -1,8 +1,8 @@
 """Building a mould and writing its files: meshes, CAD, drawings, G-code, laying page and fabrication document.
 
 The same inputs give the same bytes. Everything is built and checked before the first file is written, and the files
-appear together or not at all; a failed check is reported and stops nothing, but for a body that is no closed solid. A
-new export format needs a writer and a line in `FORMATS`; a CAD format shares the checks of "step" in `build`, too.
+appear together or not at all. Nothing is written for a body that is not a closed solid; other failed checks are only
+reported. A new export format needs a writer and a line in `FORMATS`; one for CAD also the checks of "step" in `build`.
 """
 
 import logging
@@ -89,7 +89,7 @@ class Build:
         silicone_volume_ml: volume of silicone that fills the mould.
         findings: results of all checks.
         silicone: material and amounts to mix.
-        adhesive: volume of adhesive that seals the tracks, by step of laying.
+        adhesive: volume of adhesive that seals the tracks, for each step of laying.
         order: amounts to order, and estimated hours of work.
         fibre: material of the fibres.
         fibres: one entry per fibre, in the order of their numbers.
@@ -180,7 +180,7 @@ FORMATS: dict[str, Mapping[str, Callable[..., None]]] = {
         "figures/toolpath.svg": lambda f, path: draw_toolpath(f.plan, f.toolpath, path),
     },
 }
-"""Writers of the files of every format, called with the fabrication, the body if the name has "*", and the path."""
+"""Writers of files by format and name; arguments: the fabrication, the body if the name has "*", and the path."""
 
 
 def require_formats(formats: Sequence[str]) -> None:
@@ -251,7 +251,7 @@ def _check_bodies(plan: Plan, bodies: Sequence[PrintedBody]) -> list[Finding]:
         by_body.append(check_solid(TriangleMesh.weld(body.vertices, body.triangles), genus))
     for body, findings in zip(bodies, by_body, strict=True):
         if broken := [f.message for f in findings if f.name in SOLID_CHECKS and f.status == "fail"]:
-            raise InputError(f"{body.name}: no closed solid ({'; '.join(broken)}); nothing was written")
+            raise InputError(f"{body.name}: not a closed solid ({'; '.join(broken)}); nothing was written")
     return by_body[0] + check_plan(plan)
 
 
@@ -311,8 +311,8 @@ def _write_files(out: Path, writers: Mapping[str, Callable[[Path], None]], resul
         result = replace(result, sha256={name: files.sha256(folder / name) for name in writers})
         files.write_json(folder / "fabrication.json", result.to_dict())
     for name in sorted(deleted):
-        _log.info("%s is gone: it was of the mould before this one", out / name)
+        _log.info("%s: deleted, it belonged to the previous mould", out / name)
     for name in sorted(earlier.keys() - writers.keys()):
         if files.is_local(name) and (out / name).exists():
-            _log.warning("%s is left from the mould before this one: it is not as it was written", out / name)
+            _log.warning("%s: kept, it belongs to the previous mould but was changed since", out / name)
     return result

@@ -1,7 +1,7 @@
 """Materials: the silicone of a pad (`[silicone]`), its fibres (`[fibre]`), and the plastics of its mould.
 
-Data of silicones are from the maker's technical bulletins, at room temperature; those of the published pads are from
-the paper. None means unknown. A new material is one line in its table.
+Data of silicones are from the manufacturer's technical bulletins, at room temperature; those of the published pads are
+from the paper. None means unknown. A new material is one line in its table.
 
 - Smooth-On, Ecoflex Series, technical bulletin, https://www.smooth-on.com/tb/files/ECOFLEX_SERIES_TB.pdf
 - Smooth-On, Dragon Skin Series, technical bulletin, https://www.smooth-on.com/tb/files/DRAGON_SKIN_SERIES_TB.pdf
@@ -94,13 +94,13 @@ PRODUCTS = {
 Name = Annotated[str, Field(min_length=1, max_length=100, pattern=r"^[^|\x00-\x1f]*$")]
 """One line, which fits into a cell of a table."""
 Positive = Annotated[float, Field(gt=0, le=1e6)]
-_or_preset = BeforeValidator(as_tuple), *null_as("preset")  # a key whose default is "preset", None in the model
+_or_preset = BeforeValidator(as_tuple), *null_as("preset")  # for keys whose default is "preset" in files, None here
 AnyOrPreset = Annotated[float | None, *_or_preset]
 PositiveOrPreset = Annotated[Positive | None, *_or_preset]
 
 
 class _MaterialSettings(Settings):
-    """A preset by `name`, or another name with all properties that cannot be unknown; keys override the preset."""
+    """A preset by `name`, whose properties other keys override; or another name with all required properties."""
 
     PRESETS: ClassVar[Mapping[str, Any]]
 
@@ -149,23 +149,18 @@ class SiliconeSettings(_MaterialSettings):
         description=f"{', '.join(SILICONES)}; published: Ecoflex 00-20 in a mould as large as the pad",
     )
     density_g_per_ml: PositiveOrPreset = Field(
-        default=None, le=30, description='density, g/ml; "preset": as of the name'
+        default=None, le=30, description='density, g/ml; "preset": that of the name'
     )
     parts: Annotated[tuple[Positive, Positive] | None, *_or_preset] = Field(
         default=None, description='parts A and B by mass, as [1, 1]; or "preset"'
     )
-    pot_life_min: PositiveOrPreset = Field(
-        default=None, description='how long the mix can be poured, minutes; or "preset"'
-    )
-    cure_h: PositiveOrPreset = Field(
-        default=None, description='how long it cures at room temperature, hours; or "preset"'
-    )
+    pot_life_min: PositiveOrPreset = Field(default=None, description='pot life of the mix, minutes; or "preset"')
+    cure_h: PositiveOrPreset = Field(default=None, description='cure time at room temperature, hours; or "preset"')
     shrinkage: AnyOrPreset = Field(
-        default=None, ge=0, le=0.2, description='by which share of its length it shrinks; or "preset"'
+        default=None, ge=0, le=0.2, description='shrinkage, as a fraction of the length; or "preset"'
     )
-
     modulus_kpa: PositiveOrPreset = Field(
-        default=None, description='modulus at 100 % strain, kPa, by which presses take force; or "preset"'
+        default=None, description='modulus at 100 % strain, kPa, for the force of presses; or "preset"'
     )
 
     @property
@@ -180,15 +175,15 @@ class FibreSettings(_MaterialSettings):
     PRESETS = FIBRES
 
     name: Name = Field(default=PUBLISHED, description=f"{', '.join(FIBRES)}; published: carbon-black TPE")
-    diameter_mm: AnyOrPreset = Field(default=None, gt=0, le=10, description='diameter, mm; "preset": as of the name')
+    diameter_mm: AnyOrPreset = Field(default=None, gt=0, le=10, description='diameter, mm; "preset": that of the name')
     ohm_per_mm: PositiveOrPreset = Field(
         default=None, description='resistance at rest, Ohm per mm of length; or "preset"'
     )
     min_bend_radius_mm: AnyOrPreset = Field(
-        default=None, ge=0, le=1000, description='radius of the tightest bend it bears, mm; or "preset"'
+        default=None, ge=0, le=1000, description='minimum bend radius, mm; or "preset"'
     )
     max_strain: AnyOrPreset = Field(
-        default=None, gt=0, le=100, description='share of its length by which it bears to be stretched; or "preset"'
+        default=None, gt=0, le=100, description='maximum strain, as a fraction of the length; or "preset"'
     )
 
     @property
@@ -202,8 +197,8 @@ _E24 = (10, 11, 12, 13, 15, 16, 18, 20, 22, 24, 27, 30, 33, 36, 39, 43, 47, 51, 
 
 def divider_ohm(fibre_ohm: float) -> float:
     """Return the fixed resistor of the E24 series for the most sensitive voltage divider with a fibre."""
-    # U = Us F / (F + R). A small relative change e of R changes U by Us e F R / (F + R)^2, which has its maximum,
-    # Us e / 4, at F = R, and is equal for F = x R and F = R / x: the best F has the smallest |log(F / R)|.
+    # U = Us F / (F + R) changes by Us e F R / (F + R)^2 for a small relative change e of R, equally for F = x R and
+    # F = R / x, and most, by Us e / 4, for F = R. So the best F has the smallest |log(F / R)|.
     decade = 10.0 ** (math.floor(math.log10(fibre_ohm)) - 1)
     candidates = [*(value * decade for value in _E24), 100 * decade]
     return float(f"{min(candidates, key=lambda ohm: abs(math.log(ohm / fibre_ohm))):.2g}")

@@ -24,14 +24,13 @@ Numbers = NDArray[np.int64]
 _log = logging.getLogger(__name__)
 
 _STL_RECORD = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
-
-_STL_TITLE_BYTES = 1000  # of an STL that is text, in which its first facet begins
+_STL_TITLE_BYTES = 1000  # an STL that is text has its first facet within these
 _STL_HEAD_BYTES = 84  # header of a binary STL, and its number of triangles
-SEPARATION_MM = 1e-4
-"""Distance by which coincident vertices are separated: far below what prints, far above the resolution of a float."""
+SEPARATION_MM = 1e-4  # by which coincident vertices are separated: far below what prints, far above float resolution
 
 
 def build_mesh(body: Body) -> Manifold:
+    """Build the mesh of a body, mm."""
     solid = _unite(body.base)
     if body.cuts:
         solid -= _unite(body.cuts)
@@ -61,8 +60,8 @@ def _extrude(prism: Prism) -> Manifold:
 def mesh_arrays(solid: Manifold) -> tuple[NDArray[np.float32], NDArray[np.uint32]]:
     """Return vertices (n, 3), mm, in single precision, and triangles (m, 3) of vertex indices.
 
-    No two vertices are equal. If the solid touches itself in a point or a vertical line, by chance or by rounding, the
-    vertices there are moved inwards by `SEPARATION_MM`, so that a reader that merges equal vertices gets a manifold.
+    No two vertices are equal: where the solid touches itself in a point or a vertical line, by chance or by rounding,
+    vertices are moved inwards by `SEPARATION_MM`, so that a reader that merges equal vertices gets a manifold.
     """
     mesh = solid.to_mesh()
     vertices, triangles = np.array(mesh.vert_properties), np.asarray(mesh.tri_verts)
@@ -106,7 +105,7 @@ def write_stl(path: Path, vertices: np.ndarray, triangles: np.ndarray) -> None:
 def write_3mf(path: Path, vertices: np.ndarray, triangles: np.ndarray, *, name: str, title: str, material: str) -> None:
     """Write a 3MF, mm, of one object: vertices (n, 3), with the precision of an STL, and triangles (m, 3).
 
-    `name` is that of the body, of `BODY_COLOURS`, which states its colour; `title` is for people.
+    `name` is the name of the body, whose colour `BODY_COLOURS` states; `title` is for people.
     """
     points = "".join(f'<vertex x="{x:.9g}" y="{y:.9g}" z="{z:.9g}"/>' for x, y, z in vertices.tolist())
     faces = "".join(f'<triangle v1="{a}" v2="{b}" v3="{c}"/>' for a, b, c in triangles.tolist())
@@ -144,23 +143,23 @@ def read_mesh(path: Path) -> tuple[Array, Numbers]:
     logging.getLogger("trimesh").setLevel(logging.CRITICAL)  # its errors are raised as well
     try:
         with np.errstate(all="ignore"):
-            content = {"stl": _mended_stl, "3mf": _without_unprinted}.get(kind, Path.read_bytes)(path)
+            content = {"stl": _repair_stl, "3mf": _remove_unprinted}.get(kind, Path.read_bytes)(path)
             scene = trimesh.load_scene(BytesIO(content), file_type=kind, process=False)  # keeps triangles with NaN
             mesh = (scene.convert_units("millimeters") if scene.units else scene).to_mesh()
         vertices, triangles = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
     except Exception as error:  # broken files can raise any exception
         is_missing = isinstance(error, KeyError)
-        reason = f"{error} is missing in it" if is_missing else " ".join(str(error).split()) or type(error).__name__
-        raise InputError(f"{path}: not a mesh that can be read ({reason})") from error
+        reason = f"{error} is missing" if is_missing else " ".join(str(error).split()) or type(error).__name__
+        raise InputError(f"{path}: not a readable mesh ({reason})") from error
     if not len(triangles) or triangles.min() < 0 or triangles.max() >= len(vertices):
-        raise InputError(f"{path}: holds no triangles that can be read, or is torn")
+        raise InputError(f"{path}: no readable triangles, or the file is incomplete")
     if not np.isfinite(vertices).all():
         raise InputError(f"{path}: vertices hold NaN or infinity")
     return vertices, triangles
 
 
-def _mended_stl(path: Path) -> bytes:
-    """Return an STL without the small defects that slicers pass over and trimesh does not; a warning names each."""
+def _repair_stl(path: Path) -> bytes:
+    """Return an STL without small defects that slicers ignore but trimesh refuses; log a warning about each."""
     content = path.read_bytes()
     text = content.lower()
     if text.startswith(b"solid") and b"facet" in text[:_STL_TITLE_BYTES]:
@@ -174,7 +173,7 @@ def _mended_stl(path: Path) -> bytes:
         return with_points
     n_stated = int.from_bytes(content[80:_STL_HEAD_BYTES], "little")
     n_whole, n_stray = divmod(len(content) - _STL_HEAD_BYTES, _STL_RECORD.itemsize)
-    # What states twice as many as it holds is torn, or no STL: other text states half a billion.
+    # A file that holds half of the stated number or less is incomplete, or no STL: other text states half a billion.
     if n_stated < 2 * n_whole and (n_whole, n_stray) != (n_stated, 0):
         _log.warning("%s: states %d triangles, holds %d and %d stray bytes", path, n_stated, n_whole, n_stray)
         content = content[:80] + n_whole.to_bytes(4, "little") + content[_STL_HEAD_BYTES : len(content) - n_stray]
@@ -188,8 +187,8 @@ def _is_printed(part: ElementTree.Element) -> bool:
     return not (part.tag.endswith("}item") and part.get("printable", "1") in ("0", "false"))
 
 
-def _without_unprinted(path: Path) -> bytes:
-    """Return a 3MF without objects that slicers do not print, such as supports; trimesh would read them."""
+def _remove_unprinted(path: Path) -> bytes:
+    """Return a 3MF without objects that slicers do not print, such as supports, which trimesh would read."""
     content, count = BytesIO(), 0
     with zipfile.ZipFile(path) as package, zipfile.ZipFile(content, "w") as printed:
         for name in package.namelist():

@@ -17,8 +17,8 @@ from padforge.common.validation import InputError
 from padforge.fabricate.plan import Plan, offset_box
 from padforge.fabricate.settings import WELL_MM, WELL_RIM_MM, WELL_SLOT_MM
 
+# printed bodies, and their colours in CAD programs and slicers
 BODY_COLOURS = {"mould": "#8FA3B8", "lid": "#D9C27E", "conductive": "#6F8F72", "holder": "#B0886E"}
-"""The printed bodies, and their colours in CAD programs and slicers."""
 INTO_FLOOR_MM = 0.2  # overlap of a part with the solid below it, so that no two faces coincide
 LID_MM = 3.0  # thickness of the lid
 _VENT_MM = 1.5  # diameter of the lid's vents
@@ -28,8 +28,7 @@ _FUNNEL_MM = 6.0  # height of the spout's funnel
 _FUNNEL_WALL_MM = 2.0
 _FUNNEL_FLARE_MM = _FUNNEL_MM * math.tan(math.radians(30.0))  # increase of the funnel's radius up to its top
 _PIN_CLEARANCE_MM = 0.3  # difference in diameter between the lid's holes and the pins
-HOLDER_WALL_MM = 1.0
-"""Height of the holder's walls above its floor, far below the pad's surface, so that no probe touches them."""
+HOLDER_WALL_MM = 1.0  # height of the holder's walls above its floor, far below the pad's surface and any probe
 HOLDER_PLAY_MM = 0.2  # clearance on every side of the pad in its holder
 
 Position = tuple[float, float]
@@ -60,7 +59,7 @@ def cylinder(x: float, y: float, diameter_mm: float, sides: int = 64) -> shapely
 
 
 def _tray(outline: BaseGeometry, hollows: Iterable[BaseGeometry], floor: float, depth: float, flare: float = 0) -> Body:
-    """Build an open tray with rectangular hollows of a depth; walls lean outwards by `flare` from floor to rim."""
+    """Build an open tray with rectangular hollows; their walls lean outwards by `flare` from floor to rim."""
     rim, flare_per_mm = floor + depth, flare / depth
     cuts = tuple(Prism(hollow, floor, rim + 1, flare + flare_per_mm) for hollow in hollows)  # to 1 mm above the rim
     return Body((Prism(outline, 0, rim),), cuts)
@@ -95,7 +94,8 @@ def ridge_prisms(
 ) -> list[Prism]:
     """Build the terraces of the ridges of some fibres of a layer, the upper first; a ridge without taper has one.
 
-    `top_outline` is that of the uppermost terrace; the others deviate by `tolerance_mm`, or by that of the settings.
+    `top_outline` is the outline of the uppermost terrace. The outlines of the others deviate by at most `tolerance_mm`,
+    by default that of the settings.
     """
     floor, height = plan.settings.mould.floor_mm, plan.heights_mm[plan.layer_indices[fibres[0]]]
     prisms = []

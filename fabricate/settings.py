@@ -43,7 +43,7 @@ class MouldSettings(Settings):
     """
 
     floor_mm: float = Field(default=2.0, ge=0.4, le=50, description="thickness of the tray's floor, mm")
-    wall_mm: float = Field(default=2.0, ge=0.8, le=50, description="least thickness of the tray's walls, mm")
+    wall_mm: float = Field(default=2.0, ge=0.8, le=50, description="minimum thickness of the tray's walls, mm")
     wall_draft_deg: float = Field(default=2.0, ge=0, le=30, description="lean of the walls, for demoulding, degrees")
     silicone_mm: float = Field(default=SILICONE_MM, gt=0, le=100, description="thickness of the cast pad, mm")
     border_mm: float = Field(default=0.0, ge=0, le=100, description="silicone beyond the fibre ends, mm")
@@ -58,7 +58,7 @@ class MouldSettings(Settings):
     levels: Literal["as_needed", "two"] = Field(
         default="as_needed", description="more ridge heights where a family crosses itself, or refuse such a pad"
     )
-    min_silicone_mm: float = Field(default=0.4, ge=0, le=10, description="least silicone between tracks, mm")
+    min_silicone_mm: float = Field(default=0.4, ge=0, le=10, description="minimum silicone between tracks, mm")
     exit_mm: float = Field(default=2.0, ge=0, le=50, description="length of the lead's slot in the wall (0: none), mm")
     exit_width_mm: float = Field(default=3.0, gt=0, le=50, description="width of the lead's slot in the wall, mm")
     number_mm: float = Field(default=2.5, ge=0, le=20, description="height of the sensor numbers (0: none), mm")
@@ -67,8 +67,8 @@ class MouldSettings(Settings):
     spout: bool = Field(default=False, description="a pour spout in the lid")
     holder: bool = Field(default=False, description="a tray that holds the pad on the bed while a printer presses it")
     conductive: bool = Field(default=False, description="a second mould with wells for conductive material")
-    lead_mm: float = Field(default=30.0, ge=0, le=1000, description="fibre left over at each end, mm")
-    tolerance_mm: float = Field(default=0.01, ge=1e-3, le=0.1, description="greatest deviation of a ridge, mm")
+    lead_mm: float = Field(default=30.0, ge=0, le=1000, description="length of the lead at each end of a fibre, mm")
+    tolerance_mm: float = Field(default=0.01, ge=1e-3, le=0.1, description="maximum deviation of a ridge's outline, mm")
 
     @property
     def level_step_mm(self) -> float:
@@ -85,7 +85,7 @@ class PrinterSettings(Settings):
         default=[220.0, 220.0, 250.0],
         min_length=3,
         max_length=3,
-        description="width, depth and height of the space, mm",
+        description="width, depth and height of the build volume, mm",
     )
     resin: bool = Field(default=False, description="true for a resin printer")
 
@@ -127,13 +127,13 @@ class DispenserSettings(Settings):
     travel_height_mm: float = Field(default=5.0, ge=0.5, le=500, description="height between fibres, mm over the pad")
     travel_mm_s: float = Field(default=30.0, ge=0.1, le=500, description="speed between fibres, mm/s")
     feed_mm_s: float = Field(default=10.0, ge=0.1, le=500, description="speed along a straight fibre, mm/s")
-    acceleration_mm_s2: float = Field(default=100.0, ge=1, le=1e5, description="greatest acceleration, mm/s^2")
+    acceleration_mm_s2: float = Field(default=100.0, ge=1, le=1e5, description="maximum acceleration, mm/s^2")
     origin_mm: Annotated[tuple[Coordinate, Coordinate], BeforeValidator(as_tuple)] = Field(
         default=(110.0, 110.0), description="the pad's middle [x, y] on the machine, mm"
     )
     box_mm: Box = Field(
         default=(0.0, 220.0, 0.0, 220.0, -20.0, 50.0),
-        description="where the tip may go on the machine, [x0, x1, y0, y1, z0, z1], mm",
+        description="limits of the tip on the machine, [x0, x1, y0, y1, z0, z1], mm",
     )
 
     @field_validator("box_mm")
@@ -154,8 +154,8 @@ _MAX_TERRACE_STEP_MM = 0.03  # width of the terraces of a tapered ridge, the pos
 class FabricationSettings:
     """All settings of a mould and of fibre placement, except the paths of the fibres, which the morphology has.
 
-    `pad` has the deep family, keep-outs, leads and bending radius; `contact`, if stated, is the contact assumed for a
-    pad that does not state the contact it is designed for.
+    `pad` has the deep family, keep-outs, leads and bending radius. `contact`, if settings state one, is assumed for a
+    morphology that does not state the contact that it was designed for.
     """
 
     mould: MouldSettings = field(default_factory=MouldSettings)
@@ -231,7 +231,7 @@ class FabricationSettings:
 
     @property
     def min_bend_radius_mm(self) -> float:
-        """Minimum bend radius by the rules and the fibre, mm, in the mean over half of it along a fibre."""
+        """Minimum bend radius by the rules and the fibre, mm, as the mean over half that length of fibre."""
         return max(self.rules.min_mean_bend_radius_mm, self.fibre.material.min_bend_radius_mm or 0)
 
     def require_consistent(self, layout: Layout) -> None:

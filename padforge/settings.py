@@ -1,4 +1,4 @@
-"""All sections of a `pad.toml`, and whether they agree with each other."""
+"""All sections of a `pad.toml`, and the check that they do not contradict each other."""
 
 from pkgutil import resolve_name
 from typing import TYPE_CHECKING
@@ -28,7 +28,7 @@ def section_models() -> "dict[str, type[Settings]]":
 
 
 def check_settings(spec: "Spec") -> None:
-    """Check all sections, and each against the others, also those that a command does not need.
+    """Check all sections and whether they contradict each other, including sections that a command does not need.
 
     Fibres and pitch of the pad are compared only if they are stated, since most commands take them from a morphology.
 
@@ -40,7 +40,7 @@ def check_settings(spec: "Spec") -> None:
     from padforge.sense.settings import read_rig
 
     for model in section_models().values():
-        if model.section() != "contact":  # read by `FabricationSettings`, completed with the lengths of the cast pad
+        if model.section() != "contact":  # which `FabricationSettings` reads, completed by the lengths of the cast pad
             spec.section(model)
     fabrication, rig = FabricationSettings.from_spec(spec), read_rig(spec)
     if spec.stated(PadSettings).keys() & {"grid", "horizontals", "verticals", "pitch_mm", "size_mm"}:

@@ -41,7 +41,7 @@ from tests.helpers import kernels  # noqa: E402
 from tests.helpers.golden import Golden  # noqa: E402
 from tests.helpers.once import Once  # noqa: E402
 
-compilation.PATIENCE_S = 3600.0  # what a test compiles is no output of the command that it looks at
+compilation.NOTICE_AFTER_S = 3600.0  # so that compilation adds no line to the output of commands
 plotting.DPI = 40  # pixels take most of the time of a picture, and no test looks at them
 PUBLISHED = ROOT.parent / "shared" / "data" / "published"
 

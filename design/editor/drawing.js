@@ -8,7 +8,7 @@ function layerKey(view) {
 
 function setChildren(group, parts) { byId(group).replaceChildren(...parts) }
 
-// Create all elements: of another pad, or after a knot was added or removed.
+// Create all elements, for another pad or after a knot was added or removed.
 function build(view, handlers) {
   const {scale, x, y} = frame(view), [wide, high] = view.cell_mm
   layers = {key: layerKey(view), cells: [], fibres: [], knots: []}
@@ -26,7 +26,8 @@ function build(view, handlers) {
   layers.fibres = view.fibres.map((fibre, index) => {
     const group = svgElement("g", {class: `f${fibre.family}`})
     const parts = ["halo", "path", "hit"].map(name => svgElement("path", {class: name}))
-    const [sx, sy] = fibre.knots[0], horizontal = fibre.family === 0 // inside the left edge, beside which heights stand
+    const [sx, sy] = fibre.knots[0], horizontal = fibre.family === 0
+    // horizontals are labelled inside the left edge, since the scale of y is outside
     const label = svgElement("text", {
       x: x(sx) + (horizontal ? 4 : 0), y: y(sy) + (horizontal ? -5 : 12), "text-anchor": horizontal ? "start" : "middle",
     }, index + 1)
@@ -36,8 +37,9 @@ function build(view, handlers) {
     return {group, parts}
   })
   // the deeper family lies below
-  const order = view.fibres.map((fibre, index) => [fibre.family === view.deep_family ? 0 : 1, index]).sort((a, b) => a[0] - b[0] || a[1] - b[1])
-  setChildren("lines", order.map(([, index]) => layers.fibres[index].group))
+  const isUpper = index => view.fibres[index].family !== view.deep_family
+  const order = [...view.fibres.keys()].sort((a, b) => isUpper(a) - isUpper(b)) // stable
+  setChildren("lines", order.map(index => layers.fibres[index].group))
   layers.knots = view.fibres.map((fibre, f) => fibre.knots.slice(1, -1).map((_, k) => {
     const knot = svgElement("g", {class: "knot", role: "button"})
     knot.append(svgElement("circle", {class: "grip", r: 13}), svgElement("circle", {class: "dot", r: 4}))

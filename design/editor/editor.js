@@ -40,7 +40,8 @@ async function send() {
     const edit = queue.shift(), fibre = selected.fibre, next = await post("/edit", edit)
     if (!next) continue
     const changed = edit.do === "add" || edit.do === "remove"
-    if (changed && selected.fibre === fibre) [selected.fibre, selected.knot] = next.selected // else another fibre was selected meanwhile
+    const isStillSelected = selected.fibre === fibre // the user may have selected another one since
+    if (changed && isStillSelected) [selected.fibre, selected.knot] = next.selected
     show(next)
     if (changed) selectedKnot()?.focus()
   }

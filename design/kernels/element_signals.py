@@ -47,38 +47,25 @@ need more.
 
 
 class Elements(NamedTuple):
-    """Fibres cut into E elements: fine ones for near presses, then coarse ones for far presses.
+    """Fibres cut into E elements: fine ones for near presses, then coarse ones for far presses."""
 
-    Attributes:
-        horizontals: number of fibres, the first ones, that run along x.
-        starts: first fine element of each span and, in the last column, the end of the last span; shape (F, n).
-        far_starts: the same of coarse elements; shape (F, n).
-        along: coordinates along the axis of the fibre; shape (E,), grid units.
-        across: coordinates across it; shape (E,), grid units.
-        length: lengths; shape (E,), grid units.
-        tangent_along: unit tangents, along the axis; shape (E,).
-        tangent_across: unit tangents, across it; shape (E,).
-        share: positions on the span, from 0 to 1; shape (E,).
-        weight: quadrature weights, relative to the span; shape (E,).
-    """
-
-    horizontals: int
-    starts: Any
-    far_starts: Any
-    along: Array
-    across: Array
-    length: Array
-    tangent_along: Array
-    tangent_across: Array
-    share: Array
-    weight: Array
+    horizontals: int  # number of fibres, the first ones, that run along x
+    starts: Any  # first fine element of each span and, in the last column, the end of the last span; shape (F, n)
+    far_starts: Any  # the same of coarse elements; shape (F, n)
+    along: Array  # coordinates along the axis of the fibre; shape (E,), grid units
+    across: Array  # coordinates across it; shape (E,), grid units
+    length: Array  # lengths; shape (E,), grid units
+    tangent_along: Array  # unit tangents, along the axis; shape (E,)
+    tangent_across: Array  # unit tangents, across it; shape (E,)
+    share: Array  # positions on the span, from 0 to 1; shape (E,)
+    weight: Array  # quadrature weights, relative to the span; shape (E,)
 
 
 def weight_table(law: WeightLaw) -> Array:
     """Return w and v as piecewise cubics in equal steps of the squared distance, a Hermite interpolant of the profile.
 
-    The profile itself has rows of higher degree that must be searched; a step of the table fits in one cache line. The
-    two agree to about 1e-7 of the largest weight.
+    Rows of the profile have a higher degree and must be searched for; a row of this table is found by its index and
+    fits in one cache line. Weights of the two agree to about 1e-7 of the largest one.
 
     Returns:
         Coefficients of w, then of v, by family and step, in powers of the fraction of a step; 0 after the end of the
@@ -127,6 +114,7 @@ def element_spacings(law: WeightLaw, precision: float) -> tuple[float, float]:
 
 
 def _fine_spacing(family: int, law: WeightLaw, precision: float) -> float:
+    """Return the spacing of fine elements of a family, reduced from radius / 4 until signals are precise."""
     end = law.radius
     distances, shifts = end * np.arange(32) / 32, np.arange(16)[:, None] / 16
     if law.edge:  # outside the edge of a contact, strains are smooth
@@ -143,7 +131,7 @@ def _fine_spacing(family: int, law: WeightLaw, precision: float) -> float:
         return np.stack([sum_elements(row, lengths, tangents, presses, law, family) for row in points], axis=1)
 
     spacing = end / 4
-    for _ in range(24):  # down to 1 / 200, for steep profiles
+    for _ in range(24):  # down to 1 / 200 of the first spacing, for steep profiles
         signals = straight_signals(spacing)
         reference = signals.mean(axis=1, keepdims=True)  # errors of different shifts cancel in the mean
         error, largest = np.abs(signals - reference), np.abs(reference).max()
@@ -165,22 +153,10 @@ def _count_pieces(h: float, rise: float, d0: float, d1: float, longest: float) -
 def _count_elements(
     along: Any, across: Any, slope: Any, horizontals: int, low: Any, high: Any, nodes: int, spacing: float, total: int
 ) -> Any:
-    """Count pieces and elements of spans.
+    """Return the number of pieces and the first element of each span, both (F, n), and in the last column their end.
 
-    Args:
-        along: knots along the fibres; shape (F, n).
-        across: knots across the fibres; shape (F, n).
-        slope: slopes at the knots; shape (F, n).
-        horizontals: number of fibres that run along x.
-        low: lower corner of the rectangle outside which spans get no pieces; shape (2,).
-        high: upper corner; shape (2,).
-        nodes: elements of a piece.
-        spacing: maximum mean length of an element.
-        total: number of elements before the first span.
-
-    Returns:
-        Number of pieces of each span, and its first element; both of shape (F, n). The last column of the latter has
-        the end of the last span.
+    A piece has `nodes` elements, of a mean length of at most `spacing`; `total` elements precede the first span. Spans
+    outside the rectangle from `low` to `high`, both (2,), get no pieces.
     """
     fibres, n = along.shape
     pieces, starts = np.zeros((fibres, n), np.int64), np.zeros((fibres, n), np.int64)
@@ -260,7 +236,7 @@ def weigh_elements(elements: Any, along: Any, sensitivity: Any) -> None:
 
 @kernel
 def _is_near(t: Any, v: Any, j: int, ct: float, cv: float, end: float) -> bool:
-    """Return whether the box of the ends of span j, in which it lies, is within `end` of (ct, cv) along both axes."""
+    """Return whether the bounding box of span j is within `end` of (ct, cv) along both axes; spans are monotone."""
     is_beside = t[j] < ct + end and t[j + 1] > ct - end
     return is_beside and min(v[j], v[j + 1]) < cv + end and max(v[j], v[j + 1]) > cv - end
 
@@ -291,9 +267,9 @@ def element_signals(along: Any, across: Any, elements: Any, presses: Any, law: A
                     x = at - np.int64(i)
                     weight = rows[i, 0] + x * (rows[i, 1] + x * (rows[i, 2] + x * rows[i, 3]))
                     if law.directional and square > 0:
-                        way = dt * elements.tangent_along[k] + dv * elements.tangent_across[k]
+                        projection = dt * elements.tangent_along[k] + dv * elements.tangent_across[k]
                         directed = rows[i, 4] + x * (rows[i, 5] + x * (rows[i, 6] + x * rows[i, 7]))
-                        weight += directed * (way * way / square)
+                        weight += directed * (projection * projection / square)
                     total += elements.length[k] * weight
             out[q, f] = total
 
@@ -345,17 +321,17 @@ def _differentiate_elements(
                     if law.directional and square > 0:
                         ut, uv = elements.tangent_along[k], elements.tangent_across[k]
                         directed = rows[i, 4] + x * (rows[i, 5] + x * (rows[i, 6] + x * rows[i, 7]))
-                        steeper = rate * (rows[i, 5] + x * (2 * rows[i, 6] + x * 3 * rows[i, 7]))
+                        directed_slope = rate * (rows[i, 5] + x * (2 * rows[i, 6] + x * 3 * rows[i, 7]))
                         inverse = 1 / square
-                        way = (dt * ut + dv * uv) * inverse
-                        cosine_square = way * way * square
+                        cosine_by_distance = (dt * ut + dv * uv) * inverse
+                        cosine_square = cosine_by_distance * cosine_by_distance * square
                         weight += directed * cosine_square
-                        radial += up_length * cosine_square * (steeper - directed * inverse)
-                        turn = up_length * directed * way
-                        out[k, 0] += turn * ut
-                        out[k, 1] += turn * uv
-                        out[k, 3] += turn * dt
-                        out[k, 4] += turn * dv
+                        radial += up_length * cosine_square * (directed_slope - directed * inverse)
+                        grad_projection = up_length * directed * cosine_by_distance
+                        out[k, 0] += grad_projection * ut
+                        out[k, 1] += grad_projection * uv
+                        out[k, 3] += grad_projection * dt
+                        out[k, 4] += grad_projection * dv
                     out[k, 0] += radial * dt
                     out[k, 1] += radial * dv
                     out[k, 2] += up * weight

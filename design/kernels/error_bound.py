@@ -34,7 +34,7 @@ def error_bound(responses: Any, step: Any, cells: Any, masks: Any, scatter: Any,
     independent, shared = share * share * (1 - common), math.sqrt(common) * share
     out = np.zeros(len(masks))
     gradient[:] = 0
-    is_asked = gradient.shape[1] > 0
+    differentiate = gradient.shape[1] > 0
     middle, deviation, x, y, u = np.empty((5, fibres))
     for first in cells:
         # 1. slopes in units of the deviation, and the shared part of the noise, for all sets
@@ -71,7 +71,7 @@ def error_bound(responses: Any, step: Any, cells: Any, masks: Any, scatter: Any,
             trace = xx + yy + prior[0] + prior[1]
             bound = math.sqrt(trace / volume)
             out[k] += bound / len(cells)
-            if not is_asked:
+            if not differentiate:
                 continue
             # 3. reverse pass
             grad_trace, grad_volume = bound / (2 * trace * len(cells)), -bound / (2 * volume * len(cells))

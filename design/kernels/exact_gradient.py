@@ -26,8 +26,7 @@ from padforge.design.kernels.exact_signals import (
 from padforge.design.kernels.geometry import EPS, INVERSE, MANHATTAN, UNIFORM, find_touched_range, select_frame, weigh
 from padforge.design.kernels.pchip import piece_of
 
-MIN_SINE = 0.02
-"""Minimum sine of the angle between fibre and boundary, without which the derivative would be unbounded."""
+MIN_SINE = 0.02  # minimum sine of the angle between fibre and boundary; the derivative would be unbounded without it
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(12)
 
 
@@ -104,11 +103,11 @@ def _add_inner_term(
     law, (span, d_point, d_tangent) = shape[2], work
     is_manhattan = law.length == MANHATTAN
     if law.weight == UNIFORM and is_manhattan:
-        rising = 1.0 if evaluate_cubic(span, b) >= evaluate_cubic(span, a) else -1.0
+        rise_sign = 1.0 if evaluate_cubic(span, b) >= evaluate_cubic(span, a) else -1.0
         for sign, s in ((1.0, b), (-1.0, a)):
             differentiate_cubic(s + s0, span[1], d0, d1, d_point, d_tangent)
             for x in range(6):
-                out[x] += sign * (d_point[x, 0] + rising * d_point[x, 1])
+                out[x] += sign * (d_point[x, 0] + rise_sign * d_point[x, 1])
         return
     stack[0, 0], stack[0, 1] = a, b
     top, pieces = 0, 0
@@ -153,7 +152,10 @@ def _differentiate_span(
     work: Any,
     change: Any,
 ) -> None:
-    """Compute the derivatives of the signal of span j for a press at (ct, cv) into `change` (6,)."""
+    """Compute the derivatives of the signal of span j for a press at (ct, cv) into `change` (6,).
+
+    The shape is framed; `work` has arrays for the span (6,) and for the results of `differentiate_cubic`.
+    """
     span, (chains, extents, law) = work[0], shape
     s0 = centre_cubic(t[j], t[j + 1], v[j], v[j + 1], d[j], d[j + 1], ct, cv, span)
     change[:] = 0.0

@@ -52,10 +52,8 @@ GAUSS = np.array(
         0.417959183673469387755102040816327,
     ]
 )
-MAX_HALVINGS = 48
-"""Maximum depth of the halved intervals of a quadrature."""
-PRECISION = 1e-11
-"""Maximum relative error of a piece without a closed form."""
+MAX_HALVINGS = 48  # maximum depth of the halved intervals of a quadrature
+PRECISION = 1e-11  # maximum relative error of a piece without a closed form
 
 
 @kernel
@@ -110,8 +108,9 @@ def is_precise(error: float, pieces: int) -> bool:
 def _has_turn(span: Any, a: float, b: float, law: Any) -> bool:
     """Return whether a fibre turns from its axis to a steep rise within [a, b] so sharply that quadrature may miss it.
 
-    The turn is where the rise dv/ds is about the run dt/ds. It takes a fraction of about run / max_rise of [a, b], in
-    which the length per s is wrong by about the run. Up to a ratio of 8 the quadrature converges fast.
+    The turn is where the rise dv/ds is about as large as the run dt/ds. It takes a fraction of about run / max_rise of
+    [a, b]; nodes that miss it misjudge the length per s there by about the run. Quadrature converges fast if max_rise
+    is at most 8 times the smallest rise or the run.
     """
     if law.length == MANHATTAN:
         return False
@@ -158,7 +157,7 @@ _SIGN_CERTAIN_FACTOR = 1e6  # the sign of a value is certain if it is this many 
 
 @kernel
 def _expand_square(span: Any, a: float, b: float, radius: float, p: Any) -> None:
-    """Expand the squared distance less that of a circle in u, for s = a + (b - a) u, into the coefficients p (7,)."""
+    """Expand t^2 + v^2 - radius^2 in powers of u, with s = a + (b - a) u, into the coefficients p (7,)."""
     w = b - a
     t0, t1 = span[0] + span[1] * a, span[1] * w
     v0, v3 = evaluate_cubic(span, a), span[5] * w**3
@@ -241,18 +240,18 @@ def _find_between_lines(
     start: float,
     after: float,
     lines: Any,
-    near: Any,
+    may_cross: Any,
     tolerance: float,
     scratch: Any,
     stretches: Any,
     count_inside: Any,
 ) -> Any:
-    """Append the stretches of [start, after] on which the span is between two lines; `near` says which may cross it."""
+    """Append the stretches of [start, after] on which the span, which `may_cross` either line, is between both."""
     roots, work, p, _ = scratch
     (upper_start, upper_end, lower_start, lower_end), count = lines, np.int64(0)
-    if near[0]:
+    if may_cross[0]:
         count = _find_line_roots(span, start, after, upper_start, upper_end, tolerance, roots, count, work, p)
-    if near[1]:
+    if may_cross[1]:
         count = _find_line_roots(span, start, after, lower_start, lower_end, tolerance, roots, count, work, p)
     shell_sort(roots, count)
     begin = start
@@ -262,10 +261,8 @@ def _find_between_lines(
         for share in _PROBES:
             s = begin + share * (end - begin)
             x, v = (s - start) / (after - start), evaluate_cubic(span, s)
-            to_upper, to_lower = (
-                upper_start + (upper_end - upper_start) * x - v,
-                v - lower_start - (lower_end - lower_start) * x,
-            )
+            to_upper = upper_start + (upper_end - upper_start) * x - v
+            to_lower = v - lower_start - (lower_end - lower_start) * x
             above = to_upper if abs(to_upper) > abs(above) else above
             below = to_lower if abs(to_lower) > abs(below) else below
             if min(abs(above), abs(below)) > _SIGN_CERTAIN_FACTOR * tolerance:
@@ -343,7 +340,7 @@ def find_stretches_inside(
 ) -> Any:
     """Find the stretches of [a, b] inside a press, and return their number.
 
-    The arguments are no tuple, since taking an array out of a tuple costs as much as all other steps.
+    Arrays are separate arguments, since taking one out of a tuple costs as much as all other steps.
 
     Args:
         span: coefficients r, h, e0, e1, e2, e3 of the span; shape (6,).
@@ -357,7 +354,7 @@ def find_stretches_inside(
         out: receives begin and end of each stretch.
     """
     r, h, inner = span[0], span[1], extents[4]
-    # 1. Most spans lie wholly inside or outside, as does the box of their ends, since they are monotone.
+    # 1. Most spans lie wholly inside or outside, and so does the box of their ends, since spans are monotone.
     t_start, t_end, v_start, v_end = r + h * a, r + h * b, evaluate_cubic(span, a), evaluate_cubic(span, b)
     far_t, far_v = max(abs(t_start), abs(t_end)), max(abs(v_start), abs(v_end))
     if far_t * far_t + far_v * far_v < inner * inner:

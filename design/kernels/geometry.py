@@ -16,30 +16,19 @@ Array = NDArray[np.float64]
 EPS = 2.0**-52
 UNIFORM, INVERSE_SQUARE, INVERSE, PROFILE = 0, 1, 2, 3
 MANHATTAN, EUCLIDEAN = 0, 1
-DEGREE = 7
-"""Degree of the polynomials of a layer's profile; those of splines are cubic, with their other coefficients 0."""
-PLAIN = 1
-"""First column of the coefficients of w in a row of a profile."""
-DIRECTED = 2 + DEGREE
-"""First column of the coefficients of v."""
-COLUMNS = 3 + 2 * DEGREE
-"""Number of columns of a profile."""
+DEGREE = 7  # of the polynomials of a layer's profile; those of splines are cubic, with further coefficients 0
+PLAIN = 1  # first column of the coefficients of w in a row of a profile
+DIRECTED = 2 + DEGREE  # first column of the coefficients of v
+COLUMNS = 3 + 2 * DEGREE  # number of columns of a profile
 
 
 class Ends(NamedTuple):
-    """Positions of fibre ends: horizontal i (from 0) at the height (i + 1) spacing_y, vertical i at (i + 1) spacing_x.
+    """Fibre ends: horizontal i, from 0, is at the height (i + 1) spacing_y, vertical i at x = (i + 1) spacing_x."""
 
-    Attributes:
-        horizontals: number of horizontals.
-        verticals: number of verticals.
-        spacing_y: distance of horizontals, grid units.
-        spacing_x: distance of verticals, grid units.
-    """
-
-    horizontals: int
-    verticals: int
-    spacing_y: float
-    spacing_x: float
+    horizontals: int  # number of horizontals
+    verticals: int  # number of verticals
+    spacing_y: float  # distance of horizontals, grid units
+    spacing_x: float  # distance of verticals, grid units
 
 
 class WeightLaw(NamedTuple):
@@ -49,28 +38,17 @@ class WeightLaw(NamedTuple):
     the direction to the centre; v is 0 at d = 0. It has a table for each family, since their fibres may lie at
     different depths. A row of the table has a squared distance, and the coefficients of the polynomials w and v in the
     excess over that squared distance, which hold up to that of the next row.
-
-    Attributes:
-        radius: circumradius of the shape, or the distance at which a profile ends.
-        weight: UNIFORM, INVERSE_SQUARE, INVERSE or PROFILE.
-        length: MANHATTAN or EUCLIDEAN.
-        profile: the tables; shape (2, B, COLUMNS), or (B, COLUMNS) in the frame of a family.
-        bins: row of the profile at the beginning of each of equal steps of the squared distance.
-        bin_rate: steps per squared distance.
-        directional: whether v is not 0.
-        near: distance from which the profile is smooth enough for a coarse quadrature.
-        edge: distance of the edge of a contact, at which the profile bends most; 0 if there is none.
     """
 
-    radius: float
-    weight: int
-    length: int
-    profile: Array = np.empty((2, 0, COLUMNS))
-    bins: NDArray[np.int32] = np.empty(0, np.int32)
-    bin_rate: float = 0.0
-    directional: bool = False
-    near: float = math.inf
-    edge: float = 0.0
+    radius: float  # circumradius of the shape, or the distance at which a profile ends
+    weight: int  # UNIFORM, INVERSE_SQUARE, INVERSE or PROFILE
+    length: int  # MANHATTAN or EUCLIDEAN
+    profile: Array = np.empty((2, 0, COLUMNS))  # the tables; without the first axis in the frame of a family
+    bins: NDArray[np.int32] = np.empty(0, np.int32)  # row at the beginning of each of equal steps of squared distance
+    bin_rate: float = 0.0  # steps per squared distance
+    directional: bool = False  # whether v is not 0
+    near: float = math.inf  # distance from which the profile is smooth enough for a coarse quadrature
+    edge: float = 0.0  # distance of the edge of a contact, at which the profile bends most; 0 if there is none
 
 
 @kernel
@@ -231,8 +209,7 @@ def find_touched_range(cv: float, extents: Any, max_offset: float, ends: Any, fa
     return before + int(first), before + int(end)
 
 
-_BOX_SEGMENTS = 8
-"""Segments per bounding box."""
+_BOX_SEGMENTS = 8  # segments per bounding box
 
 
 @kernel
@@ -285,19 +262,19 @@ def _bound_segments(points: Any, first: Any, margin: float) -> tuple[Any, Any, A
     count = 0
     for line in range(len(first) - 1):
         count += (first[line + 1] - first[line] + _BOX_SEGMENTS - 2) // _BOX_SEGMENTS
-    sides, segments, lines = np.empty((count, 4)), np.empty((count, 2), np.int64), np.empty(count, np.int64)
+    boxes, segments, lines = np.empty((count, 4)), np.empty((count, 2), np.int64), np.empty(count, np.int64)
     box = 0
     for line in range(len(first) - 1):
         for start in range(first[line], first[line + 1] - 1, _BOX_SEGMENTS):
             end = min(start + _BOX_SEGMENTS, first[line + 1] - 1)
-            sides[box, :2], sides[box, 2:] = np.inf, -np.inf
+            boxes[box, :2], boxes[box, 2:] = np.inf, -np.inf
             for k in range(start, end + 1):
                 for axis in range(2):
-                    sides[box, axis] = min(sides[box, axis], points[k, axis] - margin)
-                    sides[box, 2 + axis] = max(sides[box, 2 + axis], points[k, axis] + margin)
+                    boxes[box, axis] = min(boxes[box, axis], points[k, axis] - margin)
+                    boxes[box, 2 + axis] = max(boxes[box, 2 + axis], points[k, axis] + margin)
             segments[box, 0], segments[box, 1], lines[box] = start, end, line
             box += 1
-    return sides, segments, lines
+    return boxes, segments, lines
 
 
 @kernel
@@ -314,19 +291,19 @@ def find_near_intervals(points: Any, first: Any, others: Any, other_first: Any, 
     Returns:
         Index of the polyline, index of the other one, and arc lengths of start and end; shape (k, 4).
     """
-    sides, segments, lines = _bound_segments(points, first, width)
-    other_sides, other_segments, other_lines = _bound_segments(others, other_first, 0.0)
+    boxes, segments, lines = _bound_segments(points, first, width)
+    other_boxes, other_segments, other_lines = _bound_segments(others, other_first, 0.0)
     arcs = np.zeros(len(points))  # of each vertex along its polyline
     for line in range(len(first) - 1):
         for k in range(first[line] + 1, first[line + 1]):
             arcs[k] = arcs[k - 1] + math.hypot(points[k, 0] - points[k - 1, 0], points[k, 1] - points[k - 1, 1])
     intervals, count = np.empty((64, 4)), 0
-    for box in range(len(sides)):
-        x_min, y_min, x_max, y_max = sides[box]
-        for other in range(len(other_sides)):
-            if other_sides[other, 0] > x_max or other_sides[other, 2] < x_min:
+    for box in range(len(boxes)):
+        x_min, y_min, x_max, y_max = boxes[box]
+        for other in range(len(other_boxes)):
+            if other_boxes[other, 0] > x_max or other_boxes[other, 2] < x_min:
                 continue
-            if other_sides[other, 1] > y_max or other_sides[other, 3] < y_min:
+            if other_boxes[other, 1] > y_max or other_boxes[other, 3] < y_min:
                 continue
             for i in range(segments[box, 0], segments[box, 1]):
                 x, y, length = points[i, 0], points[i, 1], arcs[i + 1] - arcs[i]
@@ -351,8 +328,8 @@ def find_near_intervals(points: Any, first: Any, others: Any, other_first: Any, 
     return intervals[:count]
 
 
-_DEPTH = 60
-_MAX_DEGREE = 6
+_DEPTH = 60  # maximum halvings of (0, 1) by which a root is isolated
+_MAX_DEGREE = 6  # of the polynomials whose roots are found
 SCRATCH = (_DEPTH + 2, _MAX_DEGREE + 3)
 """Shape of the work array of `find_unit_roots`."""
 

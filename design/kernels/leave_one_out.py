@@ -19,10 +19,8 @@ import numpy as np
 
 from padforge.common.compilation import kernel
 
-_FAST = {"reassoc", "contract"}
-"""Fast-math flags: sums may be reordered, but NaN and infinities are kept."""
-EPSILON = np.float32(1e-12)
-"""Added to squared lengths, so that their root has a gradient at 0."""
+_FAST = {"reassoc", "contract"}  # fast-math flags: sums may be reordered, but NaN and infinities are kept
+EPSILON = np.float32(1e-12)  # added to squared lengths, so that their root has a gradient at 0
 
 
 @kernel(fastmath=_FAST)

@@ -241,7 +241,7 @@ def fibre_slopes_gradient(along: Any, across: Any, slope: Any, upstream: Any) ->
 def arc_lengths_gradient(along: Any, across: Any, slope: Any, out: Any) -> Any:
     """Compute the arc lengths (F,) of fibres, to 1e-3 if they are steep.
 
-    Their gradients, of each fibre by its along, across and slope, go into `out` (3, F, n).
+    The gradient of each length by the along, across and slope of its fibre is written into `out` (3, F, n).
     """
     lengths = np.zeros(len(along))
     out[:] = 0

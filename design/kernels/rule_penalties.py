@@ -17,10 +17,8 @@ import numpy as np
 from padforge.common.compilation import kernel
 from padforge.design.kernels.pchip import add_value_gradient, extremes, pchip_value
 
-STEEPNESS = 10.0
-"""Coefficient of the square in the cost of a small distance."""
-REACH = 6.0
-"""Standard deviations beyond which the density of a crossing is neglected, since it is below 1e-7."""
+STEEPNESS = 10.0  # coefficient of the square in the cost of a small distance
+REACH = 6.0  # standard deviations beyond which the density of a crossing is neglected, since it is below 1e-7
 
 
 @kernel
@@ -46,10 +44,10 @@ def sum_excess_turns(
 ) -> float:
     """Integrate the relative excess of the turn within `window` of arc length over window / radius.
 
-    Windows begin at samples and, with `all_bends`, also end at samples: as the turn is linear between samples, it is
-    largest in one of these. At both ends a fibre continues straight as a lead, which it may meet at a corner. On a pad
-    that is worn bent, fibres turn by `rolled` at right angles to the plane of the pad; leads do not. The gradient is by
-    the turns and the ends of the windows.
+    Windows begin at samples and, with `all_bends`, also end at samples: since the turn is linear between samples, the
+    window of the largest turn is one of these. At both ends a fibre continues straight as a lead, which it may meet at
+    a corner. On a pad that is worn bent, fibres also turn by the angle `rolled` per window at right angles to the plane
+    of the pad; leads do not. The gradient includes the turns and the ends of the windows.
     """
     fibres, n = arc.shape
     size, total, n_directions = n + 4, 0.0, 2 if all_bends else 1
@@ -250,10 +248,8 @@ def sum_crossings(
                 if flat > 0 and sine < 1 - 1e-9:
                     grad_sine = -weights[1] * area * density / limit / math.sqrt(1 - sine * sine)
                     grad_area += grad_sine / (lp * lq + 1e-12)
-                    grad_lp, grad_lq = (
-                        -grad_sine * sine * lq / (lp * lq + 1e-12),
-                        -grad_sine * sine * lp / (lp * lq + 1e-12),
-                    )
+                    grad_lp = -grad_sine * sine * lq / (lp * lq + 1e-12)
+                    grad_lq = -grad_sine * sine * lp / (lp * lq + 1e-12)
                 sign = 1.0 if product > 0 else -1.0 if product < 0 else 0.0
                 dpx, dpy = grad_area * sign * qy + grad_lp * px / lp, -grad_area * sign * qx + grad_lp * py / lp
                 dqx, dqy = -grad_area * sign * py + grad_lq * qx / lq, grad_area * sign * px + grad_lq * qy / lq

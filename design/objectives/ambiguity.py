@@ -30,20 +30,20 @@ MAX_EXPONENT = 300.0
 """Up to this sum of squares, a likelihood may be computed as a product of exponentials without overflow."""
 
 
-def free_presses(size: PadSettings) -> Array:
+def free_presses(pad_settings: PadSettings) -> Array:
     """Return the positions (Q, 2), grid units, of a 20 x 20 grid over the pressed rectangle that no keep-out covers."""
-    presses = grid_positions(size.sensed, side=20)
-    presses = presses[is_outside(presses, size)]
+    presses = grid_positions(pad_settings.sensed, side=20)
+    presses = presses[is_outside(presses, pad_settings)]
     if not len(presses):
         raise InputError("[pad] keep_out_mm covers all that is pressed ([pad] sensed_mm), allowed is a part of it")
     return presses
 
 
 def ambiguities(
-    pad: Morphology, contact: Contact, max_failures: int | tuple[float, ...], noise: float, size: PadSettings
+    pad: Morphology, contact: Contact, max_failures: int | tuple[float, ...], noise: float, pad_settings: PadSettings
 ) -> list[float]:
     """Compute the ambiguity, grid units, with 0, 1, ... fibres failed, on a grid of presses."""
-    presses = free_presses(size)
+    presses = free_presses(pad_settings)
     return _by_press(relative_stretch(pad, presses, contact), presses, max_failures, noise).mean(axis=1).tolist()
 
 

@@ -59,21 +59,23 @@ class Positions(NamedTuple):
 
 
 @threadpool_limits.wrap(limits=1, user_api="blas")  # threads of BLAS wait for each other if cores are busy
-def expected_errors(pad: Morphology, contact: Contact, search: SearchSettings, size: PadSettings) -> list[float]:
+def expected_errors(
+    pad: Morphology, contact: Contact, search: SearchSettings, pad_settings: PadSettings
+) -> list[float]:
     """Compute the expected errors with 0, 1, ... fibres failed, grid units, always with the same random numbers."""
-    fibres, windows = len(pad.knots), evaluation_windows(size.sensed)
+    fibres, windows = len(pad.knots), evaluation_windows(pad_settings.sensed)
     levels = range(min(len(failure_shares(search.max_failures)), fibres))
     masks = [failure_masks(fibres, k, max(MAX_SETS // len(windows), MIN_SETS)) > 0 for k in levels]
-    scale = straight_full_scale(pad.layout, contact, size.sensed_mm)
+    scale = straight_full_scale(pad.layout, contact, pad_settings.sensed_mm)
     scatter = scatter_of_full_scale(search.response_scatter, contact, scale)
     scatter = scatter._replace(floor=max(scatter.floor, MIN_NOISE))
     rng, errors = np.random.default_rng(0), []
     for window in windows:
-        presses = _random_presses(window, PRESSES // len(windows), size, rng)
+        presses = _random_presses(window, PRESSES // len(windows), pad_settings, rng)
         if not len(presses):
             continue
         readings = scatter.sample(relative_stretch(pad, presses, contact) / scale, rng)
-        positions = possible_positions(pad, contact, size, window, scale)
+        positions = possible_positions(pad, contact, pad_settings, window, scale)
         errors.append([])
         for sets in masks:
             count, means = max(len(presses) // len(sets), MIN_PRESSES), []
@@ -86,10 +88,10 @@ def expected_errors(pad: Morphology, contact: Contact, search: SearchSettings, s
 
 
 def possible_positions(
-    pad: Morphology, contact: Contact, size: PadSettings, window: Rectangle, scale: float
+    pad: Morphology, contact: Contact, pad_settings: PadSettings, window: Rectangle, scale: float
 ) -> Positions:
     """Return the positions that a press in a window may have: a fine grid, and a coarse one over the remaining pad."""
-    low, high = np.array(size.sensed)
+    low, high = np.array(pad_settings.sensed)
     near_low, near_high = np.clip(np.add(window, [[-MARGIN], [MARGIN]]), low, high)
     grids = [_position_grid(pad, contact, near_low, near_high, STEP)]
     if (near_low > low).any() or (near_high < high).any():
@@ -97,7 +99,7 @@ def possible_positions(
         is_far = ((far.centres < near_low) | (far.centres > near_high)).any(axis=1)
         grids.append(Positions(*(values[is_far] for values in far)))
     positions = Positions(*map(np.concatenate, zip(*grids, strict=True)))
-    free = is_outside(positions.centres, size)
+    free = is_outside(positions.centres, pad_settings)
     centres, log_prior, responses, blur = (values[free] for values in positions)
     return Positions(centres, log_prior, responses / scale, blur / scale**2)
 
@@ -116,13 +118,13 @@ def _position_grid(pad: Morphology, contact: Contact, low: Array, high: Array, s
     )
 
 
-def _random_presses(window: Rectangle, presses: int, size: PadSettings, rng: np.random.Generator) -> Array:
+def _random_presses(window: Rectangle, presses: int, pad_settings: PadSettings, rng: np.random.Generator) -> Array:
     """Return about `presses` positions outside keep-outs, in random order, one in each cell of a grid over a window."""
     low, high = np.array(window)
     side = math.ceil(math.sqrt(presses))
     cells = rng.permutation(np.stack(np.meshgrid(*[np.arange(side)] * 2), axis=-1).reshape(-1, 2))
     positions = low + (high - low) * (cells + rng.random(cells.shape)) / side
-    return positions[is_outside(positions, size)]
+    return positions[is_outside(positions, pad_settings)]
 
 
 def bayes_positions(readings: Array, positions: Positions, scatter: Scatter, working: Mask) -> Array:

@@ -88,17 +88,19 @@ class PressWindow(NamedTuple):
         return np.concatenate([self.positions, self.far[partners]])
 
 
-def criterion_errors(pad: Morphology, contact: Contact, search: SearchSettings, size: PadSettings) -> list[float]:
+def criterion_errors(
+    pad: Morphology, contact: Contact, search: SearchSettings, pad_settings: PadSettings
+) -> list[float]:
     """Compute the criterion with 0, 1, ... fibres failed, grid units, always on the same presses."""
     rng, fibres = np.random.default_rng(0), len(pad.knots)
     levels = range(min(len(failure_shares(search.max_failures)), fibres))
-    windows = evaluation_windows(size.sensed)
+    windows = evaluation_windows(pad_settings.sensed)
     masks_by_size = [failure_masks(fibres, k, max(MAX_SETS // len(windows), MIN_SETS)) for k in levels]
-    scale, weights = straight_full_scale(pad.layout, contact, size.sensed_mm), kernel_weights(pad.layout)
+    scale, weights = straight_full_scale(pad.layout, contact, pad_settings.sensed_mm), kernel_weights(pad.layout)
     scatter = scatter_of_full_scale(search.response_scatter, contact, scale)
     errors: list[list[float]] = []  # by window, means over the sets of each size
     for window in windows:
-        presses = window_presses(size, window, EVALUATION_SIDE, rng)
+        presses = window_presses(pad_settings, window, EVALUATION_SIDE, rng)
         if not presses.free.any():
             continue
         near, far = (
@@ -177,7 +179,7 @@ def place_window(rectangle: Rectangle, share: float | Array) -> Rectangle:
     return tuple(corner.tolist()), tuple((corner + size).tolist())
 
 
-def window_presses(size: PadSettings, window: Rectangle, side: int, rng: np.random.Generator) -> PressWindow:
+def window_presses(pad_settings: PadSettings, window: Rectangle, side: int, rng: np.random.Generator) -> PressWindow:
     """Return side^2 presses on a randomly shifted grid over a window, and a coarse grid over the rest of the pad."""
 
     def shifted_grid(low: Array, high: Array, counts: Array) -> Array:
@@ -186,14 +188,14 @@ def window_presses(size: PadSettings, window: Rectangle, side: int, rng: np.rand
 
     low, high = np.array(window)
     positions, far = shifted_grid(low, high, np.array([side, side])), np.empty((0, 2))
-    pad_low, pad_high = np.array(size.sensed)
+    pad_low, pad_high = np.array(pad_settings.sensed)
     if ((high - low) < (pad_high - pad_low) - 2 * WINDOW_MARGIN).any():
         far = shifted_grid(pad_low, pad_high, np.ceil((pad_high - pad_low) / COARSE_STEP).astype(int))
         if len(far) > MAX_FAR:
             far = far[rng.choice(len(far), MAX_FAR, replace=False)]
         is_outside_window = ((far < low - WINDOW_MARGIN) | (far > high + WINDOW_MARGIN)).any(axis=1)
-        far = far[is_outside_window & is_outside(far, size)]
-    return PressWindow(positions, (high - low) / side, is_outside(positions, size), far)
+        far = far[is_outside_window & is_outside(far, pad_settings)]
+    return PressWindow(positions, (high - low) / side, is_outside(positions, pad_settings), far)
 
 
 def confusable(near: Array, far: Array, masks: Array) -> Ints:

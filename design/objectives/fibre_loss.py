@@ -32,9 +32,9 @@ def failure_shares(max_failures: int | tuple[float, ...]) -> tuple[float, ...]:
 
 
 def sample_failures(fibres: int, shares: tuple[float, ...], rng: np.random.Generator) -> Array:
-    """Draw masks (L, F), 1 for a working fibre: a set of failed fibres of each size.
+    """Draw one set of failed fibres of each size, as masks (L, F): 1 for a working fibre, 0 for a failed one.
 
-    Sizes of probability 0 by `shares`, and those that leave no fibre, are omitted.
+    Sizes whose probability in `shares` is 0, and those that leave no working fibre, are omitted.
     """
     sizes = [size for size, share in enumerate(shares[:fibres]) if share > 0]
     masks = np.ones((len(sizes), fibres))

@@ -50,7 +50,7 @@ class Violation:
         return f"{self.rule}: {names}{place}: {_format_amount(self.measured)}, limit {_format_amount(self.limit)}"
 
 
-def check_rules(pad: Morphology, rules: RulesSettings, size: PadSettings | None = None) -> list[Violation]:
+def check_rules(pad: Morphology, rules: RulesSettings, pad_settings: PadSettings | None = None) -> list[Violation]:
     """Check every rule of `[rules]`, and return the worst violation per fibre or pair of fibres.
 
     - `min_mean_bend_radius_mm` R: in no stretch of R / 2 along it does a fibre turn by more than half a radian, left
@@ -77,19 +77,19 @@ def check_rules(pad: Morphology, rules: RulesSettings, size: PadSettings | None 
     Args:
         pad: the fibres.
         rules: the limits.
-        size: settings of the pad, of which the keep-outs and the radius on which it is worn matter.
+        pad_settings: settings of the pad, of which the keep-outs and the radius on which it is worn matter.
     """
     pad, rules = check_type("pad", pad, Morphology), check_type("rules", rules, RulesSettings)
     lines = [pad.to_mm(points) for points in curves.flatten(pad, TOLERANCE_MM / pad.unit_mm)]
-    size = or_default("size", size, PadSettings).for_layout(pad.layout)
+    pad_settings = or_default("pad_settings", pad_settings, PadSettings).for_layout(pad.layout)
     return [
-        *_check_bends(pad, rules.min_mean_bend_radius_mm, size.bent_radius_mm),
+        *_check_bends(pad, rules.min_mean_bend_radius_mm, pad_settings.bent_radius_mm),
         *_check_gaps(lines, pad.layout, rules.min_gap_mm),
         *_check_folds(pad, lines, rules.min_gap_mm),
         *_check_crossings(pad, rules),
         *_check_common_tracks(lines, pad.layout, rules.max_common_track_mm),
         *_check_borders(pad, lines, rules.border_mm),
-        *_check_keep_outs(pad, lines, size, rules.keep_out_mm),
+        *_check_keep_outs(pad, lines, pad_settings, rules.keep_out_mm),
         *_check_lengths(pad, rules.max_length_mm),
     ]
 
@@ -205,9 +205,11 @@ def _check_borders(pad: Morphology, lines: list[Array], limit: float) -> Iterato
             yield _violation("border_mm", [fibre], float(distance[worst]), limit, line[worst])
 
 
-def _check_keep_outs(pad: Morphology, lines: list[Array], size: PadSettings, limit: float) -> Iterator[Violation]:
+def _check_keep_outs(
+    pad: Morphology, lines: list[Array], pad_settings: PadSettings, limit: float
+) -> Iterator[Violation]:
     """Yield the point of every fibre nearest to each polygon, or the middle of the longest stretch through it."""
-    for polygon in shapely.transform(keep_outs(size), pad.to_mm):
+    for polygon in shapely.transform(keep_outs(pad_settings), pad.to_mm):
         for fibre, line in enumerate(lines):
             curve = shapely.LineString(line)
             gap, inside = shapely.shortest_line(curve, polygon), curve.intersection(polygon)

@@ -35,7 +35,7 @@ class ScoredPad:
     contact: Contact
     search: SearchSettings
     rules: RulesSettings
-    size: PadSettings
+    pad_settings: PadSettings
     noise: float = AMBIGUITY_NOISE  # of the signals in the ambiguity, relative to full scale
 
     def terms(self, names: Collection[str] = ()) -> dict[str, float]:
@@ -51,12 +51,12 @@ class ScoredPad:
     @cached_property
     def expected_errors(self) -> list[float]:
         """Expected errors with 0, 1, ... fibres failed, grid units."""
-        return expected_errors(self.pad, self.contact, self.search, self.size)
+        return expected_errors(self.pad, self.contact, self.search, self.pad_settings)
 
     @cached_property
     def serpentine_signals(self) -> Array:
         """Signals of presses along a serpentine; shape (Q, F)."""
-        return signals(self.pad, serpentine_presses(self.size.sensed, 32, 5 / 49), self.contact)
+        return signals(self.pad, serpentine_presses(self.pad_settings.sensed, 32, 5 / 49), self.contact)
 
     @property
     def published_contact(self) -> Contact:
@@ -84,9 +84,9 @@ def sharpness(signals: Array) -> float:
     return float(np.abs(np.diff(signals, n=2, axis=1)).mean())
 
 
-def sharpness_loss(curves: FibreCurves, contact: Contact, size: PadSettings) -> tuple[float, Array]:
+def sharpness_loss(curves: FibreCurves, contact: Contact, pad_settings: PadSettings) -> tuple[float, Array]:
     """Return the sharpness in a search, and its gradient (3, F, n) by the curves."""
-    signals, differentiate = curves.signals(serpentine_presses(size.sensed, SEARCH_SIDE), contact)
+    signals, differentiate = curves.signals(serpentine_presses(pad_settings.sensed, SEARCH_SIDE), contact)
     signs = np.sign(np.diff(signals, n=2, axis=1))
     # the transpose of a second difference is the second difference of the padded array
     grad_signals = np.diff(np.pad(signs, ((0, 0), (2, 2))), n=2, axis=1)
@@ -98,12 +98,12 @@ def _in_mm(scored: ScoredPad, values: list[float]) -> dict[object, float]:
 
 
 def _ambiguities(scored: ScoredPad) -> list[float]:
-    return ambiguities(scored.pad, scored.contact, scored.search.max_failures, scored.noise, scored.size)
+    return ambiguities(scored.pad, scored.contact, scored.search.max_failures, scored.noise, scored.pad_settings)
 
 
 def _penalties(scored: ScoredPad) -> dict[object, float]:
     along, across = (axis[0] for axis in fibre_axes(scored.pad)[:2])
-    return {**penalties(along, across, scored.size, scored.rules).values}
+    return {**penalties(along, across, scored.pad_settings, scored.rules).values}
 
 
 TERMS = (
@@ -159,7 +159,7 @@ def score(
     max_failures: int | tuple[float, ...] = 3,
     noise: float = AMBIGUITY_NOISE,
     rules: RulesSettings | None = None,
-    size: PadSettings | None = None,
+    pad_settings: PadSettings | None = None,
     scatter: Scatter | None = None,
 ) -> dict[str, float]:
     """Compute every term of a pad; TERMS describes them.
@@ -173,7 +173,7 @@ def score(
         max_failures: maximum number of failed fibres, or weights of 0, 1, ... failed fibres.
         noise: noise of the signals in the ambiguity, relative to full scale.
         rules: limits of the penalties; the default ones if None.
-        size: settings of the pad, with the rectangle that is pressed.
+        pad_settings: settings of the pad, with the rectangle that is pressed.
         scatter: scatter of the responses in the expected error; that of a default search if None.
 
     Returns:
@@ -183,11 +183,12 @@ def score(
         InputError: arguments out of range, or a pad of too many fibres or knots.
     """
     contact, rules = or_default("contact", contact, Contact), or_default("rules", rules, RulesSettings)
-    size = or_default("size", size, PadSettings).for_layout(check_type("pad", pad, Morphology).layout)
+    layout = check_type("pad", pad, Morphology).layout
+    pad_settings = or_default("pad_settings", pad_settings, PadSettings).for_layout(layout)
     noise, keys = SearchSettings(noise=noise).noise, {"max_failures": max_failures}
     if scatter is not None:
         check_type("scatter", scatter, Scatter)
         keys |= {"noise": scatter.floor, "scatter": scatter.share, "scatter_common": scatter.common}
     search = SearchSettings(**keys)
     check_comparisons(len(pad.knots), PER_SPAN * (pad.knots.shape[1] - 1) + 1)
-    return ScoredPad(pad, contact, search, rules, size, noise).terms()
+    return ScoredPad(pad, contact, search, rules, pad_settings, noise).terms()

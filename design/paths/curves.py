@@ -291,31 +291,44 @@ def _concatenate(lines: Sequence[Array]) -> tuple[Array, NDArray[np.int_]]:
 
 
 def extreme_headings(slopes: Array) -> Array:
-    """Return headings (..., 2 n + 1), rad, at ends and extremes of spans of slopes (..., n, 3): monotone in between."""
+    """Return the headings, rad, at the ends and the extremum of n spans, between which they are monotone.
+
+    The slopes are (..., n, 3), the headings (..., 2 n + 1).
+    """
     pairs = np.stack([slopes[..., 0], quadratic(slopes, _stationary(slopes))], axis=-1)
     return np.arctan(np.concatenate([pairs.reshape(*pairs.shape[:-2], -1), slopes[..., -1:, 2]], axis=-1))
 
 
 def trace_curve(spans: Array, slopes: Array, step: float) -> tuple[Array, Array]:
-    """Sample one fibre, its `beziers` and `slope_beziers`, so that it turns by at most `step`, rad, between points.
+    """Sample one fibre so that it turns by at most `step`, rad, between two points.
 
-    Such points (n, 2) also measure its length: a chord is shorter than its arc by less than the fraction step^2 / 8.
-    Also returned are the exact headings there (n,), rad.
+    A chord of such points is shorter than its arc by less than the fraction step^2 / 8.
+
+    Args:
+        spans: `beziers` of the fibre; shape (S, 4, 2).
+        slopes: `slope_beziers` of the fibre; shape (S, 3).
+        step: maximum turn, rad.
+
+    Returns:
+        Points (n, 2), and the exact headings there (n,), rad.
     """
+    # 1. Begin at the ends of all spans and at their extreme headings. A position is the index of a span plus the
+    # parameter in it.
     starts = np.arange(len(spans))
-    at = np.append(np.column_stack([starts, starts + _stationary(slopes)]), len(spans))  # span + parameter in it
-    heading = extreme_headings(slopes)
+    positions = np.append(np.column_stack([starts, starts + _stationary(slopes)]), len(spans))
+    headings = extreme_headings(slopes)
+    # 2. Halve intervals that turn too much, down to the resolution of a float.
     while True:
-        middle = (at[:-1] + at[1:]) / 2
-        wide = (np.abs(np.diff(heading)) > step) & (at[:-1] < middle) & (middle < at[1:])
-        if not wide.any():
+        middles = (positions[:-1] + positions[1:]) / 2
+        halved = (np.abs(np.diff(headings)) > step) & (positions[:-1] < middles) & (middles < positions[1:])
+        if not halved.any():
             break
-        new = np.flatnonzero(wide) + 1
-        at = np.insert(at, new, middle[wide])
-        span = middle[wide].astype(int)
-        heading = np.insert(heading, new, np.arctan(quadratic(slopes[span], middle[wide] - span)))
-    span = np.minimum(at.astype(int), len(spans) - 1)
-    return cubic(spans[span], at - span), heading
+        new, middles = np.flatnonzero(halved) + 1, middles[halved]
+        span = middles.astype(int)
+        positions = np.insert(positions, new, middles)
+        headings = np.insert(headings, new, np.arctan(quadratic(slopes[span], middles - span)))
+    span = np.minimum(positions.astype(int), len(spans) - 1)
+    return cubic(spans[span], positions - span), headings
 
 
 def rolled_turns(points: Array, angles: Array, radius: float) -> Array:
@@ -334,26 +347,33 @@ def bend_radius(
 ) -> tuple[float, Array]:
     """Compute the smallest bend radius of a curve: `window` over the largest total turn in a stretch of that length.
 
-    For a shorter curve its length is the window. A PCHIP curve is only C1, so its pointwise curvature does not describe
-    how a fibre of finite stiffness lies. The curve is assumed to turn evenly between two points; the turn in a window
-    is then piecewise linear in the window's position, with its maximum at a window that starts or ends at a point.
+    A PCHIP curve is only C1, so its pointwise curvature does not describe how a fibre of finite stiffness lies. The
+    curve is assumed to turn evenly between two points. The turn in a window is then piecewise linear in the window's
+    position, so that its maximum is in a window that starts or ends at a point.
 
-    The points (n, 2) are so dense that chords measure the length; at a corner two of them coincide. Headings (n,), rad,
-    of the tangents there are unwrapped. Turns `out_of_plane` (n - 1,), rad, are those of `rolled_turns`. Returned are
-    the radius, and the position (2,) of the middle of that bend.
+    Args:
+        points: points so dense that chords measure the length; at a corner two of them coincide; shape (n, 2).
+        headings: unwrapped headings of the tangents there; shape (n,), rad.
+        window: length of the stretch; for a shorter curve its own length.
+        out_of_plane: `rolled_turns` of the curve; shape (n - 1,), rad.
+
+    Returns:
+        The radius, and the position (2,) of the middle of the tightest bend.
     """
     arc = arc_lengths(points)
     window = min(window, arc[-1])
-    turn = np.concatenate([[0.0], np.cumsum(np.hypot(np.diff(headings), out_of_plane))])
-    # A corner at either end of a window counts: a window starts before the turn at its first point (`turn` there,
-    # or at the first of two equal points), and `interp` takes the last of equal arcs.
-    ahead = np.interp(arc + window, arc, turn) - turn
-    behind = turn - np.interp(arc - window, arc, turn)
-    i, j = int(np.argmax(ahead)), int(np.argmax(behind))
-    is_ahead = ahead[i] >= behind[j]
-    angle, half = (ahead[i], turn[i] + ahead[i] / 2) if is_ahead else (behind[j], turn[j] - behind[j] / 2)
-    position = interpolate(points, arc, np.interp(half, turn, arc))
-    return (window / float(angle) if angle > 0 else np.inf), position
+    turned = np.concatenate([[0.0], np.cumsum(np.hypot(np.diff(headings), out_of_plane))])  # since the first point
+    # Corners at both ends of a window count: `turned` at the first of two equal points is without the corner, and
+    # `interp` returns that of the last one.
+    starting = np.interp(arc + window, arc, turned) - turned  # turn in the window that starts at each point
+    ending = turned - np.interp(arc - window, arc, turned)  # turn in the window that ends there
+    start, end = int(np.argmax(starting)), int(np.argmax(ending))
+    if starting[start] >= ending[end]:
+        turn, turned_at_middle = float(starting[start]), turned[start] + starting[start] / 2
+    else:
+        turn, turned_at_middle = float(ending[end]), turned[end] - ending[end] / 2
+    position = interpolate(points, arc, np.interp(turned_at_middle, turned, arc))
+    return (window / turn if turn > 0 else np.inf), position
 
 
 def fold_gap(line: Array, gap: float) -> tuple[float, Array] | None:

@@ -35,13 +35,17 @@ def check_fibre_ends(pad: PadSettings, rules: RulesSettings) -> None:
 
 
 def is_outside(positions: NDArray[np.float64], pad: PadSettings) -> NDArray[np.bool_]:
-    """Whether positions (Q, 2), grid units, lie outside all keep-outs; shape (Q,)."""
+    """Return the mask (Q,) of the positions (Q, 2), grid units, that lie outside all keep-outs."""
     polygons = np.array(keep_outs(pad), dtype=object)
     return ~shapely.intersects_xy(polygons[:, None], *positions.T).any(axis=0)
 
 
 class _Passage:
-    """Lanes on which the fibres of a family pass a keep-out, a box (2, 2), and which they enter and leave smoothly."""
+    """Lanes on which the k fibres of a family pass the box of a keep-out, with smooth transitions before and after it.
+
+    From `begin` to `end` along the axis fibres are at `lanes` (k,) across it; `transitions` are the lengths before and
+    after, and `marks` the coordinates along at which transitions begin and end. All are in grid units.
+    """
 
     def __init__(self, box: Array, family: int, pad: PadSettings, rules: RulesSettings) -> None:
         layout = pad.layout
@@ -51,35 +55,36 @@ class _Passage:
         (self.begin, low), (self.end, high) = box[:, [family, 1 - family]] + np.array([[-clearance], [clearance]])
         gap, border = max(rules.min_gap_mm / unit, MARGIN), rules.border_mm / unit
         levels = layout.levels[layout.families[family]]
-        # 1. numbers of fibres that pass below and above: by their levels, as far as there is room
-        room = np.maximum([low - border, width - high - border], 0)
-        capacity = np.where(room > 0, 1 + room // (1.1 * gap), 0).astype(int)
-        below = min(int((levels < (low + high) / 2).sum()), capacity[0])
-        below = max(below, min(capacity[0], len(levels) - capacity[1]))
-        above = len(levels) - below
-        # 2. lanes of the fibres
-        spacing = np.minimum(2 * gap, room / np.maximum([below - 1, above - 1], 1))
+        # 1. Fibres pass on the side on which they end, unless there is no room for so many lanes.
+        room_below, room_above = max(low - border, 0), max(width - high - border, 0)
+        max_below, max_above = (int(1 + room // (1.1 * gap)) if room > 0 else 0 for room in (room_below, room_above))
+        n_below = min(int((levels < (low + high) / 2).sum()), max_below)
+        n_below = max(n_below, min(max_below, len(levels) - max_above))
+        n_above = len(levels) - n_below
+        # 2. Lanes begin beside the keep-out, two gaps apart if there is room. Fibres that end further off stay there.
+        spacing_below = min(2 * gap, room_below / max(n_below - 1, 1))
+        spacing_above = min(2 * gap, room_above / max(n_above - 1, 1))
         self.lanes = levels.copy()
-        self.lanes[:below] = np.minimum(levels[:below], low - spacing[0] * np.arange(below)[::-1])
-        self.lanes[below:] = np.maximum(levels[below:], high + spacing[1] * np.arange(above))
-        # 3. transitions, half as long again as the rules need: a cubic with zero end slopes that rises by h over a
-        # length l has curvature 6 h / l^2
+        self.lanes[:n_below] = np.minimum(levels[:n_below], low - spacing_below * np.arange(n_below)[::-1])
+        self.lanes[n_below:] = np.maximum(levels[n_below:], high + spacing_above * np.arange(n_above))
+        # 3. Transitions are half as long again as the rules need: a cubic with zero end slopes that rises by h over a
+        # length l has curvature 6 h / l^2. The search has to repair those for which the pad is too short.
         rise = float(np.abs(self.lanes - levels).max(initial=0))
         length = max(1.5 * np.sqrt(6 * rise * rules.min_mean_bend_radius_mm / unit), rise)
-        available = self.begin, layout.extent[family] - self.end  # the search has to repair steeper transitions
+        available = self.begin, layout.extent[family] - self.end
         self.transitions = [max(min(length, limit), MARGIN) for limit in available]
         self.marks = [self.begin - self.transitions[0], self.begin, self.end, self.end + self.transitions[1]]
 
     def shift_to_lanes(self, along: Array, across: Array) -> Array:
-        """Return the coordinates across (k, n), of knots at `along` and `across`, on paths that take the lanes."""
-        outside = np.maximum((self.begin - along) / self.transitions[0], (along - self.end) / self.transitions[1])
-        share = 1 - np.clip(outside, 0, 1)
+        """Return the coordinates across of knots at `along` and `across`, all (k, n), moved towards the lanes."""
+        distance = np.maximum((self.begin - along) / self.transitions[0], (along - self.end) / self.transitions[1])
+        share = 1 - np.clip(distance, 0, 1)
         share = share**2 * (3 - 2 * share)  # smoothstep
         return across + share * (self.lanes[:, None] - across)
 
 
 def _passages(pad: PadSettings, rules: RulesSettings, family: int) -> list[_Passage]:
-    """Return a family's passages of all keep-outs; none without fibres or where the rules are not enforced."""
+    """Return the passages of a family by each keep-out; none if it has no fibres or rules are not enforced."""
     if not rules.enforce or not pad.layout.counts[family]:
         return []
     boxes = [np.array(polygon.bounds).reshape(2, 2) for polygon in keep_outs(pad)]
@@ -98,7 +103,10 @@ def pass_keep_outs(knots: Array, pad: PadSettings, rules: RulesSettings) -> Arra
 
 
 def straight_paths(pad: PadSettings, rules: RulesSettings, count: int) -> Array:
-    """Return the knots (F, count + 2, 2) of straight fibres that bow around keep-outs if the rules are enforced."""
+    """Return the knots (F, count + 2, 2) of straight fibres, which pass keep-outs if the rules are enforced.
+
+    Knots include the marks of the passages, unless these are more than `count`.
+    """
     layout = pad.layout
     marks = []
     for family, extent in enumerate(layout.extent):

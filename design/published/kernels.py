@@ -24,7 +24,7 @@ def _bisect_monotone(curve: Any, low: int, high: int, value: float, rising: bool
 
 @kernel
 def _is_between_chains(dt: float, dv: float, chains: Any) -> bool:
-    """Whether (dt, dv) from the centre lies between the lower and the upper chain of a polygon."""
+    """Return whether (dt, dv) from the centre lies between the lower and the upper chain of a polygon."""
     breaks, upper, lower = chains
     if not breaks[0] <= dt <= breaks[-1]:
         return False
@@ -46,9 +46,10 @@ def _sum_uniform(
     outer: float,
     inner: float,
 ) -> float:
-    """Compute `_sum_stretch` for weight 1: the inscribed circle without branches, the ring around it by samples.
+    """Compute `_sum_stretch` for weight 1: samples in the inscribed circle without branches, those around it singly.
 
-    The squared radii are arguments: taken from the shape in here, the loop is no longer vectorised.
+    The squared radii of the polygon and of its inscribed circle are arguments, since the loop is not vectorised if they
+    are taken from the shape here.
     """
     values, weights, start = curve[low:high], segment_lengths[low:high], low * step - ct
     total, ring = 0.0, 0
@@ -143,9 +144,9 @@ def _sample_fibre_signals(
 def quantized_signals(
     along: Any, across: Any, horizontals: int, presses: Any, shape: Any, samples: int, begin: int, end: int, out: Any
 ) -> None:
-    """Compute signals (P, Q, F) of fibres `begin` to `end` of all P F: sums of sampled segments that start inside.
+    """Compute the signals of fibres `begin` to `end` of all P F into out (P, Q, F), from `samples` points per fibre.
 
-    The shape is (chains, extents, law), `samples` the points per fibre.
+    A signal is the sum of the segments that start inside the shape, which is (chains, extents, law).
     """
     fibres = along.shape[1]
     curve, column = np.empty(samples), np.empty(len(presses))
@@ -231,9 +232,10 @@ def published_terms(
     end: int,
     out: Any,
 ) -> None:
-    """Compute four terms of pads `begin` to `end`, into `out` (P, 4).
+    """Compute four terms of pads `begin` to `end` into `out` (P, 4).
 
-    They are the entropy, summed over families, sharpness and disorder, and the joint entropy of all fibres.
+    The terms are the sum of the joint entropies of both families, sharpness, disorder, and the joint entropy of all
+    fibres.
     """
     fibres = along.shape[1]
     curves = np.empty((fibres, samples))
@@ -245,12 +247,13 @@ def published_terms(
             t, v, framed = along[p, f], across[p, f], select_frame(shape, family)
             step = t[-1] / (samples - 1)
             pchip_sample(t, v, step, curves[f])
-            _sample_fibre_signals(t, v, curves[f], step, presses, family, framed, column)  # for a column, compiled anew
-            for q in range(len(presses)):  # an assignment to a slice takes two seconds to compile
+            # a strided column of `signals` as argument, or an assignment to a slice, would take long to compile
+            _sample_fibre_signals(t, v, curves[f], step, presses, family, framed, column)
+            for q in range(len(presses)):
                 signals[q, f] = column[q]
         quantize(signals, levels, scaled)
-        none = np.int64(0)  # kernels are compiled anew for each literal
-        out[p, 0] = compute_row_entropy(scaled, none, horizontals) + compute_row_entropy(scaled, horizontals, fibres)
+        zero = np.int64(0)  # kernels are compiled anew for each literal
+        out[p, 0] = compute_row_entropy(scaled, zero, horizontals) + compute_row_entropy(scaled, horizontals, fibres)
         out[p, 1] = sum_second_differences(scaled)
         out[p, 2] = _sum_disorder(curves, horizontals)
-        out[p, 3] = compute_row_entropy(scaled, none, fibres)
+        out[p, 3] = compute_row_entropy(scaled, zero, fibres)

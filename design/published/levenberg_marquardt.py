@@ -1,8 +1,8 @@
 """Batched Levenberg-Marquardt with variable projection: networks of one hidden layer trained side by side.
 
-The output weights that are best for given hidden ones solve a ridge regression, so only the hidden weights are searched
-for. With activations H, Z Z' = H (H'H + ridge)^-1 H' and the residual projector R = 1 - Z Z', a step solves
-(J'R J + damping) change = J'e, or the dual equations; J is that of Kaufman. `docs/method.md` names the sources.
+For given hidden weights the best output weights solve a ridge regression, so only the hidden weights are searched for.
+With activations H, Z Z' = H (H'H + ridge)^-1 H', the residual projector R = 1 - Z Z' and Kaufman's Jacobian J, a step
+solves (J'R J + damping) change = J'e, or the dual equations. `docs/method.md` names the sources.
 
 Shapes: S networks, Q samples, D inputs, H hidden neurons, O outputs, A alternative targets, P = (D + 1) H weights.
 """
@@ -14,11 +14,11 @@ import torch
 from torch import Tensor
 
 MAX_STALLED_STEPS = 3  # steps in a row without a new best on validation that end the training
-RIDGE = 1e-5  # penalty of squared output weights per sample: keeps them finite where neurons are alike
+RIDGE = 1e-5  # penalty of squared output weights per sample: keeps them finite if neurons respond equally
 INITIAL_DAMPING = 3.0  # in units of the mean curvature: high, since small first steps lead to smoother networks
 MIN_DAMPING_FACTOR = 0.2  # least factor by which an accepted step lowers the damping
-MIN_DAMPING, MAX_DAMPING = 1e-15, 1e10
-MIN_GRADIENT = 1e-7
+MIN_DAMPING, MAX_DAMPING = 1e-15, 1e10  # limits of the damping; training of a network ends above the second
+MIN_GRADIENT = 1e-7  # norm of the gradient below which training ends
 BLOCK = 64  # columns of a symmetric product computed at once
 
 Samples = tuple[Tensor, Tensor]  # scaled inputs (S, Q, D) and targets (S, A, Q, O)
@@ -27,10 +27,11 @@ Samples = tuple[Tensor, Tensor]  # scaled inputs (S, Q, D) and targets (S, A, Q,
 def train_batch(
     hidden: Tensor, training: Samples, validation: Samples, max_steps: int
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Train every network from its hidden weights until validation stalls, or no step lowers its loss.
+    """Train every network from its hidden weights until its validation loss stalls or no step lowers its loss.
 
-    Returned are the hidden (S, D + 1, H) and output weights (S, H + 1, O) that did best on `validation`, and the number
-    of accepted steps (S,).
+    Returns:
+        Hidden weights (S, D + 1, H) and output weights (S, H + 1, O) of the least validation loss, and the numbers of
+        accepted steps (S,).
     """
     batch = _Batch.start(hidden, training, validation)
     best = batch.fit.hidden.clone(), batch.fit.output.clone()
@@ -56,7 +57,7 @@ class _Rows:
         return type(self)(*(part.rows(index) if isinstance(part, _Rows) else part[index] for part in parts))
 
     def replace_rows(self, other: Self, mask: Tensor) -> None:
-        """Take over the rows of `other` where `mask` (S,) is set."""
+        """Replace the rows in `mask` (S,) by those of `other`."""
         for field in fields(self):
             current, new = getattr(self, field.name), getattr(other, field.name)
             setattr(self, field.name, torch.where(mask.view(-1, *[1] * (current.dim() - 1)), new, current))
@@ -64,10 +65,10 @@ class _Rows:
 
 @dataclass
 class ProjectedFit(_Rows):
-    """Networks with the output weights that are best for their hidden ones."""
+    """Networks with the best output weights for their hidden weights."""
 
     hidden: Tensor  # hidden weights; shape (S, D + 1, H)
-    targets: Tensor  # of equally valid targets the ones nearest to the outputs; shape (S, Q, O)
+    targets: Tensor  # the alternative targets nearest to the outputs; shape (S, Q, O)
     neurons: Tensor  # activations, the last column 1; shape (S, Q, H + 1)
     root: Tensor  # inverse Cholesky factor of the ridged Gram matrix, Z = neurons root'; shape (S, H + 1, H + 1)
     output: Tensor  # output weights; shape (S, H + 1, O)
@@ -76,7 +77,7 @@ class ProjectedFit(_Rows):
 
     @classmethod
     def solve(cls, hidden: Tensor, x: Tensor, targets: Tensor) -> Self:
-        """Solve for the output weights, for x (S, Q, D + 1) with a last column of 1, and targets (S, Q, O)."""
+        """Solve for the output weights by inputs x (S, Q, D + 1), whose last column is 1, and targets (S, Q, O)."""
         neurons = activations(hidden, x)
         ridge = RIDGE * x.shape[1]
         gram = neurons.mT @ neurons
@@ -89,13 +90,13 @@ class ProjectedFit(_Rows):
         return cls(hidden, targets, neurons, root, output, error, loss)
 
     def reassign(self, x: Tensor, targets: Tensor) -> "ProjectedFit":
-        """Return the fit to those of the targets (S, A, Q, O) that are nearest to the outputs: never a worse one."""
+        """Return the fit to the nearest to the outputs of targets (S, A, Q, O); its loss is never larger."""
         if targets.shape[1] == 1:
             return self
         return ProjectedFit.solve(self.hidden, x, _nearest_targets(self.neurons @ self.output, targets)[0])
 
     def validate(self, x: Tensor, targets: Tensor) -> Tensor:
-        """Return (S,) squared errors to the nearest of the targets (S, A, Q, O) of other samples."""
+        """Return the squared errors (S,) on other samples x, to the nearest of their targets (S, A, Q, O)."""
         return _sum_squares(_nearest_targets(activations(self.hidden, x) @ self.output, targets)[1])
 
     def basis(self, like: Tensor) -> Tensor:
@@ -112,7 +113,7 @@ class ProjectedFit(_Rows):
 class _Batch(_Rows):
     """The networks still in training."""
 
-    index: Tensor  # which of all networks they are; shape (L,)
+    index: Tensor  # their indices among all networks; shape (L,)
     steps: Tensor  # accepted steps of each; shape (L,)
     fit: ProjectedFit  # their weights and residuals
     x: Tensor  # training inputs; shape (L, Q, D + 1)
@@ -127,15 +128,15 @@ class _Batch(_Rows):
     @classmethod
     def start(cls, hidden: Tensor, training: Samples, validation: Samples) -> Self:
         """Return the batch before the first step."""
-        (x, targets), (checked_x, checked) = ((append_ones(inputs), goal) for inputs, goal in (training, validation))
+        (x, targets), (validation_x, validation_targets) = ((append_ones(x), y) for x, y in (training, validation))
         fit = ProjectedFit.solve(hidden, x, targets[:, 0]).reassign(x, targets)
-        loss = fit.validate(checked_x, checked)
+        loss = fit.validate(validation_x, validation_targets)
         index = torch.arange(len(hidden), device=hidden.device)
         zero, unset, two = torch.zeros_like(index), torch.full_like(loss, torch.nan), torch.full_like(loss, 2.0)
-        return cls(index, zero, fit, x, targets, checked_x, checked, loss, zero, unset, two)
+        return cls(index, zero, fit, x, targets, validation_x, validation_targets, loss, zero, unset, two)
 
     def step(self) -> tuple[Tensor, Tensor]:
-        """Try a step; return (L,) whether it is the best on validation so far, and whether it was the last to try."""
+        """Try a step; return two masks (L,): networks that improved on validation, and networks that are finished."""
         gradient = jacobian_product(self.x, self.fit, self.fit.error)
         change = self._solve(gradient)
         candidate = ProjectedFit.solve(self.fit.hidden - change.view_as(self.fit.hidden), self.x, self.fit.targets)
@@ -145,7 +146,7 @@ class _Batch(_Rows):
         self.fit.replace_rows(candidate.reassign(self.x, self.targets), accepted)
         factor = (1 - (2 * ratio - 1) ** 3).clamp(min=MIN_DAMPING_FACTOR)
         self.damping = (self.damping * torch.where(accepted, factor, self.growth)).clamp(min=MIN_DAMPING)
-        self.growth = torch.where(accepted, 2.0, 2 * self.growth)  # where it is rejected, the next one is damped more
+        self.growth = torch.where(accepted, 2.0, 2 * self.growth)  # consecutive rejections raise the damping faster
         self.steps = self.steps + accepted
         loss = self.fit.validate(self.validation_x, self.validation_targets)
         improved = accepted & (loss < self.best_loss)
@@ -155,9 +156,9 @@ class _Batch(_Rows):
         return improved, ~(unfinished & (self.stalled < MAX_STALLED_STEPS))
 
     def _solve(self, gradient: Tensor) -> Tensor:
-        """Return (L, P) by which hidden weights are lowered; NaN where a damped matrix is singular to rounding."""
+        """Return the decrease (L, P) of the hidden weights; NaN if the damped matrix is numerically singular."""
         is_dual = self.fit.error[0].numel() < gradient.shape[1]
-        # single precision serves: the loss decides, in double precision, whether the step is taken
+        # single precision is sufficient, since the loss, in double precision, decides whether a step is accepted
         matrix = (dual_matrix if is_dual else gauss_newton_matrix)(self.x.float(), self.fit)
         right = (-self.fit.targets.flatten(1) if is_dual else gradient).float()
         diagonal = matrix.diagonal(dim1=1, dim2=2)
@@ -174,12 +175,12 @@ class _Batch(_Rows):
 
 
 def append_ones(x: Tensor) -> Tensor:
-    """Return x (S, Q, D) with a last column of 1, for the biases."""
+    """Append a column of 1, for the biases, to x (S, Q, D)."""
     return torch.cat([x, torch.ones_like(x[:, :, :1])], dim=2)
 
 
 def activations(hidden: Tensor, x: Tensor) -> Tensor:
-    """Return (S, Q, H + 1) activations of the neurons for x (S, Q, D + 1), and 1."""
+    """Return the activations of the neurons for x (S, Q, D + 1), and a last column of 1; shape (S, Q, H + 1)."""
     return append_ones(torch.tanh(x @ hidden))
 
 
@@ -191,15 +192,15 @@ def jacobian_product(x: Tensor, fit: ProjectedFit, error: Tensor) -> Tensor:
 def gauss_newton_matrix(x: Tensor, fit: ProjectedFit) -> Tensor:
     """Return J'R J (S, P, P), its lower triangle only, in the precision of x (S, Q, D + 1).
 
-    Output k responds to the weight of neuron i on input a by V_ki (1 - h_i^2) x_a: all but V_ki is common to the
-    outputs, so that one symmetric product serves all of them.
+    The derivative of output k by the weight of neuron i on input a is V_ki (1 - h_i^2) x_a. All but V_ki is common to
+    the outputs, so one symmetric product serves all of them.
     """
     networks, samples, inputs = x.shape
     slopes = fit.slopes.to(x)
     parts = (x[..., None] * slopes[:, :, None, :]).view(networks, samples, -1)
     size = parts.shape[2]
     matrix = x.new_empty(networks, size, size)
-    # block by block, which spares almost half of the full product; what lies above the blocks is never read
+    # block by block, which saves almost half of the full product; entries above the blocks are never read
     for begin in range(0, size, BLOCK):
         end = begin + BLOCK
         matrix[:, begin:, begin:end] = parts[:, :, begin:].mT @ parts[:, :, begin:end]
@@ -234,7 +235,7 @@ def dual_matrix(x: Tensor, fit: ProjectedFit) -> Tensor:
 
 
 def _nearest_targets(outputs: Tensor, targets: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the nearest of A targets (S, A, Q, O) to each output (S, Q, O), and the errors."""
+    """Return the nearest of A targets (S, A, Q, O) to each output (S, Q, O), and the errors; both (S, Q, O)."""
     errors = outputs[:, None] - targets
     if targets.shape[1] == 1:
         return targets[:, 0], errors[:, 0]
@@ -243,5 +244,5 @@ def _nearest_targets(outputs: Tensor, targets: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _sum_squares(values: Tensor) -> Tensor:
-    """Return (S,) sums of squares of (S, ...)."""
+    """Return the sum of squares (S,) over each row of values (S, ., .)."""
     return values.square().sum(dim=(1, 2))

@@ -16,24 +16,24 @@ from padforge.design.settings import Rectangle, between_fibres
 EPOCHS = 1000
 TRAINING_SHARE, VALIDATION_SHARE = 0.7, 0.15
 """Shares of the samples; the rest is the test set of the published split."""
-JITTER = 5 / 49  # greatest shift of a press off its serpentine, grid units, as published
-BATCH = 14  # networks trained at once by a core, which gains nothing from more; a GPU trains all of a level at once
+JITTER = 5 / 49  # maximum shift of a press from its serpentine, grid units, as published
+BATCH = 14  # networks that a core trains at once, which gains nothing from more; a GPU trains all of one size at once
 _FIRST_CALL = Lock()
-"""Torch loads the linear algebra of a GPU at its first call, which fails where two threads make it at once."""
+"""Torch loads the linear algebra of a GPU at its first call, which fails if two threads make it at once."""
 
 FailureSet = tuple[int, ...]  # indices of failed fibres
 
 
 @dataclass(frozen=True)
 class RangeScaler:
-    """Scale columns to [-1, 1] and back; a column that never varied becomes 0, which no weight can act on."""
+    """Scales columns to [-1, 1] and back; a constant column becomes 0, so that its weights have no effect."""
 
     middle: Array  # middle of each column's range; shape (D,)
     half: Array  # half width of each column's range; shape (D,)
 
     @classmethod
     def fit(cls, values: Array) -> "RangeScaler":
-        """Return the scaler by which `values` (Q, D) fill [-1, 1]."""
+        """Return the scaler that maps the range of each column of `values` (Q, D) to [-1, 1]."""
         low, high = values.min(axis=0), values.max(axis=0)
         return cls((low + high) / 2, (high - low) / 2)
 
@@ -74,29 +74,32 @@ def fit_batch(
     """Train S networks of one shape at once by Levenberg-Marquardt with early stopping.
 
     70 % of the samples are for training, 15 % for validation, and 15 % are left out. The weights are those of the step
-    that did best on validation. Except for rounding, a network depends on its samples and its generator alone, and on
-    no other network of the batch.
+    with the least validation loss. Except for rounding, a network depends only on its samples and its generator.
 
-    The inputs are samples of S networks (S, Q, D), or (Q, D) that all of them share; the targets (Q, O) are shared.
-    `rngs` are S generators of the splits and of the first weights. If inputs (S, C, D) and targets (C, O) for the
-    validation are given, all samples are for training. Alternative targets (A, Q, O) are as valid as `targets`: a
-    sample counts by the nearest one.
+    Args:
+        inputs: samples of S networks, shape (S, Q, D), or samples that all of them share, shape (Q, D).
+        targets: targets, which all networks share; shape (Q, O).
+        rngs: S generators of the splits and of the initial weights.
+        hidden: neurons.
+        epochs: maximum number of steps.
+        validation: inputs (S, C, D) and targets (C, O) for validation; all other samples are then for training.
+        alternatives: targets that are as valid as `targets`; the nearest one to the output counts; shape (A, Q, O).
     """
     inputs = np.broadcast_to(inputs, (len(rngs), *inputs.shape[-2:]))
-    options = targets[None] if alternatives is None else np.concatenate([targets[None], alternatives])
+    valid_targets = targets[None] if alternatives is None else np.concatenate([targets[None], alternatives])
     scalers = [RangeScaler.fit(samples) for samples in inputs]
-    target_scaler = RangeScaler.fit(options.reshape(-1, targets.shape[1]))
-    goals, count = target_scaler.transform(options), inputs.shape[1]
+    target_scaler = RangeScaler.fit(valid_targets.reshape(-1, targets.shape[1]))
+    y, count = target_scaler.transform(valid_targets), inputs.shape[1]
     n_training = round(TRAINING_SHARE * count) if validation is None else count
     n_validation = max(1, round(VALIDATION_SHARE * count))
     parts = []
     for i, (scaler, rng) in enumerate(zip(scalers, rngs, strict=True)):
         rows, held_out, _ = np.split(rng.permutation(count), [n_training, n_training + n_validation])
         x = scaler.transform(inputs[i])
-        checked = x[held_out], goals[:, held_out]
+        validation_samples = x[held_out], y[:, held_out]
         if validation is not None:
-            checked = scaler.transform(validation[0][i]), target_scaler.transform(validation[1][None])
-        parts.append((initial_weights(scaler.half > 0, hidden, rng).T, x[rows], goals[:, rows], *checked))
+            validation_samples = scaler.transform(validation[0][i]), target_scaler.transform(validation[1][None])
+        parts.append((initial_weights(scaler.half > 0, hidden, rng).T, x[rows], y[:, rows], *validation_samples))
     weights, *samples = (torch.from_numpy(np.stack(part)).to(best_device()) for part in zip(*parts, strict=True))
     trained = train_batch(weights, (samples[0], samples[1]), (samples[2], samples[3]), epochs)
     trained = (part.cpu().numpy() for part in trained)
@@ -107,7 +110,7 @@ def fit_batch(
 
 
 def best_device() -> str:
-    """Return torch's name of the GPU, if there is one, else of the processor."""
+    """Return torch's name of the device for training: the GPU if there is one, otherwise the processor."""
     if not torch.cuda.is_available():
         return "cpu"
     with _FIRST_CALL:
@@ -116,9 +119,9 @@ def best_device() -> str:
 
 
 def initial_weights(varies: NDArray[np.bool_], hidden: int, rng: np.random.Generator) -> Array:
-    """Draw hidden weights (H, D + 1), biases last, by Nguyen and Widrow (IJCNN 1990): regions spread over [-1, 1]^D.
+    """Draw hidden weights (H, D + 1), biases last, whose regions cover [-1, 1]^D (Nguyen and Widrow, IJCNN 1990).
 
-    Inputs that do not vary, by `varies` (D,), get weight 0, as if they were absent.
+    Inputs that are constant, according to `varies` (D,), get weight 0, as if they were absent.
     """
     weights = rng.uniform(-1, 1, (hidden, len(varies))) * varies
     length = 0.7 * hidden ** (1 / max(1, varies.sum()))
@@ -136,13 +139,13 @@ def split_batches(failures: Sequence[FailureSet]) -> list[list[FailureSet]]:
 
 @dataclass(frozen=True)
 class SimulatedPresses:
-    """Presses to train on and others to test on, with the signals of a pad."""
+    """Training presses and test presses, with the signals of a pad."""
 
     train_positions: Array  # shape (Q, 2), grid units
     train_signals: Array  # shape (Q, F)
     test_positions: Array  # shape (T, 2), grid units
     test_signals: Array  # shape (T, F)
-    seed: int  # of the networks, beside the failed fibres
+    seed: int  # seed of the networks, together with their failed fibres
 
     @classmethod
     def simulate(
@@ -150,27 +153,27 @@ class SimulatedPresses:
     ) -> "SimulatedPresses":
         """Simulate a serpentine of `side`^2 training presses, and `test` uniformly drawn test presses.
 
-        They lie between the outermost fibres. `respond` gives the signals (Q, F) for positions (Q, 2), grid units.
+        They lie between the outermost fibres. `respond` returns the signals (Q, F) at positions (Q, 2), grid units.
         """
         rectangle = between_fibres(pad.layout)
         training, fresh = training_presses(rectangle, side, seed), fresh_presses(rectangle, test, seed)
         return cls(training, respond(training), fresh, respond(fresh), seed)
 
     def fit(self, failures: Sequence[FailureSet], hidden: int, repeat: int = 0) -> list[Network]:
-        """Train a network on the working fibres for each set of failed fibres of one size.
+        """Train a network on the working fibres for each set of failed fibres, all sets of one size.
 
-        Another `repeat` gives other first weights and another split of the presses.
+        Initial weights and the split of the presses also depend on `repeat`.
         """
         rngs = [np.random.default_rng([2, self.seed, len(failed), *failed, repeat]) for failed in failures]
         inputs = np.stack([self.train_signals[:, self._working(failed)] for failed in failures])
         return fit_batch(inputs, self.train_positions, rngs, hidden)
 
     def test_errors(self, network: Network, failed: FailureSet) -> Array:
-        """Return (T,) distances from estimated to true test positions, grid units, without the failed fibres."""
+        """Return the errors (T,) of a network on the test presses, grid units, without the failed fibres."""
         return self.position_errors(network, failed, self.test_signals, self.test_positions)
 
     def position_errors(self, network: Network, failed: FailureSet, signals: Array, positions: Array) -> Array:
-        """Return (Q,) distances from positions estimated by signals (Q, F) to `positions` (Q, 2)."""
+        """Return the distances (Q,) between positions estimated from signals (Q, F) and `positions` (Q, 2)."""
         return np.linalg.norm(network(signals[:, self._working(failed)]) - positions, axis=1)
 
     def _working(self, failed: FailureSet) -> NDArray[np.int64]:
@@ -178,11 +181,11 @@ class SimulatedPresses:
 
 
 def training_presses(rectangle: Rectangle, side: int, seed: int) -> Array:
-    """Return (side^2, 2) presses of a jittered serpentine over a rectangle, grid units."""
+    """Return the presses (side^2, 2) of a jittered serpentine over a rectangle, grid units."""
     jitter_seed = int(np.random.default_rng([0, seed]).integers(2**32))
     return serpentine_presses(rectangle, side, JITTER, jitter_seed)
 
 
 def fresh_presses(rectangle: Rectangle, count: int, seed: int) -> Array:
-    """Return (count, 2) presses drawn uniformly over a rectangle, grid units."""
+    """Sample presses (count, 2) uniformly over a rectangle, grid units."""
     return np.random.default_rng([1, seed]).uniform(*rectangle, (count, 2))

@@ -34,7 +34,7 @@ from padforge.design.settings import (
 
 
 def quantize(signals: Array, levels: int = LEVELS) -> Array:
-    """Return signals (Q, C) as converter levels: columns scaled to their range, rounded up; 0 where they have none."""
+    """Return signals (Q, C) as converter levels: each column scaled to its range and rounded up; 0 if constant."""
     out = np.zeros(signals.shape)
     if len(signals):
         kernels.quantize(np.asarray(signals, dtype=np.float64), levels, out)
@@ -42,27 +42,25 @@ def quantize(signals: Array, levels: int = LEVELS) -> Array:
 
 
 def joint_entropy(levels: Array) -> float:
-    """Return the joint entropy in bits of the rows of (Q, C) levels: at most log2 Q, where all rows differ."""
+    """Return the joint entropy, bits, of the rows of levels (Q, C): at most log2 Q, if all rows differ."""
     return float(kernels.compute_row_entropy(np.asarray(levels, dtype=np.float64), 0, levels.shape[1]))
 
 
 def idle_share(signals: Array) -> float:
-    """Return the share of signals (Q, C), changes from rest, that are 0: the fibre is idle in these presses."""
+    """Return the fraction of signals (Q, C) that are 0, which means that a fibre is idle in a press."""
     return float((signals == 0).mean()) if signals.size else 0.0
 
 
 def information(pad: Morphology, contact: Contact | None = None, noise: float = 1.0, side: int = 20) -> float:
     """Compute a lower bound of the mutual information of the position of a press and the noisy signals, in bits.
 
-    The position is uniform between the outermost fibres, each signal has Gaussian noise of `noise` counts of a
-    converter whose LEVELS span the largest signal. What is pressed is cut into side x side cells; within a cell signals
-    are linear in the position, so the signals of a cell are Gaussian with covariance C = sigma^2 I + J S J^T (J the
-    signals' derivative, S the covariance of a position in its cell) and those of the pad a mixture. With D the
-    Bhattacharyya distance,
+    The position is uniform between the outermost fibres. Each signal has Gaussian noise of `noise` counts of a
+    converter whose LEVELS span the largest signal. The rectangle is cut into side x side cells, in which signals are
+    approximated as Gaussian with the covariance C = sigma^2 I + J S J^T, where J is the derivative of the signals and S
+    the covariance of a position in its cell. The signals of the pad are a mixture of these. With the Bhattacharyya
+    distance D, by the pairwise bound on the entropy of a mixture (Kolchinsky and Tracey, Entropy 2017, equation (10)),
 
-        I >= mean_a [ln det(C_a / sigma^2) / 2] - mean_a ln mean_b exp(-D_ab)    (in nats)
-
-    (pairwise bound on the entropy of a mixture: Kolchinsky and Tracey, Entropy 2017, equation (10)).
+        I >= mean_a [ln det(C_a / sigma^2) / 2] - mean_a ln mean_b exp(-D_ab)    (in nats).
     """
     low, high = np.array(between_fibres(pad.layout))
     x, y = ((np.arange(side) + 0.5) / side * (high - low)[axis] + low[axis] for axis in (0, 1))
@@ -71,7 +69,7 @@ def information(pad: Morphology, contact: Contact | None = None, noise: float = 
     step = 1e-2 if contact.model == "layer" else 1e-4  # a layer's signals are less precise
     around = (positions[:, None] + step * np.array([[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1]])).reshape(-1, 2)
     values = signals(pad, around, contact).reshape(len(positions), 5, -1)
-    values = values[..., values.any(axis=(0, 1))]  # the other fibres, most of a large pad's, have no information
+    values = values[..., values.any(axis=(0, 1))]  # untouched fibres, most of them on a large pad, add nothing
     if not values.size:
         return 0.0
     sigma = noise * np.abs(values).max() / LEVELS
@@ -91,8 +89,8 @@ def information(pad: Morphology, contact: Contact | None = None, noise: float = 
 def _overlaps(mean: Array, jacobian: Array, log_det: Array, count: int) -> Array:
     """Return exp(-D_ab) of the first `count` cells a with all b: means (Q, C), covariances I + J J^T, in noise units.
 
-    The mean covariance of two cells is I + W W^T with W = [J_a, J_b] / sqrt 2, four columns, so its
-    determinant and inverse are those of a 4 x 4 matrix.
+    The mean covariance of two cells is I + W W^T, where W = [J_a, J_b] / sqrt 2 has four columns, so its determinant
+    and inverse follow from those of a 4 x 4 matrix.
     """
     half = jacobian / np.sqrt(2)
     offset = mean[:count, None] - mean[None]
@@ -101,9 +99,8 @@ def _overlaps(mean: Array, jacobian: Array, log_det: Array, count: int) -> Array
     inner[..., :2, :2], inner[..., 2:, 2:] = diagonal[:count, None], diagonal
     inner[..., :2, 2:] = np.tensordot(half[:count], half, axes=(1, 1)).transpose(0, 2, 1, 3)
     inner[..., 2:, :2] = inner[..., :2, 2:].swapaxes(-1, -2)
-    along = np.concatenate(
-        [offset @ half[:count], (offset.swapaxes(0, 1) @ half).swapaxes(0, 1)], axis=-1
-    )  # W^T offset
+    by_cell = [offset @ half[:count], (offset.swapaxes(0, 1) @ half).swapaxes(0, 1)]
+    along = np.concatenate(by_cell, axis=-1)  # W^T offset
     square = (offset**2).sum(axis=-1) - (along * np.linalg.solve(inner, along[..., None])[..., 0]).sum(axis=-1)
     distance = square / 8 + (np.linalg.slogdet(inner)[1] - (log_det[:count, None] + log_det[None]) / 2) / 2
     return np.exp(-distance)
@@ -140,16 +137,20 @@ def published_terms(
 ) -> list[PublishedTerms]:
     """Compute the terms of formula (5) for every pad of a population.
 
-    The entropy is that of either family, summed, as in the published code ("families"), or that of all fibres, as in
-    the paper's formula ("joint"). The pads are a morphology, or knots (P, F, N + 2, 2) of a `layout`, by default of as
-    many horizontals as verticals, the default pitch apart. Each of the `presses` (Q, 2) is a neighbour of the one
-    before; by default they are the 49 published ones. Signals and C are computed from `samples` points per fibre, and
-    signals are rounded up to `levels` levels.
+    Args:
+        pads: a morphology, or the knots of P pads; shape (P, F, N + 2, 2).
+        contact: contact model; PUBLISHED_CONTACT if None.
+        presses: each a neighbour of the one before; the 49 published ones if None; shape (Q, 2).
+        samples: points per fibre from which signals and C are computed.
+        weights: alpha, beta, gamma.
+        layout: layout of knots; by default as many horizontals as verticals, the default pitch apart.
+        levels: levels to which signals are rounded up.
+        entropy: "families": sum over both families, as in the published code; "joint": of all fibres, as in the paper.
     """
     alpha, beta, gamma = weights
     along, across, layout, _ = fibre_axes(pads, layout)
     samples, levels = check_samples(samples, along.shape[1]), check_int("levels", levels, 1, MAX_LEVELS)
-    # a copy, for a read-only array has kernels compiled anew
+    # a copy, since kernels would be compiled anew for a read-only array
     positions = published_presses(layout).copy() if presses is None else check_presses(presses)[0]
     shape = press_shape(or_default("contact", contact, Contact, PUBLISHED_CONTACT), layout.unit_mm)
     terms = np.zeros((len(along), 4))

@@ -19,9 +19,9 @@ from padforge import design, fabricate, sense
 # some fail, and keeps them buildable. More `starts` and `steps` find better pads; the defaults take half a minute.
 
 # %%
-size = design.PadSettings(grid=3)
+pad_settings = design.PadSettings(grid=3)
 quick = design.SearchSettings(starts=1, steps=100)
-found = design.search(size, settings=quick)
+found = design.search(pad_settings, settings=quick)
 for failed in range(4):
     name = f"expected_error_mm_{failed}"
     print(f"{failed} failed: {found.terms[name]:.2f} mm, straight fibres {found.straight[name]:.2f} mm")
@@ -51,7 +51,7 @@ Image("mould/figures/mould.png")
 # sense record`, from files, or from arrays of your own.
 
 # %%
-recording = sense.simulate(found.morphology, sense.RigSettings(presses=240), size=size)
+recording = sense.simulate(found.morphology, sense.RigSettings(presses=240), pad_settings=pad_settings)
 shown = recording.times_s < 30
 plt.plot(recording.times_s[shown], recording.readings[shown])
 plt.xlabel("time (s)")

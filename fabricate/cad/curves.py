@@ -158,15 +158,18 @@ def fit_arc(points: Array) -> Arc | None:
 
 
 def fit_spline(points: Array, tangents: Sequence[Array], fit_mm: float) -> BSpline:
-    """Fit a cubic spline of few spans to a polyline (n, 2), n > 2, parametrised by its arc length.
+    """Fit a cubic spline of few spans to a polyline, parametrised by its arc length.
 
-    The ends are exact, and have the `tangents`, unit directions (2,). `fit_mm` is the tolerance against the whole line.
+    Args:
+        points: vertices, more than two, of which the first and the last are exact; shape (n, 2), mm.
+        tangents: unit directions (2,) of the spline at its start and its end.
+        fit_mm: tolerance across the polyline; along it `_ALONG_FACTOR` times as much.
     """
     s, samples, normals, vertices = _sample_edges(points)
     s *= max(np.round(s[-1], _KNOT_DECIMALS), _MIN_SPAN_MM) / s[-1]
 
     def fit(knots: Array, rows: NDArray[np.intp] | slice) -> tuple[BSpline, NDArray[np.bool_]]:
-        """Fit a spline to some samples; return it, and which of all samples are within the tolerance."""
+        """Fit a spline to the samples `rows`; return it, and the mask of all samples that are within the tolerance."""
         padded = np.concatenate([[knots[0]] * 3, knots, [knots[-1]] * 3])
         basis = BSpline.construct_fast(padded, np.eye(len(padded) - 4), 3)(s)
         poles = _fit_poles(knots, basis[rows], samples[rows], tangents)
@@ -175,7 +178,7 @@ def fit_spline(points: Array, tangents: Sequence[Array], fit_mm: float) -> BSpli
         is_close = (across <= fit_mm) & ((error**2).sum(axis=1) <= (fit_mm * _ALONG_FACTOR) ** 2)
         return BSpline.construct_fast(padded, poles, 3), is_close
 
-    # 1. Interpolate sites of the polyline, and add sites where the error exceeds the tolerance.
+    # 1. Interpolate some samples, the sites, and add sites where the error exceeds the tolerance.
     sites = np.unique(vertices[[0, len(vertices) // 2, -1]])
     while True:
         best, is_close = fit(s[sites], sites)
@@ -183,15 +186,16 @@ def fit_spline(points: Array, tangents: Sequence[Array], fit_mm: float) -> BSpli
         if not gaps:
             break
         sites = np.union1d(sites, [_next_site(a, b, vertices) for a, b in gaps])
-    # 2. Use the sites as knots of a least-squares fit, and remove every knot that the tolerance does not need.
+    # 2. Fit all samples by least squares, with knots at the sites. Leave out each knot without which the fit is still
+    # within the tolerance.
     inner = np.unique(np.round(s[sites], _KNOT_DECIMALS))
     inner = inner[(inner > _MIN_SPAN_MM) & (inner < s[-1] - _MIN_SPAN_MM)]
     knots = np.concatenate([s[:1], inner, s[-1:]])
-    for knot in (np.nan, *knots[1:-1]):  # the first fit removes none
-        fewer = knots[knots != knot]
-        curve, is_close = fit(fewer, slice(None))
+    for removed in (None, *inner):
+        remaining = knots if removed is None else knots[knots != removed]
+        curve, is_close = fit(remaining, slice(None))
         if is_close.all():
-            best, knots = curve, fewer
+            best, knots = curve, remaining
     return best
 
 

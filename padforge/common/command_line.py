@@ -39,7 +39,6 @@ json_option = click.option("--json", "as_json", is_flag=True, help="Print the re
 seed_option = click.option(
     "--seed", type=click.IntRange(0, 2**32 - 1), help="Seed of every random choice (default: that of the settings, 0)."
 )
-
 force_option = click.option(
     "--force", is_flag=True, help="Replace files even if others in the folder were made from them."
 )
@@ -48,7 +47,7 @@ force_option = click.option(
 def out_option(
     default: str = "", what: str = "Folder for the results", file: bool = False, place: str = "in the folder of the pad"
 ) -> Callable[..., Any]:
-    """Make the option `--out` for a folder or a file; without a default `place` says where `pad_folder` puts it."""
+    """Make the option `--out` for a folder or a file; its help names the `default`, or the `place` that is chosen."""
     return click.option(
         "--out",
         type=click.Path(file_okay=file, dir_okay=not file, path_type=Path),
@@ -85,7 +84,7 @@ def setting_option(name: str, section: str, kind: Any, text: str) -> Callable[..
 
 
 class SectionedGroup(click.Group):
-    """A group whose help lists its commands under headings, in the order of their addition."""
+    """A group whose help lists its commands under headings, in the order in which they were added."""
 
     def __init__(self, *arguments: Any, **options: Any) -> None:
         self._headings: dict[str, str] = {}
@@ -106,7 +105,7 @@ class SectionedGroup(click.Group):
 
 
 def pad_folder(source: Path | None = None) -> Path:
-    """Return the default folder for results: that of the pad `source`; out/NAME for NAME.mat."""
+    """Return the default folder for results: that of `source`, a folder or .json; out/NAME for another file NAME.*."""
     if source is None:
         return Path("out/pad")
     if source.is_dir() or source.suffix.lower() == ".json":
@@ -134,9 +133,9 @@ def profile_option(command: Callable[..., Any]) -> Callable[..., Any]:
 
 
 class SettingsFile(NamedTuple):
-    """Allowed sections and check of a settings file; the object of click's root context, used by `load_spec`."""
+    """What `load_spec` checks in a settings file; the object of click's root context."""
 
-    sections: Collection[str]
+    sections: Collection[str]  # names of the allowed sections
     check: "Callable[[Spec], None]"  # raises InputError if sections contradict each other
 
 
@@ -202,19 +201,19 @@ class _StderrHandler(logging.Handler):
 
 
 _HANDLER = _StderrHandler()
-INTERRUPTED = 130  # exit code after Ctrl-C, as in shells
+INTERRUPTED = 130  # exit code after Ctrl-C, as of shells
 
 
 def run_to_end(command: click.Command, name: str, extras: Mapping[str, str]) -> int:
-    """Run a command line with the arguments of this process; errors are one line on stderr; return the exit code.
+    """Run a command line with the arguments of this process, and return the exit code; errors are one line on stderr.
 
-    `extras` are the optional dependencies of its subcommands, by name; other subcommands need all of these.
+    `extras` are the extras of padforge that each subcommand needs, by its name; other subcommands need all of these.
     """
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")  # file names may not be valid text
-    for name_of_signal in {"SIGTERM", "SIGHUP"} & set(dir(signal)):
-        number = getattr(signal, name_of_signal)
+    for signal_name in {"SIGTERM", "SIGHUP"} & set(dir(signal)):
+        number = getattr(signal, signal_name)
         if signal.getsignal(number) is signal.SIG_DFL:  # otherwise it is ignored, as under nohup
             signal.signal(number, signal.default_int_handler)  # clean up as after Ctrl-C
     logger = logging.getLogger("padforge")
@@ -259,7 +258,7 @@ def _run(command: click.Command, name: str, extras: Mapping[str, str]) -> int:
             raise
         return _fail(name, message)
     except MemoryError as error:
-        return _fail(name, f"this takes more memory than there is ({str(error) or 'no more is given'})")
+        return _fail(name, f"out of memory ({error})" if str(error) else "out of memory")
 
 
 def _fail(name: str, message: str, code: int = 2) -> int:

@@ -24,10 +24,10 @@ from numba.core import event as events
 
 import padforge
 
-PATIENCE_S = 1.5  # time spent on compiling after which the user is notified
+NOTICE_AFTER_S = 1.5  # time spent on compiling after which the user is notified
 _STAGES = next(base for base in map(Path, padforge.__path__) if (base / "design").is_dir())  # folder of the stages
 SOURCES = [_STAGES / stage for stage in ("design", "sense")]  # folders with kernels
-MAX_CACHES = 4  # in a folder, for the latest versions of the sources
+MAX_CACHES = 4  # maximum number of caches in a folder, for the latest versions of the sources
 _PREFIX = "padforge-kernels-"
 
 _Function = TypeVar("_Function", bound=Callable[..., Any])
@@ -105,14 +105,14 @@ def _cached_njit(function: Callable[..., Any] | None = None, **options: Any) -> 
 
 
 kernel: _Decorator = partial(_cached_njit, error_model="numpy", nogil=True)
-"""Compiles a function at its first call, without checks for division by zero, and releases Python's lock.
+"""Compiles a function at its first call, without checks for division by zero; calls release the interpreter lock.
 
-A function that is called by a single kernel should be a `kernel(inline="always")`, which is compiled into that one.
+A function that only one kernel calls should be a `kernel(inline="always")`, which becomes a part of that kernel.
 """
 
 
 class Compilations(events.Listener):
-    """Logs one line when a process has compiled kernels for `PATIENCE_S`; none if it reads them from the cache.
+    """Logs one line when a process has compiled kernels for `NOTICE_AFTER_S`; none if it reads them from the cache.
 
     Numba runs one compilation at a time, with nested ones for the functions that are called.
     """
@@ -125,8 +125,8 @@ class Compilations(events.Listener):
         if self._depth == 0:
             self._started_s = time.monotonic()
             self._collects = gc.isenabled()
-            gc.disable()  # the compiler's many objects are all in use; to collect garbage takes a sixth of the time
-            self._timer = Timer(max(PATIENCE_S - self._spent_s, 0), self._announce)
+            gc.disable()  # collecting garbage would take a sixth of the time; the compiler's objects are all in use
+            self._timer = Timer(max(NOTICE_AFTER_S - self._spent_s, 0), self._announce)
             self._timer.daemon = True  # must not delay the end of the program
             self._timer.start()
         self._depth += 1

@@ -13,8 +13,8 @@ from padforge.common.files import check_file
 from padforge.common.validation import InputError
 
 MAX_BYTES = 2**33  # size limit of a file
+# classes of MATLAB 7.3 whose datasets are not matrices of numbers
 _OBJECTS = ("cell", "char", "table", "timetable", "string", "datetime", "duration", "categorical")
-"""Classes of MATLAB 7.3 whose datasets are not matrices of numbers."""
 
 
 class Hdf5Reader:
@@ -38,7 +38,7 @@ class Hdf5Reader:
         """Return a text attribute of the file; None if it is missing."""
         value = self._file.attrs.get(name)
         if not isinstance(value, str | bytes | None):
-            raise InputError(f"attribute {name} is no text")
+            raise InputError(f"attribute {name} is not a text")
         return value.decode() if isinstance(value, bytes) else value
 
     def is_numeric(self, name: str) -> bool:
@@ -61,7 +61,7 @@ class Hdf5Reader:
     def read(self, name: str) -> NDArray[Any]:
         """Read the values of a dataset; raise InputError if they are not real numbers."""
         if (dataset := self._datasets.get(name)) is None:
-            raise InputError(f"{name} is no dataset, expected one with all of its values in this file")
+            raise InputError(f"{name} is not readable, expected a dataset with all of its values in this file")
         if getattr(dataset, "size", 0) is None or not self.is_numeric(name):
             raise InputError(f"{name} holds {dataset.dtype} values, expected an array of real numbers")
         return np.asarray(dataset[()])
@@ -79,14 +79,14 @@ def open_hdf5(path: Path) -> Iterator[Hdf5Reader]:
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
     except Exception as error:  # h5py raises many types for damaged files
-        raise InputError(f"{path}: no HDF5 file that can be read ({' '.join(str(error).split())})") from error
+        raise InputError(f"{path}: not a readable HDF5 file ({' '.join(str(error).split())})") from error
 
 
 def load_mat(path: Path, required: tuple[str, ...]) -> dict[str, Any]:
-    """Read the variables of a MATLAB file of any version, which must have those that are `required`, by name.
+    """Read the variables of a MATLAB file of any version, by name; raise InputError if a `required` one is missing.
 
-    Values are arrays of full real matrices, in their stored type, dictionaries of the fields of structures, and
-    descriptions, such as "a cell array", of anything else.
+    A full real matrix is an array of its stored type, a structure a dictionary of its fields, and anything else a
+    description, such as "a cell array".
     """
     try:
         with check_file(path, MAX_BYTES).open("rb") as file:
@@ -95,7 +95,7 @@ def load_mat(path: Path, required: tuple[str, ...]) -> dict[str, Any]:
     except InputError:
         raise
     except Exception as error:  # SciPy raises many types for damaged files
-        raise InputError(f"{path}: not a readable MATLAB file, torn or of another kind ({error})") from error
+        raise InputError(f"{path}: not a readable MATLAB file ({error})") from error
     if missing := [name for name in required if name not in content]:
         present = ", ".join(sorted(content)) or "nothing"
         raise InputError(f"{path}: has no variable {', '.join(missing)} (found {present})")
@@ -111,7 +111,7 @@ def flatten_variables(content: Mapping[str, Any], prefix: str = "") -> dict[str,
 
 
 def _load_hdf5(path: Path) -> dict[str, Any]:
-    """Read MATLAB 7.3: arrays are transposed, structures are groups, #refs# has the elements of cell arrays."""
+    """Read MATLAB 7.3, which is HDF5: arrays are transposed, structures are groups, #refs# has elements of cells."""
     content = dict[str, Any]()
     with open_hdf5(path) as file:
         for name in file.names:
@@ -123,9 +123,8 @@ def _load_hdf5(path: Path) -> dict[str, Any]:
                 node = node.setdefault(structure, {})
             kind = file.matlab_class(name)
             is_matrix = file.is_numeric(name) and kind not in _OBJECTS
-            node[field] = (
-                file.read(name).T if is_matrix else _name_object("a cell array" if kind == "cell" else kind, field)
-            )
+            description = _name_object("a cell array" if kind == "cell" else kind, field)
+            node[field] = file.read(name).T if is_matrix else description
     return content
 
 
@@ -140,7 +139,7 @@ def _load_matrices(path: Path) -> dict[str, Any]:
     """Read MATLAB 4 to 7.2."""
     import scipy.io
 
-    with warnings.catch_warnings(action="ignore"):  # of duplicate names
+    with warnings.catch_warnings(action="ignore"):  # about duplicate names
         variables = scipy.io.loadmat(path, appendmat=False)
     content = dict[str, Any]()
     for name, value in variables.items():

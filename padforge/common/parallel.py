@@ -30,7 +30,7 @@ Result = TypeVar("Result")
 
 FORMAT = "padforge-search/1"
 SCHEDULER_S = 10.0  # time limit for a cluster's scheduler to answer
-POLL_S = 0.1  # interval at which Ctrl-C is noticed on systems where it does not wake a waiting thread
+POLL_S = 0.1  # interval of checks for Ctrl-C, which does not wake a waiting thread on every system
 
 _STATE_FILE = re.compile(r"start_([0-9]{4,})\.npz")
 
@@ -47,8 +47,8 @@ def run_tasks(
 ) -> Iterator[tuple[Key, Result]]:
     """Run tasks in parallel, and yield their results as they complete, each with the key of its task.
 
-    Tasks, picklable for a cluster, start only while the caller iterates. After an exception or Ctrl-C in the caller no
-    further task starts, and running ones are not waited for; an exception in a task is raised here at once.
+    Tasks start only while the caller iterates, and must be picklable for a cluster. After an exception or Ctrl-C in the
+    caller no further task starts, and running ones are not waited for; an exception in a task is raised here at once.
 
     Args:
         tasks: functions by key, in the order in which they start.
@@ -125,7 +125,7 @@ def cluster(address: str | None) -> Iterator[Executor | None]:
             yield executor
         except (CancelledError, KilledWorker) as error:
             reason = "has lost its scheduler" if isinstance(error, CancelledError) else "loses every worker"
-            advice = "see why, and start again; a search goes on with --resume"
+            advice = "find the cause, and start again; a search goes on with --resume"
             raise Fault(f"the cluster at {address} {reason}; {advice}") from error
 
 
@@ -136,7 +136,7 @@ def map_threads(work: Callable[[Item], Result], items: Sequence[Item]) -> Iterat
 
 
 def map_chunks(work: Callable[[int, int], Result], count: int, min_chunk: int) -> list[Result]:
-    """Return work(begin, end) for chunks, of at least `min_chunk`, of range(count), with one thread a core."""
+    """Return work(begin, end) for chunks, of at least `min_chunk`, of range(count), in one thread per core."""
     n_chunks = max(1, min(os.cpu_count() or 1, count // min_chunk))
     if n_chunks == 1:
         return [work(0, count)]
@@ -154,8 +154,8 @@ _limits_lock = Lock()
 def one_thread() -> Iterator[None]:
     """Limit torch and BLAS to one thread in the body, which may be nested or run in several threads.
 
-    More threads gain little for small matrices, are slow beside other programs, and sum in another order. BLAS threads
-    spin while they wait: beside other programs, the calibration of uncertainty took six times the processor time.
+    More threads gain little for small matrices, are slow beside other programs, and sum in another order. Threads of
+    BLAS are busy while they wait: beside other programs, a calibration took six times the processor time.
     """
     global _n_bodies
     from threadpoolctl import threadpool_limits
@@ -197,7 +197,7 @@ class Checkpoints:
                 for key, value in values.items():
                     if (before := stored.get(section, {}).get(key)) != value:
                         change = f"begun with {section} {key} {short_repr(before)}, now {short_repr(value)}"
-                        raise InputError(f"{self.folder}: {change}; allowed to resume are the same settings")
+                        raise InputError(f"{self.folder}: {change}; a search resumes with the same settings only")
         paths = {int(name[1]): path for path in self.folder.iterdir() if (name := _STATE_FILE.fullmatch(path.name))}
         return {number: self._read(paths[number]) for number in sorted(paths)}
 
@@ -229,4 +229,4 @@ class Checkpoints:
         except InputError:
             raise
         except Exception as error:  # NumPy and zipfile raise many types for damaged files
-            raise InputError(f"{path}: cannot be read ({error}); start anew without --resume") from error
+            raise InputError(f"{path}: cannot be read ({error}); start again without --resume") from error

@@ -9,7 +9,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 FAMILY_COLOURS = HORIZONTAL, VERTICAL = "#0b6e99", "#d9730d"
-ALARM, INK, FAINT, PAPER = "#c4161c", "#37352f", "#d3d1cb", "#f7f6f3"
+ALARM, INK, FAINT, PAPER = "#c4161c", "#37352f", "#d3d1cb", "#f7f6f3"  # faults, text, lines of axes, fill of a pad
 CURVES = (INK, VERTICAL, HORIZONTAL, ALARM, "#3f8f5b", "#8a63b0", "#b58900", "#7d7a75")  # colours of curves, in order
 
 DPI = 150  # default resolution of pictures

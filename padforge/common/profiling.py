@@ -1,4 +1,4 @@
-"""Profile of a command: wall time by stage, and the amount of work that was skipped."""
+"""Profile of a command: its wall time by stage, and how much work it skipped."""
 
 import sys
 import threading
@@ -54,7 +54,7 @@ _active: Profile | None = None
 
 @contextmanager
 def profiled() -> Iterator[Profile]:
-    """Profile the body; the import of each of the libraries in `HEAVY` is a stage."""
+    """Profile the body, in which the import of each library in `HEAVY` is a stage."""
     global _active
     _active, finder = Profile(), _TimedImports()
     sys.meta_path.insert(0, finder)
@@ -82,7 +82,7 @@ def stage(name: str) -> Iterator[None]:
 
 
 def add_count(name: str, evaluated: int, total: int) -> None:
-    """Count `evaluated` of `total` items, of which the others were skipped; thread-safe."""
+    """Count `total` items, of which `evaluated` were evaluated and the others skipped; thread-safe."""
     if _active is not None:
         with _active.lock:
             _active.counts[name][0] += evaluated
@@ -90,7 +90,7 @@ def add_count(name: str, evaluated: int, total: int) -> None:
 
 
 class _TimedImports(MetaPathFinder):
-    """Makes the import of each of the libraries in `HEAVY` a stage."""
+    """Makes the import of each library in `HEAVY` a stage."""
 
     def find_spec(self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None) -> Any:
         spec = PathFinder.find_spec(fullname, path, target) if fullname in HEAVY else None
@@ -98,7 +98,7 @@ class _TimedImports(MetaPathFinder):
         if loader is not None:
 
             def exec_timed(module: ModuleType) -> None:
-                del loader.exec_module  # restores the method of its class
+                del loader.exec_module  # this attribute, which hides the method of the class
                 with stage(f"import {fullname}"):
                     loader.exec_module(module)
 

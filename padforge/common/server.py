@@ -51,15 +51,15 @@ class ConnectionServer(socketserver.ThreadingTCPServer):
     ) -> None:
         """Bind the port of an address, 0 for any free one.
 
-        Clients need the `token`, which is required if other machines can connect. `option` is that of the command line
-        that sets the port, for messages.
+        Clients need the `token`, which is required if other machines can connect. `option` is the name of the command
+        line option for the port, for messages.
         """
         host, port = address
         if token and not (len(token) >= MIN_TOKEN and token.isascii() and token.isprintable()):
             raise InputError(f"token has {len(token)} characters, allowed are {MIN_TOKEN} or more of plain text")
         if host not in (HOST, "localhost") and not token:
             example = f"--token {secrets.token_urlsafe(MIN_TOKEN)}"
-            raise InputError(f"host is {host!r}, which other machines reach: state a token, such as {example}")
+            raise InputError(f"host is {host!r}, which other machines can reach: state a token, such as {example}")
         self.token = token
         self._lock = threading.Lock()  # of the connections: threads add and remove them
         self._connections = set[Any]()
@@ -85,7 +85,7 @@ class ConnectionServer(socketserver.ThreadingTCPServer):
         self.server_close()
 
     def end(self, timeout_s: float) -> None:
-        """Stop sending, and wait until every client has the last message, for at most `timeout_s`; if any is sent."""
+        """Stop sending, and wait up to `timeout_s` until every client has the last message; here nothing is sent."""
 
     def verify_request(self, request: Any, client_address: Any) -> bool:
         with self._lock:
@@ -101,11 +101,11 @@ class ConnectionServer(socketserver.ThreadingTCPServer):
         super().server_close()
         with self._lock:
             for connection in self._connections:
-                with suppress(OSError):  # sent data still arrive, and the thread that waits for it wakes up
+                with suppress(OSError):  # sent data still arrive, and the thread that waits for data wakes up
                     connection.shutdown(socket.SHUT_RDWR)
 
     def handle_error(self, request: Any, client_address: Any) -> None:
-        """Report an error, unless it is that of a connection closed by its client."""
+        """Report an error unless it is an OSError, as of a connection that its client has closed."""
         if not isinstance(sys.exception(), OSError):
             super().handle_error(request, client_address)
 
@@ -150,7 +150,7 @@ class LocalPage(ConnectionServer):
             self._changed.notify_all()
 
     def end(self, timeout_s: float) -> None:
-        """Stop sending, and wait until every browser has the latest message, for at most `timeout_s`."""
+        """Stop sending, and wait up to `timeout_s` until every browser has the latest message."""
         with self._changed:
             self._has_ended = True
             self._changed.notify_all()
@@ -227,7 +227,7 @@ class _PageHandler(BaseHTTPRequestHandler):
                 self._send(HTTPStatus.OK, "application/json", json.dumps(result, allow_nan=False).encode())
 
     def _is_authorised(self) -> bool:
-        """Return whether the request has the token, or names this machine if there is none, and is of this page."""
+        """Return whether a request comes from this page, with the token or, if there is none, to this machine."""
         self._url = urlsplit(self.path)
         if self.server.token:
             token = parse_qs(self._url.query).get("token", [""])[0]
@@ -240,7 +240,7 @@ class _PageHandler(BaseHTTPRequestHandler):
     def _is_foreign(self) -> bool:
         """Return whether another page makes the request; links to the page itself are allowed.
 
-        For images and the like browsers send no Origin header, but state in Sec-Fetch-Site that they are foreign.
+        Browsers send no Origin header for images and the like, but state in Sec-Fetch-Site that another page asks.
         """
         origin = f"http://{self.headers['Host']}"
         is_cross_site = self.headers.get("Sec-Fetch-Site", "none") not in ("same-origin", "none")

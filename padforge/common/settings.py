@@ -95,15 +95,9 @@ class Spec:
         source: str = "built-in defaults",
         sections: Collection[str] | None = None,
     ) -> None:
-        """Check the names of sections; their contents are validated by `section`.
+        """Check that `tables` has only the allowed `sections`, any if None; `section` validates their contents.
 
-        Args:
-            tables: sections by name.
-            source: name of the source in errors.
-            sections: allowed names; any if None.
-
-        Raises:
-            InputError: a section is unknown, or not a table.
+        Errors name the `source`.
         """
         allowed = check_mapping("tables", tables) if sections is None else sections
         if unknown := [name for name in tables if name not in allowed]:
@@ -114,15 +108,7 @@ class Spec:
 
     @classmethod
     def load(cls, path: Path | None, sections: Collection[str] | None = None) -> "Spec":
-        """Read a TOML file.
-
-        Args:
-            path: the file; None for the defaults.
-            sections: allowed names; any if None.
-
-        Raises:
-            InputError: the file cannot be read, is not TOML, or has an unknown section.
-        """
+        """Read a TOML file with the allowed `sections`, any if None; a `path` of None stands for the defaults."""
         if path is None:
             return cls({})
         path = check_path("path", path)
@@ -134,27 +120,17 @@ class Spec:
         return cls(tables, str(path), sections)
 
     def section(self, model: type[AnySettings], **overrides: Any) -> AnySettings:
-        """Return the validated section.
+        """Return the validated section of a model; raise InputError if a key is unknown or a value out of range.
 
-        Args:
-            model: model of the section.
-            **overrides: values that replace those of the file, unless None; their errors do not name the file.
-
-        Raises:
-            InputError: a key is unknown or a value out of range.
+        Overrides that are not None replace values of the file; errors in them do not name the file.
         """
         changes = {key: value for key, value in overrides.items() if value is not None}
         return validate(model, {**self.stated(model), **changes}, f"{self.source}: [{model.section()}]", changes)
 
     def replaced(self, tables: Mapping[str, Mapping[str, Any]], source: str = "") -> "Spec":
-        """Return a copy of these settings with other values.
-
-        Args:
-            tables: other values, by section and key.
-            source: name of the source in errors; that of these settings if empty.
-        """
+        """Return a copy with other values, by section and key; errors name its `source`, by default that of `self`."""
         source = source or self.source
-        Spec(tables, source)  # checks them
+        Spec(tables, source)  # checks the tables
         names = {*self._tables, *tables}
         return Spec({name: {**self._tables.get(name, {}), **tables.get(name, {})} for name in names}, source)
 
@@ -217,7 +193,7 @@ def _key_path(loc: Sequence[str | int], model: type[Settings], values: object) -
             path += f".{item}"
         else:
             continue
-        with suppress(LookupError, TypeError):  # the value here is no table or list
+        with suppress(LookupError, TypeError):  # this value is not a table or list
             values = cast("Any", values)[item]
     return path.removeprefix(".")
 
@@ -239,7 +215,7 @@ def commented_toml(models: Mapping[str, type[Settings]], preset: Mapping[str, Se
 def settings_schema(models: Mapping[str, type[Settings]]) -> dict[str, Any]:
     """Return the JSON Schema of a `pad.toml`, with which editors complete and check it.
 
-    It uses draft 7, the latest one that editors for TOML support. It leaves out rules across keys.
+    It uses draft 7, the latest one that editors for TOML support, and does not express rules across keys.
     """
     from pydantic.json_schema import models_json_schema  # slow to import, and needed by one command only
 

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import ArrayLike, NDArray
 
-MAX_LISTED = 12  # names in a message
+MAX_LISTED = 12  # maximum number of names in a message
 MAX_VALUES = 2**28  # size limit of arrays that public functions accept or create: 2 GiB of float64
 
 Kind = TypeVar("Kind")
@@ -36,7 +36,7 @@ class InputError(ValueError):
 
 @contextmanager
 def naming_file(path: Path | str) -> Iterator[None]:
-    """Put the name of a file, or of anything else that is read, before the message of an InputError."""
+    """Put the name of a file, or of another source, before the message of an InputError."""
     try:
         yield
     except InputError as error:
@@ -117,7 +117,7 @@ def check_array(name: str, values: "ArrayLike", max_abs: float = math.inf) -> "N
     try:
         array = np.asarray(values)
     except (TypeError, ValueError) as error:
-        raise InputError(f"{name} are {short_repr(values)}, expected numbers in rows of one length") from error
+        raise InputError(f"{name} are {short_repr(values)}, expected numbers in rows of equal length") from error
     if array.dtype.kind not in "fiu" and array.size:
         raise InputError(f"{name} are {array.dtype} values, expected real numbers")
     if array.size > MAX_VALUES:

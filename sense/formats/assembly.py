@@ -69,30 +69,12 @@ def assemble_recording(content: ForeignArrays, presses: Arrays = ()) -> Recordin
 
 def _assemble(content: ForeignArrays, presses: Arrays) -> Recording:
     notes, arrays = list(content.notes), [*content.arrays, *presses]
-    columns: dict[str, Array] = {}
-    fibres: list[tuple[ColumnEntry, Array]] = []
-    for entry, array in arrays:
-        values = _scale(entry, entry.select(array))
-        if entry.quantity == "fibres":
-            fibres.append((entry, values))
-        elif entry.quantity == "positions":
-            columns["positions"] = values
-        elif values.size in values.shape:  # a row or a column
-            columns[entry.quantity] = values.ravel()
-        else:
-            raise InputError(f"{entry.quantity} has shape {values.shape}, expected one row or column")
-    if "rate" in columns:
-        n_readings = max(fibres[0][1].shape)
-        columns["time"] = np.arange(n_readings) / columns.pop("rate")[0]
+    columns, fibres = _scale_arrays(arrays)
     times = columns.pop("time")
     fibres = [(entry, _by_readings(values, len(times))) for entry, values in fibres]
     readings = fibres[0][1] if len(fibres) == 1 else np.column_stack([values for _, values in fibres])
-    if not np.nanmax(np.abs(readings), initial=0) <= MAX_VOLTS:
-        level_v = float(np.nanmedian(np.abs(readings)))
-        if np.isfinite(level_v) and level_v > MAX_VOLTS:
-            hint = suggest_unit(content.source, "fibres", readings)
-            raise InputError(f"fibres rest at {level_v:.4g} V, allowed is {MAX_VOLTS:g} V; are they {hint}?")
-    names = [name for each in fibres for name in _fibre_names(*each)]
+    _check_level(readings, content.source)
+    names = [name for entry, values in fibres for name in _fibre_names(entry, values)]
     # 1. Leave out lines without a reading, and repair times.
     by_line = {name: values for name, values in columns.items() if len(values) == len(times)}
     is_reading, is_held = np.ones(len(times), bool), content.is_held
@@ -155,6 +137,34 @@ def _assemble(content: ForeignArrays, presses: Arrays) -> Recording:
     source |= {NOTE: "; ".join(notes)} if notes else {}
     by_attribute: dict[str, Any] = {MEASURES[name]: values for name, values in measures.items()}
     return Recording(readings, times, presses_mm, down, up, source, **by_attribute)
+
+
+def _scale_arrays(arrays: Arrays) -> tuple[dict[str, Array], list[tuple[ColumnEntry, Array]]]:
+    """Return the arrays in s, V, mm and N: all except fibres by quantity, and fibres with their entries."""
+    columns: dict[str, Array] = {}
+    fibres: list[tuple[ColumnEntry, Array]] = []
+    for entry, array in arrays:
+        values = _scale(entry, entry.select(array))
+        if entry.quantity == "fibres":
+            fibres.append((entry, values))
+        elif entry.quantity == "positions":
+            columns["positions"] = values
+        elif values.size in values.shape:  # a row or a column
+            columns[entry.quantity] = values.ravel()
+        else:
+            raise InputError(f"{entry.quantity} has shape {values.shape}, expected one row or column")
+    if "rate" in columns:
+        columns["time"] = np.arange(max(fibres[0][1].shape)) / columns.pop("rate")[0]
+    return columns, fibres
+
+
+def _check_level(readings: Array, source: Mapping[str, Any]) -> None:
+    """Raise InputError if most readings are above MAX_VOLTS, and name the unit that they may have."""
+    if not np.nanmax(np.abs(readings), initial=0) <= MAX_VOLTS:
+        level_v = float(np.nanmedian(np.abs(readings)))
+        if np.isfinite(level_v) and level_v > MAX_VOLTS:
+            hint = suggest_unit(source, "fibres", readings)
+            raise InputError(f"fibres rest at {level_v:.4g} V, allowed is {MAX_VOLTS:g} V; are they {hint}?")
 
 
 def _scale(entry: ColumnEntry, array: NDArray[Any]) -> Array:

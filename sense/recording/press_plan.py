@@ -63,7 +63,7 @@ class PressPlan:
 
 def fit_pad_settings(pad: Morphology, pad_settings: PadSettings | None = None) -> PadSettings:
     """Return `[pad]`, or the default, for the layout of a pad; InputError if keep-outs leave too little to press."""
-    pad_settings = or_default("size", pad_settings, PadSettings).for_layout(pad.layout)
+    pad_settings = or_default("pad_settings", pad_settings, PadSettings).for_layout(pad.layout)
     if pad_settings.keep_out_mm:
         import shapely
 

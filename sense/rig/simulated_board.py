@@ -26,19 +26,19 @@ class SimulatedBoard:
     """A board that samples a simulated pad at `[rig] rate_hz`; implements `Board`.
 
     The pad, with the baselines of its fibres, is the one that `simulate` makes of the same arguments. Presses have the
-    same timing, other positions, and the depths of `[rig]` in turn. `size` has the sensed area and keep-outs, which
-    are those of the pad by default.
+    same timing, other positions, and the depths of `[rig]` in turn. `pad_settings` has the sensed area and keep-outs.
     """
 
-    def __init__(self, pad: Morphology, rig: RigSettings, contact: Contact, size: PadSettings | None = None) -> None:
+    def __init__(
+        self, pad: Morphology, rig: RigSettings, contact: Contact, pad_settings: PadSettings | None = None
+    ) -> None:
         rig = rig.for_contact(contact)
         rng = np.random.default_rng(rig.seed)
         if rig.plan_file is None:
-            make_plan(pad, rig, rng, size)  # `simulate`, too, draws the plan before the pad
+            make_plan(pad, rig, rng, pad_settings)  # `simulate`, too, draws the plan before the pad
         self._model = LivePad(pad, contact, rig, rig.rate_hz, rng)
-        self._pad, self._rig = pad, rig
+        self._pad, self._rig, self._pad_settings = pad, rig, pad_settings
         self._depths_mm = rig.press_depths_mm
-        self._size = size
         self._position_rng = rng.spawn(1)[0]
         self._start_s: float | None = None
         self._n_samples = 0
@@ -73,7 +73,8 @@ class SimulatedBoard:
         cycle_s = self._rig.readings_per_press / self._rig.rate_hz
         press, elapsed_s = divmod(time_s, cycle_s)
         if press > self._press:
-            self._press, self._position_mm = press, sample_positions(self._pad, 1, self._position_rng, self._size)[0]
+            self._press = press
+            self._position_mm = sample_positions(self._pad, 1, self._position_rng, self._pad_settings)[0]
         relative_depth = min((elapsed_s - cycle_s / 2) / TRAVEL_S, 1.0, (cycle_s - elapsed_s) / TRAVEL_S)
         return self._position_mm, self._depths_mm[int(press) % len(self._depths_mm)] * max(relative_depth, 0.0)
 
@@ -91,7 +92,7 @@ def simulated_board_of(model: Path) -> SimulatedBoard:
     try:
         pad = Morphology.from_dict(source["morphology"])
         rig = RigSettings(**source["rig"] | {"channels": ()})  # a simulated pad is not wired to inputs
-        size = {key: source[key] for key in ("sensed_mm", "keep_out_mm") if key in source}
-        return SimulatedBoard(pad, rig, Contact(**source["contact"]), PadSettings(**pad.layout.settings | size))
+        pressed = {key: source[key] for key in ("sensed_mm", "keep_out_mm") if key in source}
+        return SimulatedBoard(pad, rig, Contact(**source["contact"]), PadSettings(**pad.layout.settings | pressed))
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(f"{path}: describes no pad that can be simulated ({error})") from error

@@ -54,20 +54,22 @@ class PadModel:
     noise_v: Array | None = None  # noise of responses in V; None for relative changes of resistance
 
 
-def model_plan(pad: Morphology, contact: Contact, rig: RigSettings, size: PadSettings | None = None) -> PadModel:
-    """Model a pad that is built as `[rig]` says, and pressed in the area of `size`, see `fit_pad_settings`."""
-    size = fit_pad_settings(pad, size)
-    keys = {"sensed_mm", "keep_out_mm"} if size.keep_out_mm else {"sensed_mm"}
+def model_plan(
+    pad: Morphology, contact: Contact, rig: RigSettings, pad_settings: PadSettings | None = None
+) -> PadModel:
+    """Model a pad that is built as `[rig]` says, and pressed in the area of `pad_settings`, see `fit_pad_settings`."""
+    pad_settings = fit_pad_settings(pad, pad_settings)
+    keys = {"sensed_mm", "keep_out_mm"} if pad_settings.keep_out_mm else {"sensed_mm"}
     source = {"contact": contact.model_dump(mode="json"), "morphology": pad_source(pad)}
-    source |= size.model_dump(mode="json", include=keys)
+    source |= pad_settings.model_dump(mode="json", include=keys)
 
     def responses(positions_mm: Array, depths_mm: Array) -> PressParts[Array]:
         return resistance_changes(build_pad(pad, rig), positions_mm, depths_mm, contact, rig)
 
-    return PadModel(pad.to_mm(size.sensed), pressable_test(pad, size), responses, source)
+    return PadModel(pad.to_mm(pad_settings.sensed), pressable_test(pad, pad_settings), responses, source)
 
 
-def model_twin(twin: Twin, rig: RigSettings, size: PadSettings | None = None) -> PadModel:
+def model_twin(twin: Twin, rig: RigSettings, pad_settings: PadSettings | None = None) -> PadModel:
     """Model the pad of a twin: fibres as built and wired, pressed where the arm pressed; dead channels stay at rest."""
     columns, live = _live_channels(twin)
     fibres = np.array([channel.fibre for channel in live])
@@ -96,7 +98,7 @@ def model_twin(twin: Twin, rig: RigSettings, size: PadSettings | None = None) ->
     spans = np.abs(twin.frame.turned(np.eye(2))).T
     sides, *_ = np.linalg.lstsq(spans, np.array(twin.sensed_mm) / twin.frame.scale, rcond=MIN_SINGULAR)
     half_mm = np.maximum(sides, 0) / 2
-    plan = model_plan(twin.morphology, twin.contact(), rig, size)
+    plan = model_plan(twin.morphology, twin.contact(), rig, pad_settings)
     return replace(
         plan,
         corners_mm=np.array([-half_mm, half_mm]),
@@ -106,13 +108,13 @@ def model_twin(twin: Twin, rig: RigSettings, size: PadSettings | None = None) ->
     )
 
 
-def model_like_twin(pad: Morphology, twin: Twin, rig: RigSettings, size: PadSettings | None = None) -> PadModel:
+def model_like_twin(pad: Morphology, twin: Twin, rig: RigSettings, pad_settings: PadSettings | None = None) -> PadModel:
     """Model another pad by its plan, with the contacts of a twin, and its median gains and noise.
 
     The differences of its channels are unknown before it is made: fibre i is on channel i, and all have the same gain.
     """
     columns, live = _live_channels(twin)
-    plan = model_plan(pad, twin.contact(), rig, size)
+    plan = model_plan(pad, twin.contact(), rig, pad_settings)
     noise_v = np.full(len(pad.knots), np.median([channel.noise_v for channel in live]))
     plain, gain_v = twin.contact(), _median_gain(np.array([channel.gain_v for channel in live]))
     parts = [twin.parts.get(name) for name in PARTS]
@@ -177,7 +179,7 @@ def simulate(
     pad: Morphology | Twin,
     rig: RigSettings | None = None,
     contact: Contact | None = None,
-    size: PadSettings | None = None,
+    pad_settings: PadSettings | None = None,
     like: Twin | None = None,
 ) -> Recording:
     """Simulate a recording of the presses that `[rig]` plans.
@@ -189,7 +191,7 @@ def simulate(
         rig: plan, depths, rate, seed, noise, drift, creep, hysteresis and scatter; measured values of a twin replace
             them.
         contact: contact model; that of a twin replaces it.
-        size: pressed area and keep-outs of the pad; for a twin only the keep-outs.
+        pad_settings: pressed area and keep-outs of the pad; for a twin only the keep-outs.
         like: twin of another pad, whose sensitivity, gain and noise `pad` takes over.
 
     Returns:
@@ -207,11 +209,11 @@ def simulate(
         rig, contact = measured_rig(measured, rig), measured.contact()
     rig = rig.for_contact(contact)
     if isinstance(pad, Twin):
-        model = model_twin(pad, rig, size)
+        model = model_twin(pad, rig, pad_settings)
     elif like is None:
-        model = model_plan(pad, contact, rig, size)
+        model = model_plan(pad, contact, rig, pad_settings)
     else:
-        model = model_like_twin(pad, like, rig, size)
+        model = model_like_twin(pad, like, rig, pad_settings)
     rng = np.random.default_rng(rig.seed)
     plan = make_plan_in(model.corners_mm, rig, rng, model.free)
     cycle = Cycle(rig.readings_per_press, rig.rate_hz)
@@ -230,10 +232,12 @@ def simulate(
     )
 
 
-def plan_simulation(pad: Morphology, rig: RigSettings, contact: Contact, size: PadSettings | None = None) -> PressPlan:
+def plan_simulation(
+    pad: Morphology, rig: RigSettings, contact: Contact, pad_settings: PadSettings | None = None
+) -> PressPlan:
     """Return the presses that `simulate` makes on any pad of the same layout, and raise InputError as it does."""
     _check_plan_kind(rig)
-    plan = make_plan(pad, rig, np.random.default_rng(rig.seed), size)
+    plan = make_plan(pad, rig, np.random.default_rng(rig.seed), pad_settings)
     if contact.model == "layer":
         check_depths(plan.depths_mm, contact.thickness_mm, "the thickness of the pad")
         contact_press(deepest_contact(contact, plan.depths_mm))
@@ -245,10 +249,12 @@ def _check_plan_kind(rig: RigSettings) -> None:
         raise InputError("[rig] plan is adaptive, allowed in a simulation are uniform, grid, serpentine or a .csv file")
 
 
-def sample_positions(pad: Morphology, presses: int, rng: np.random.Generator, size: PadSettings | None = None) -> Array:
+def sample_positions(
+    pad: Morphology, presses: int, rng: np.random.Generator, pad_settings: PadSettings | None = None
+) -> Array:
     """Sample positions (Q, 2), mm, uniformly over the pressed area of a pad, see `fit_pad_settings`."""
-    size = fit_pad_settings(pad, size)
-    return sample_uniform(pad.to_mm(size.sensed), presses, rng, pressable_test(pad, size))
+    pad_settings = fit_pad_settings(pad, pad_settings)
+    return sample_uniform(pad.to_mm(pad_settings.sensed), presses, rng, pressable_test(pad, pad_settings))
 
 
 def measure_rig_settings(recording: Recording) -> dict[str, float]:

@@ -75,7 +75,7 @@ def test_results_without_out_go_beside_their_pad(tmp_path: Path) -> None:
         (KeyboardInterrupt("2 pads are there"), 130, "interrupted; 2 pads are there"),
         (FileNotFoundError(2, "No such file", "pad.json"), 2, "pad.json: No such file"),
         (OSError("full"), 2, "full"),
-        (MemoryError(), 2, "this takes more memory than there is (no more is given)"),
+        (MemoryError(), 2, "out of memory"),
         (InputError("two\nlines \x1b[31m"), 2, r"two lines \x1b[31m"),
     ],
 )

@@ -55,7 +55,7 @@ def test_compilation_is_announced_unless_it_is_short_or_cached(
         return [record.message.split(",")[0] for record in caplog.records]
 
     assert notes(1) == []  # compiled in less than the patience
-    monkeypatch.setattr(compilation, "PATIENCE_S", 0.0)
+    monkeypatch.setattr(compilation, "NOTICE_AFTER_S", 0.0)
     assert notes(1) == []  # read from disk
     assert set(notes(1.5)) == {"compiling kernels"}  # another type is compiled
 

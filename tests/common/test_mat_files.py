@@ -44,7 +44,7 @@ def test_load_mat_reads_every_version_and_refuses_torn_files(tmp_path: Path) -> 
     assert np.array_equal(pads[0].knots, pads[1].knots)
     content = newer(tmp_path / "new.mat", CONTENT).read_bytes()
     (tmp_path / "torn.mat").write_bytes(content[:2000])
-    with pytest.raises(InputError, match=r"torn\.mat: no HDF5 file that can be read"):
+    with pytest.raises(InputError, match=r"torn\.mat: not a readable HDF5 file"):
         load_mat(tmp_path / "torn.mat", ())
     (tmp_path / "torn.mat").write_bytes((tmp_path / "old.mat").read_bytes()[:300])
     with pytest.raises(InputError, match=r"torn\.mat: not a readable MATLAB file"):

@@ -54,7 +54,7 @@ def test_design_for_twin_uses_its_contact_and_resumes(here, twin, little_scored,
     assert unbroken["provenance"]["inputs"] == {"twin.json": sha256(twin)}
     pad, scatter = Morphology.load("out/pad/morphology.json"), Scatter(used["search"]["noise"], 0.05, 0.5)
     size = PadSettings(sensed_mm=(18, 30)).for_layout(pad.layout)
-    terms = score(pad, contact, max_failures=1, size=size, scatter=scatter)
+    terms = score(pad, contact, max_failures=1, pad_settings=size, scatter=scatter)
     terms = {name: term for name, term in terms.items() if not name.startswith("published_")}  # those are of a shape
     assert unbroken["terms"] == pytest.approx(terms, rel=1e-9)
 

@@ -78,7 +78,7 @@ VALUES: dict[str, Callable[[], object]] = {
     "a screw by an end": keep_out(-25.0, -15.0, 4.0),
     "a keep-out by an end": keep_out(*square(-25.0, -15.0, 4)),
     "a keep-out of all": keep_out((-28, -30), (28, -30), (28, 30), (-28, 30)),
-    "a sensed area": lambda: design.score(Morphology.straight(3), size=PadSettings(sensed_mm=(46, 20))),
+    "a sensed area": lambda: design.score(Morphology.straight(3), pad_settings=PadSettings(sensed_mm=(46, 20))),
     "too many fibres to compare": lambda: design.score(Morphology.random(16, 3000, seed=0), max_failures=0),
     "no noise": lambda: design.score(PAD, noise=0.0),
     "an origin of other fibres": lambda: design.search(PadSettings(grid=2), origin=Morphology.straight(3)),

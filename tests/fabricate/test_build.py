@@ -221,10 +221,10 @@ def test_build_deletes_earlier_files_unless_they_were_changed(tmp_path, caplog):
     left = {"mine.stl", "mould.step", "tracks.dxf"}
     assert files_in(tmp_path).keys() == {*result.sha256, "fabrication.json"} | left
     assert result.sha256.keys() == {"mould.stl", *BESIDE}
-    gone = "is gone: it was of the mould before this one"
+    deleted = "deleted, it belonged to the previous mould"
     assert caplog.messages == [
-        *(f"{tmp_path / name} {gone}" for name in ("mould.3mf", "tracks.svg")),
-        f"{tmp_path / 'tracks.dxf'} is left from the mould before this one: it is not as it was written",
+        *(f"{tmp_path / name}: {deleted}" for name in ("mould.3mf", "tracks.svg")),
+        f"{tmp_path / 'tracks.dxf'}: kept, it belongs to the previous mould but was changed since",
     ]
 
 

@@ -47,7 +47,7 @@ function gridElements(view) {
   return elements
 }
 
-// Calls show with each message, which is the whole of what the page shows.
+// Call `show` with each message, which contains everything that the page shows.
 function subscribe(show) {
   let ended = false
   const source = new EventSource("/events" + location.search)

@@ -20,7 +20,9 @@ def test_score_evaluates_the_sensed_area(little_scored):
     """The published terms and the information are of presses between the fibres, wherever else it is pressed."""
     # a layer leaves no fibre idle anywhere
     pad, disc = Morphology.random(2, 4, seed=1), Contact(radius=0.9, sides=None)
-    beyond, wide = (score(pad, disc, max_failures=0, size=PadSettings(sensed_mm=size)) for size in ("beyond", (30, 20)))
+    beyond, wide = (
+        score(pad, disc, max_failures=0, pad_settings=PadSettings(sensed_mm=size)) for size in ("beyond", (30, 20))
+    )
     for name in beyond:
         assert (beyond[name] == wide[name]) == name.startswith(("published", "information", "penalty"))
     assert score(pad, disc, max_failures=0) == beyond

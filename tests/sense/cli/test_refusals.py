@@ -72,7 +72,7 @@ calibrate rec --time-budget nan                 | Invalid value for '--time-budg
 {live} --model model --port {taken}             | port {taken} of 127.0.0.1: another program uses it
 {live} --model model --replay other             | readings are of 6 fibres, the localizer was learnt from 4
 {live} --model model --rig ur5                  | no board is found
-{live} --model model --host 0.0.0.0             | host is '0.0.0.0', which other machines reach
+{live} --model model --host 0.0.0.0             | host is '0.0.0.0', which other machines can reach
 {live} --model model --replay rec --tcp 0 --rerun here | --rerun is 'here', expected an address like rerun+http://HOST:PORT
 {live} --model model --tcp 0 --token short      | token has 5 characters, allowed are 16 or more
 """

@@ -54,7 +54,7 @@ def test_simulated_board_of_a_model_is_that_of_its_simulated_recording(tmp_path:
     hole = ((2.0, -6.0), (9.0, -6.0), (9.0, 6.0), (2.0, 6.0))
     size = PadSettings(horizontals=3, verticals=2, pitch_mm=(8.0, 15.0), keep_out_mm=(hole,), sensed_mm=(10.0, 12.0))
     pad, rig, time = Morphology.straight(size.layout), quiet_rig(presses=4, readings_per_press=10), Time(least_s=0)
-    simulate(pad, rig, size=size).save(tmp_path / RECORDED, {})
+    simulate(pad, rig, pad_settings=size).save(tmp_path / RECORDED, {})
     boards = simulated_board_of(tmp_path), *(SimulatedBoard(pad, rig, Contact(), each) for each in (size, None))
     with time.of_all():
         for board in boards:

@@ -17,7 +17,9 @@ QUICK = LocalizerSettings(members=1, hidden=32, layers=2, epochs=10, batch=64, m
 
 @few_moments()
 def test_localization_of_a_rectangular_pad_is_in_mm() -> None:
-    recording = simulate(Morphology.random(SIZE.layout, knots=3, seed=2), RigSettings(presses=250, seed=1), size=SIZE)
+    recording = simulate(
+        Morphology.random(SIZE.layout, knots=3, seed=2), RigSettings(presses=250, seed=1), pad_settings=SIZE
+    )
     localizer, evaluation = calibrate(recording, QUICK)
     localization = localizer.predict(recording)
     errors = np.linalg.norm(localization.positions_mm - recording.presses_mm, axis=1)

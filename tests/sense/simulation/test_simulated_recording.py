@@ -46,7 +46,7 @@ def test_simulate_presses_all_that_is_sensed_as_deep_as_the_contact() -> None:
     recording = simulate(GRID, RigSettings(presses=400))
     assert np.abs(recording.presses_mm).max() <= 22.5
     assert np.abs(recording.presses_mm).max(axis=0).min() > 21
-    strip = simulate(GRID, RigSettings(presses=400), size=PadSettings(sensed_mm=(50, 8)))
+    strip = simulate(GRID, RigSettings(presses=400), pad_settings=PadSettings(sensed_mm=(50, 8)))
     assert strip.source["sensed_mm"] == [50, 8]
     np.testing.assert_allclose(np.abs(strip.presses_mm).max(axis=0), [25, 4], rtol=0.02)
     for rig, depth_mm in ((RigSettings(presses=4), 2.0), (RigSettings(presses=4, depth_mm=4.0), 4.0)):

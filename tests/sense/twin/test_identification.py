@@ -124,7 +124,7 @@ def test_identify_requires_presses_over_half_of_a_rectangle_each_way() -> None:
     plan = Morphology.straight((1, 3), (8.0, 12.0))
     narrow = PadSettings(**plan.layout.settings, sensed_mm=(10.0, 11.0))
     with pytest.raises(InputError, match="allowed from 12 x 6 mm on"):
-        identify(simulate(plan, RigSettings(presses=80), size=narrow), plan)
+        identify(simulate(plan, RigSettings(presses=80), pad_settings=narrow), plan)
 
 
 @pytest.mark.slow
