@@ -200,7 +200,8 @@ def atomic_files(folder: Path, without: Collection[str] = ()) -> Iterator[Path]:
         make_folder(folder)
         with temporary_folder(folder) as stage:
             yield stage
-            names = sorted(path.relative_to(stage).as_posix() for path in stage.rglob("*") if path.is_file())
+            paths = (path.relative_to(stage) for path in stage.rglob("*") if path.is_file())
+            names = sorted(path.as_posix() for path in paths if not path.parts[0].startswith(UNFINISHED))
             folders = {(folder / name).parent for name in names} | {folder}
             documents = [name for name in names if name.endswith(".json")]
             for name in names:

@@ -13,6 +13,7 @@ import pytest
 
 from padforge.common import files
 from padforge.common.validation import InputError
+from tests.helpers.folders import files_in
 from tests.helpers.power_cut import ON_LINUX, Disk
 
 LOCK = "import sys\nfrom pathlib import Path\nfrom padforge.common.files import locked_folder\n"
@@ -111,22 +112,23 @@ def test_locked_folder_admits_one_run_and_is_removed_again_if_created_and_empty(
 def replaced(folder, *names, without=(), text="new"):
     with files.atomic_files(folder, without) as stage:
         for name in names:
+            (stage / name).parent.mkdir(exist_ok=True)
             (stage / name).write_text(text)
             if name == "fails":
                 raise KeyError
 
 
 def texts(folder):
-    return {path.name: path.read_text() for path in folder.iterdir() if path.is_file()}
+    return {name: content.decode() for name, content in files_in(folder).items()}
 
 
 def test_atomic_files_moves_and_removes_all_or_none(tmp_path):
     with pytest.raises(KeyError):
         replaced(tmp_path / "out", "one", "fails")
     assert texts(tmp_path / "out") == {}
-    replaced(tmp_path / "out", "one", "two", "mine", text="old")
-    replaced(tmp_path / "out", "one", without=["two", "three"])
-    assert texts(tmp_path / "out") == {"one": "new", "mine": "old"}
+    replaced(tmp_path / "out", "one", "two", "mine", "in/four", "in/five", text="old")
+    replaced(tmp_path / "out", "one", "in/four", ".unfinished-of-a-library/file", without=["two", "three", "in/five"])
+    assert texts(tmp_path / "out") == {"one": "new", "mine": "old", "in/four": "new"}
     (tmp_path / "out" / "two").mkdir()
     with pytest.raises(InputError, match="two: is a folder, expected a file or nothing"):
         replaced(tmp_path / "out", "mine", "two")
@@ -138,10 +140,10 @@ def test_what_is_written_outlasts_a_power_cut(tmp_path, monkeypatch):
     disk, folder = Disk(monkeypatch), tmp_path / "a" / "b"
     for text in ("old", "new"):
         files.write_text(folder / "file.txt", text)
-        replaced(folder / "set", "a.json", "b.csv", text=text)
-        for name in ("file.txt", "set/a.json", "set/b.csv"):
+        replaced(folder / "set", "a.json", "b.csv", "in/c.png", text=text)
+        for name in ("file.txt", "set/a.json", "set/b.csv", "set/in/c.png"):
             assert disk.read(folder / name) == text.encode()
-    assert all(disk.has_name(path) for path in (folder.parent, folder, folder / "set"))
+    assert all(disk.has_name(path) for path in (folder.parent, folder, folder / "set", folder / "set" / "in"))
     assert disk.torn == []
 
 

@@ -165,9 +165,10 @@ def test_fit_correction_recovers_gains_and_pose(localizer: LocalizerModel, recor
 
 def test_recalibrate_command_writes_nothing_beside_a_broken_detector(model: Path, tmp_path: Path) -> None:
     shutil.copytree(model, tmp_path / "old")
-    (tmp_path / "old/health.json").write_text("{}")
+    (tmp_path / "old/health").mkdir()
+    (tmp_path / "old/health/commanded.json").write_text("{}")
     ended = called("sense", "recalibrate", "--model", "old", "old/recording", "--out", "new", cwd=tmp_path)
-    assert (ended.code, ended.err[:28]) == (2, "padforge: old/health.json: f")
+    assert (ended.code, ended.err[:38]) == (2, "padforge: old/health/commanded.json: f")
     assert not (tmp_path / "new").exists()
 
 
