@@ -109,7 +109,8 @@ def test_walls_of_ridges_go_straight_on_but_for_their_corners(knots, seed, leads
     shapes = judged(Plan(Morphology.random(1, knots, seed), settings))
     for ridge in (shapes["horizontal 1"], shapes["vertical 1"]):
         for wire in (wire for face in ridge.faces() if face.normal_at().Z > 0.5 for wire in face.wires()):
-            places = [[tuple(edge @ at) for at in (0, 1e-6, 1, 1 - 1e-6)] for edge in wire.edges()]
+            steps = [(edge, 1e-5 / edge.length) for edge in wire.edges()]
+            places = [[tuple(edge @ at) for at in (0, step, 1, 1 - step)] for edge, step in steps]
             ends, beside = np.array(places).reshape(-1, 2, 3).swapaxes(0, 1)
             away = (beside - ends) / np.linalg.norm(beside - ends, axis=1, keepdims=True)
             near = np.asarray(KDTree(ends).query(ends, k=2)[1])
