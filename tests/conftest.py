@@ -47,7 +47,6 @@ PUBLISHED = ROOT.parent / "shared" / "data" / "published"
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    """An option that renews the whole outputs in tests/golden."""
     parser.addoption("--renew", action="store_true", help="keep outputs in tests/golden as they are now")
 
 
@@ -78,13 +77,11 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
 
 @pytest.fixture(scope="session")
 def once(tmp_path_factory: pytest.TempPathFactory) -> Once:
-    """Makes what is dear once for all workers."""
     return Once(tmp_path_factory.getbasetemp())
 
 
 @pytest.fixture
 def golden(request: pytest.FixtureRequest, tmp_path: Path) -> Golden:
-    """Compares an output with the one in tests/golden."""
     return Golden(tmp_path, renew=bool(request.config.getoption("--renew")))
 
 

@@ -1,5 +1,3 @@
-"""What the comparison of whole outputs passes, and what it does not."""
-
 import numpy as np
 import pytest
 from hypothesis import given

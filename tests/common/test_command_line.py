@@ -1,5 +1,3 @@
-"""The command line's terminal: log records on stderr, also beside a progress bar."""
-
 import logging
 import re
 from pathlib import Path
@@ -32,17 +30,10 @@ def run(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
     return command_line.run_to_end(log, "padforge", {})
 
 
-def test_command_line_prints_log_records_as_plain_lines(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_log_records_are_plain_lines_and_above_a_progress_bar_lines_of_their_own(monkeypatch, capsys) -> None:
     for _ in range(2):
         assert run(monkeypatch) == 0
         assert capsys.readouterr() == ("", "a note of 100 %\n")
-
-
-def test_log_record_is_on_a_line_of_its_own_above_a_progress_bar(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
     for name, value in {"FORCE_COLOR": "1", "TERM": "xterm", "COLUMNS": "80"}.items():
         monkeypatch.setenv(name, value)
     assert run(monkeypatch, "--bar") == 0
@@ -79,9 +70,7 @@ def test_results_without_out_go_beside_their_pad(tmp_path: Path) -> None:
         (InputError("two\nlines \x1b[31m"), 2, r"two lines \x1b[31m"),
     ],
 )
-def test_errors_end_in_one_line(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], error: BaseException, code: int, line: str
-) -> None:
+def test_errors_end_in_one_line(monkeypatch, capsys, error, code, line) -> None:
     @click.command()
     def fail() -> None:
         raise error

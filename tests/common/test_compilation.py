@@ -1,5 +1,3 @@
-"""Kernels are compiled once for the sources that there are, and a note says so where it takes long."""
-
 import logging
 import os
 import shutil
@@ -30,7 +28,6 @@ def outer(x):
 
 
 def loaded(path: Path) -> ModuleType:
-    """Load the module anew, as a new process does."""
     spec = spec_from_file_location("kernels_of_a_test", path)
     assert spec is not None
     assert spec.loader is not None
@@ -39,9 +36,7 @@ def loaded(path: Path) -> ModuleType:
     return module
 
 
-def test_compilation_is_announced_unless_it_is_short_or_cached(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_compilation_is_announced_unless_it_is_short_or_cached(tmp_path, monkeypatch, caplog) -> None:
     path = tmp_path / "kernels.py"
     path.write_text(KERNELS)
     caplog.set_level(logging.INFO, "padforge")
@@ -76,18 +71,15 @@ def root(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
 
 
 @pytest.mark.parametrize("is_chosen", [False, True])
-def test_kernels_are_compiled_anew_when_what_they_call_has_changed(
-    root: Path, monkeypatch: pytest.MonkeyPatch, is_chosen: bool
-) -> None:
+def test_kernels_are_compiled_anew_when_what_they_call_has_changed(root, monkeypatch, is_chosen) -> None:
     """In the folder of the user's choice, too."""
     if is_chosen:
         monkeypatch.setenv("NUMBA_CACHE_DIR", str(root / "chosen"))
     inner, _, outer = KERNELS.rpartition("@kernel")
     (root / "design/kernels").mkdir()
     (root / "design/kernels/inner.py").write_text(inner)
-    (root / "design/outer.py").write_text(
-        inner.partition("@")[0] + "from inner_of_a_test import inner\n@kernel" + outer
-    )
+    imports = inner.partition("@")[0] + "from inner_of_a_test import inner\n"
+    (root / "design/outer.py").write_text(f"{imports}@kernel{outer}")
 
     def compute() -> tuple[int, int]:
         """Do what a new process does; returns the result, and how many kernels are compiled for it."""

@@ -1,5 +1,3 @@
-"""Atomic writes of files and sets of files, locks, JSON documents, and dependents of a file."""
-
 import errno
 import json
 import os
@@ -16,8 +14,7 @@ from padforge.common.validation import InputError
 from tests.helpers.folders import files_in
 from tests.helpers.power_cut import ON_LINUX, Disk
 
-LOCK = "import sys\nfrom pathlib import Path\nfrom padforge.common.files import locked_folder\n"
-ANOTHER = LOCK + "try:\n  with locked_folder(Path(sys.argv[1])): print('in')\nexcept ValueError as error: print(error)"
+LOCK = "import sys, os\nfrom pathlib import Path\nfrom padforge.common.files import locked_folder\n"
 
 
 def test_atomic_file_keeps_the_old_file_when_writing_fails(tmp_path):
@@ -81,8 +78,9 @@ def test_nested_atomic_file_is_renamed_once_with_ordinary_permissions(tmp_path):
     assert (tmp_path / "a.json").stat().st_mode & 0o777 == 0o644
 
 
-def another(folder):
-    return subprocess.run([sys.executable, "-c", ANOTHER, folder], capture_output=True, text=True, check=True).stdout
+def locked_by_another(folder, does):
+    code = f"{LOCK}with locked_folder(Path(sys.argv[1])): {does}"
+    return subprocess.run([sys.executable, "-c", code, folder], capture_output=True, text=True, check=False)
 
 
 def test_locked_folder_admits_one_run_and_is_removed_again_if_created_and_empty(tmp_path):
@@ -98,11 +96,10 @@ def test_locked_folder_admits_one_run_and_is_removed_again_if_created_and_empty(
     assert (tmp_path / "kept").exists()
     folder = tmp_path / "out" / "pad"
     with files.locked_folder(folder):
-        assert "another run is writing there" in another(folder)
+        assert "another run is writing there" in locked_by_another(folder, "pass").stderr
         with pytest.raises(InputError, match="another run is writing there"), files.locked_folder(folder):
             pass
-    code = LOCK + "import os\nwith locked_folder(Path(sys.argv[1])): os._exit(9)"
-    assert subprocess.run([sys.executable, "-c", code, folder], check=False).returncode == 9
+    assert locked_by_another(folder, "os._exit(9)").returncode == 9
     assert {path.name for path in folder.iterdir()} == {".lock"}
     with files.locked_folder(folder), files.locked_folder(tmp_path / "out" / "other"):
         pass
@@ -203,9 +200,8 @@ def document(path: Path, inputs: object = None, **more: object) -> Path:
     return path
 
 
-@pytest.fixture
-def folder(tmp_path: Path) -> Path:
-    """A pad with its mould, its recording, and what was learnt from that."""
+def test_find_dependents_follows_chains_and_ignores_other_files(tmp_path: Path) -> None:
+    """Of a pad with its mould, its recording, and what was learnt from that."""
     pad = document(tmp_path / PAD, format="padforge-morphology/1")
     digest = {PAD: files.sha256(pad)}
     document(tmp_path / "design.json", morphology_sha256=digest[PAD])
@@ -216,22 +212,14 @@ def folder(tmp_path: Path) -> Path:
     document(tmp_path / "fibre_loss.json", {"recording": "of its readings", "localizer": model})
     document(tmp_path / "edited.json", digest, format="padforge-morphology/1")
     document(tmp_path / "contacts.json", {PAD: "of another pad"})
-    return tmp_path
-
-
-def test_find_dependents_follows_chains(folder: Path) -> None:
     made = ["design.json", "fabrication.json", "fibre_loss.json", "localizer.json", "recording"]
-    assert files.find_dependents(folder / PAD) == made
-    assert files.find_dependents(folder / PAD, remade=["design.json", "recording"]) == made[1:4]
-    assert files.find_dependents(folder / "localizer.json") == ["fibre_loss.json"]
-    assert files.find_dependents(folder / "edited.json") == files.find_dependents(folder / "contacts.json") == []
-
-
-@pytest.mark.parametrize("content", ["", "[]", '{"provenance": {"inputs": [1]}}'])
-def test_find_dependents_ignores_other_files(folder: Path, content: str) -> None:
-    before = files.find_dependents(folder / PAD)
-    (folder / "other.json").write_text(content)
-    (folder / "folder.json").mkdir()
-    (folder / ".unfinished-set-0").mkdir()
-    document(folder / ".unfinished-set-0" / "start.json", {PAD: files.sha256(folder / PAD)})
-    assert files.find_dependents(folder / PAD) == before
+    assert files.find_dependents(pad) == made
+    assert files.find_dependents(pad, remade=["design.json", "recording"]) == made[1:4]
+    assert files.find_dependents(tmp_path / "localizer.json") == ["fibre_loss.json"]
+    for name in ("edited.json", "contacts.json"):
+        assert files.find_dependents(tmp_path / name) == []
+    (tmp_path / "folder.json").mkdir()
+    document(tmp_path / ".unfinished-set-0" / "start.json", digest)
+    for content in ("", "[]", '{"provenance": {"inputs": [1]}}'):
+        (tmp_path / "other.json").write_text(content)
+        assert files.find_dependents(pad) == made

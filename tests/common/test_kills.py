@@ -20,7 +20,6 @@ NAMES = ("a.csv", "b.png", "mine.txt", "set.json")
 
 
 def make_set(folder: Path) -> None:
-    """A folder with files of an earlier run, and one of a person."""
     folder.mkdir()
     for name in NAMES:
         (folder / name).write_text("old")

@@ -1,5 +1,3 @@
-"""MATLAB files of every version, and none of them with values from another file."""
-
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any

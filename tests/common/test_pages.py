@@ -1,9 +1,8 @@
-"""Local pages: origins, tokens and limits of connections; elements of HTML pages: text stays text."""
-
 import json
 import re
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, closing
+from functools import partial
 from http.client import HTTPConnection, HTTPResponse
 from typing import Any
 
@@ -75,22 +74,21 @@ ELSEWHERE = "http://elsewhere.example"
         (b"1" * 4096, "/double", {}, 200),
     ],
 )
-def test_posts_of_other_origins_and_malformed_posts_are_refused(
-    page: LocalPage, body: bytes | None, path: str, headers: dict, status: int
-) -> None:
+def test_posts_of_other_origins_and_malformed_posts_are_refused(page, body, path, headers, status) -> None:
     assert posted(page, body, path, **headers).status == status
+
+
+def status_of(page: LocalPage, path: str, **headers: str) -> int:
+    with closing(HTTPConnection(HOST, port_of(page), timeout=10)) as browser:
+        browser.request("GET", path, headers=headers)
+        return browser.getresponse().status
 
 
 def test_token_is_required_under_any_host_name() -> None:
     token = "known to few & all"
     with LocalPage(0, PAGE, {"/double": doubled}, host="0.0.0.0", token=token) as page:
         assert page.url.endswith("/?token=known+to+few+%26+all")
-
-        def asked(path: str, **headers: str) -> int:
-            connection = HTTPConnection(HOST, port_of(page), timeout=10)
-            connection.request("GET", path, headers={"Host": "pad.example"} | headers)
-            return connection.getresponse().status
-
+        asked = partial(status_of, page, Host="pad.example")
         assert asked("/") == asked("/events") == asked("/?token=") == asked("/?token=known+to+few") == 403
         assert asked("/?token=known+to+few+%26+all") == asked("/", Authorization=f"Bearer {token}") == 200
         assert asked("/", Authorization="Bearer another") == 403
@@ -110,13 +108,9 @@ def test_token_is_required_under_any_host_name() -> None:
         ("/", {"Sec-Fetch-Site": "cross-site"}, 200),
     ],
 )
-def test_page_is_reached_by_itself_and_by_links_alone(
-    page: LocalPage, path: str, headers: dict[str, str], status: int
-) -> None:
+def test_page_is_reached_by_itself_and_by_links_alone(page, path, headers, status) -> None:
     """Links may be anywhere; what other pages request is refused."""
-    with closing(HTTPConnection(HOST, port_of(page), timeout=10)) as browser:
-        browser.request("GET", path, headers=headers)
-        assert browser.getresponse().status == status
+    assert status_of(page, path, **headers) == status
 
 
 def test_every_reader_gets_the_latest_view(page: LocalPage) -> None:

@@ -1,5 +1,3 @@
-"""Tasks on any executor, torch and BLAS on one thread, the cache of kernels, and the end of a program with tasks."""
-
 import os
 import subprocess
 import sys
@@ -117,7 +115,6 @@ def test_one_thread_nests_and_restores():
 @pytest.mark.slow
 @pytest.mark.skipif(os.name != "posix", reason="signals as POSIX has them")
 def test_sigterm_during_torch_tasks_exits_130_without_a_crash() -> None:
-    """Threads of torch that are at work when the interpreter ends do so."""
     code = """
 import os, signal, sys, threading
 import click, torch

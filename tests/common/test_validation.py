@@ -1,5 +1,3 @@
-"""Checks of arguments: bounds are inclusive, and errors are one line."""
-
 import math
 from pathlib import Path
 

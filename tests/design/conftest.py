@@ -1,5 +1,3 @@
-"""What tests of design share."""
-
 from functools import partial
 from pathlib import Path
 
@@ -23,14 +21,12 @@ KNOTS_MM = (
 
 
 def max_distance_mm(one: Morphology, other: Morphology) -> float:
-    """Greatest distance of fibres of two pads, mm."""
     lines = ([shapely.LineString(pad.to_mm(line)) for line in flatten(pad, 1e-5)] for pad in (one, other))
     return max(a.hausdorff_distance(b) for a, b in zip(*lines, strict=True))
 
 
 @pytest.fixture
 def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """An empty folder, which is the current one."""
     monkeypatch.chdir(tmp_path)
     return tmp_path
 
@@ -60,12 +56,3 @@ def little_scored(monkeypatch: pytest.MonkeyPatch) -> None:
     """Pads are compared by few presses, and information is bounded by the cells of a coarse grid."""
     compare_little(monkeypatch)
     monkeypatch.setattr("padforge.design.published.objective.information", partial(information, side=5))
-
-
-@pytest.fixture
-def one_thread():
-    """Torch computes on one thread, as in a search: several that wait for a busy machine take many times as long."""
-    from padforge.common.parallel import one_thread
-
-    with one_thread():
-        yield

@@ -1,5 +1,7 @@
 """Signals of a layer against fibres that its displacements carry along: outside the kernels, in three dimensions."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 from scipy.interpolate import CubicSpline, PchipInterpolator
@@ -24,14 +26,9 @@ def random_press(seed):
     # the strains of an ideal rod are infinite at its rim; nearer below it a fibre feels how sharp a real one is
     shallowest_mm = 1.0 if tool == "flat" else 0.25
     depths_mm = tuple(rng.uniform(shallowest_mm, 0.9 * thickness_mm, 2).tolist())
-    contact = Contact(
-        tool=tool,
-        tool_radius_mm=radius_mm,
-        depth_mm=depth_mm,
-        thickness_mm=thickness_mm,
-        base="slipping" if seed // 4 % 2 else "bonded",
-        fibre_depths_mm=depths_mm,
-    )
+    lengths: dict[str, Any] = {"tool_radius_mm": radius_mm, "depth_mm": depth_mm, "thickness_mm": thickness_mm}
+    base = "slipping" if seed // 4 % 2 else "bonded"
+    contact = Contact(tool=tool, base=base, fibre_depths_mm=depths_mm, **lengths)
     pad = Morphology.random(layout, int(rng.integers(0, 6)), rng)
     return pad, rng.uniform(0, layout.extent, (4, 2)), contact
 
@@ -55,10 +52,8 @@ def carried_lengths(pad, presses, contact):
     """Change of length of each fibre (Q, F) carried along, and of pairs of points above and below it; grid units."""
     press = solve_press(contact.tool, contact.tool_radius_mm, contact.depth_mm, contact.thickness_mm, contact.base)
     out = np.zeros((len(presses), pad.layout.fibres))
-    fields = [
-        displacement(press, contact.thickness_mm - depth_mm, 1.1 * np.hypot(*pad.layout.size_mm))
-        for depth_mm in contact.fibre_depths_mm
-    ]
+    heights_mm, end_mm = contact.thickness_mm - np.array(contact.fibre_depths_mm), 1.1 * np.hypot(*pad.layout.size_mm)
+    fields = [displacement(press, height_mm, end_mm) for height_mm in heights_mm.tolist()]
     for f, knots in enumerate(pad.knots):
         axis = pad.layout.family(f)
         curve = PchipInterpolator(knots[:, axis], knots[:, 1 - axis])

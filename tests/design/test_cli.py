@@ -1,5 +1,3 @@
-"""Searches for a twin; `test_outputs` has what commands print."""
-
 import json
 from pathlib import Path
 

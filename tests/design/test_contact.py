@@ -1,25 +1,15 @@
-"""Signals of rectangles as they are turned and of presses of known depth, forces, and further contacts."""
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from padforge.design import (
-    Contact,
-    Morphology,
-    SearchSettings,
-    indented_signals,
-    press_forces_n,
-    signals,
-    signals_quantized,
-)
+from padforge.design import Contact, Morphology, indented_signals, press_forces_n, signals, signals_quantized
 from padforge.design.contact import half_width_mm
 from padforge.design.contact_set import judged_contacts, served_contacts
 from padforge.design.layer import solve_press
 from padforge.design.objectives.rules import check_rules
 from padforge.design.paths.curves import crossings, lengths
-from padforge.design.settings import PUBLISHED_CONTACT, Layout, RulesSettings
+from padforge.design.settings import PUBLISHED_CONTACT, Layout, RulesSettings, SearchSettings
 from tests.helpers.golden import Golden
 
 CONTACTS = [Contact(radius=0.5, sides=4, length="euclidean"), Contact(), Contact(model="profile")]
@@ -75,12 +65,8 @@ def test_rules_and_lengths_of_a_transposed_rectangle(pad):
 PAD = Morphology.random(2, 3, 1)
 
 
-def presses_on(pad, count):
-    return np.random.default_rng(0).uniform(0.3, pad.grid + 0.7, (count, 2))
-
-
 def test_indented_signals_are_those_of_solved_contacts():
-    contact, presses = Contact(), presses_on(PAD, 12)
+    contact, presses = Contact(), np.random.default_rng(0).uniform(0.3, 2.7, (12, 2))
     full_scale = np.abs(signals(PAD, presses, contact)).max()
     depths_mm = (0.03, 1.3)
     interpolated = indented_signals(PAD, np.tile(presses, (2, 1)), np.repeat(depths_mm, len(presses)), contact)
@@ -94,13 +80,11 @@ def test_indented_signals_are_those_of_solved_contacts():
 
 
 def test_press_forces_are_those_of_solved_contacts():
-    contact, depths_mm = Contact(tool="ball", tool_radius_mm=6.0, base="slipping"), np.array([[0.0, 0.02], [1.3, 4.8]])
-    solved = [
-        solve_press("ball", 6.0, depth_mm, contact.thickness_mm, "slipping").force_n() if depth_mm else 0.0
-        for depth_mm in depths_mm.ravel().tolist()
-    ]
-    deepest_n = float(press_forces_n(contact.depth_mm, contact))
-    np.testing.assert_allclose(press_forces_n(depths_mm, contact).ravel(), solved, rtol=0, atol=5e-4 * deepest_n)
+    contact, depths_mm = Contact(tool="ball", tool_radius_mm=6.0, base="slipping"), [0.02, 1.3, 4.8]
+    presses = (solve_press("ball", 6.0, depth_mm, contact.thickness_mm, "slipping") for depth_mm in depths_mm)
+    expected = np.reshape([0.0, *(press.force_n() for press in presses)], (2, 2))
+    deepest_n, found = press_forces_n(contact.depth_mm, contact), press_forces_n([[0.0, 0.02], [1.3, 4.8]], contact)
+    np.testing.assert_allclose(found, expected, rtol=0, atol=5e-4 * float(deepest_n))
 
 
 ASSUMED = {

@@ -1,6 +1,7 @@
 """The layer contact against closed forms of contact mechanics and finite elements."""
 
 import math
+from functools import partial
 
 import numpy as np
 import pytest
@@ -22,14 +23,16 @@ def tool_depth(tool, radius, depth, r):
 
 
 @pytest.mark.parametrize(("radius", "depth"), [(8.4, 0.5), (4.2, 2.0)])
-def test_dome_on_thick_layer_is_hertz(radius, depth):
-    solved = solve_press("dome", radius, depth, 100 * radius)
+def test_dome_on_thick_layer_is_hertz_and_a_finger_a_dome_with_half_the_force(radius, depth):
+    solved, finger = (solve_press(tool, radius, depth, 100 * radius) for tool in ("dome", "finger"))
     a = math.sqrt(radius * depth)
     assert solved.contact_radius_mm == pytest.approx(a, rel=0.02)
     assert solved.force_n(73) == pytest.approx(73e-3 * 4 / 3 * math.sqrt(radius) * depth**1.5, rel=0.02)
     r = a * np.array([1.2, 2.0, 4.0])
     outside = ((2 * a**2 - r**2) * np.arcsin(a / r) + a * np.sqrt(r**2 - a**2)) / (math.pi * radius)
     np.testing.assert_allclose(solved.deflection(r), outside, atol=0.02 * depth)
+    assert finger.contact_radius_mm == pytest.approx(solved.contact_radius_mm, rel=0.005)
+    assert finger.force_n() == pytest.approx(solved.force_n() / 2, rel=0.01)
 
 
 def test_thin_bonded_layer_is_a_lubrication_film():
@@ -68,11 +71,7 @@ def test_strains_are_differences_of_displacements(base):
 
 @pytest.mark.parametrize(
     ("tool", "thickness", "depth", "base"),
-    [
-        ("dome", 6, 5, "bonded"),
-        ("ball", 8, 4, "slipping"),
-        ("flat", 6, 2, "bonded"),
-    ],
+    [("dome", 6, 5, "bonded"), ("ball", 8, 4, "slipping"), ("flat", 6, 2, "bonded")],
 )
 def test_layer_is_that_of_finite_elements(tool, thickness, depth, base):
     solved = solve_press(tool, 8.4, depth, thickness, base)
@@ -82,9 +81,7 @@ def test_layer_is_that_of_finite_elements(tool, thickness, depth, base):
         while edges[-1] < a + (6 if base == "bonded" else 60) * thickness:
             edges.append(edges[-1] + 1.3 * (edges[-1] - edges[-2]))
         heights = np.linspace(0, thickness, max(4, count * thickness // 8) + 1)
-        results.append(
-            press(lambda r: tool_depth(tool, 8.4, depth, r), np.array(edges), heights, bonded=base == "bonded")
-        )
+        results.append(press(partial(tool_depth, tool, 8.4, depth), np.array(edges), heights, bonded=base == "bonded"))
     coarse, fine = results
     # an edge of pressure without bound, of a flat end, is what elements see least
     assert fine.force == pytest.approx(coarse.force, rel=0.01)
@@ -98,12 +95,6 @@ def test_layer_is_that_of_finite_elements(tool, thickness, depth, base):
     np.testing.assert_allclose(squeezed[beside], strains.compressive[beside], atol=0.03 * greatest)
     hoop = fine.outward[1:, row] / fine.r[1:]
     np.testing.assert_allclose(hoop[beside[1:]], strains.hoop[1:][beside[1:]], atol=0.03 * greatest)
-
-
-def test_finger_on_thick_layer_is_a_dome_with_half_the_force():
-    dome, finger = (solve_press(tool, 8.4, 1.0, 1000.0) for tool in ("dome", "finger"))
-    assert finger.contact_radius_mm == pytest.approx(dome.contact_radius_mm, rel=0.005)
-    assert finger.force_n() == pytest.approx(dome.force_n() / 2, rel=0.01)
 
 
 @pytest.mark.parametrize(
@@ -141,11 +132,8 @@ def test_strains_above_1_are_said_with_their_size(golden: Golden) -> None:
 
 @pytest.mark.parametrize("base", ["bonded", "slipping"])
 def test_pads_of_any_great_thickness_weigh_fibres_alike(base):
-    def weigh(thickness: float) -> tuple[tuple[np.ndarray, ...], ...]:
-        contact = Contact(thickness_mm=thickness, base=base, tool_radius_mm=2, depth_mm=0.5)
-        return profile_weights(contact)
-
-    thick, thicker = weigh(100), weigh(1000)
+    contacts = (Contact(thickness_mm=mm, base=base, tool_radius_mm=2, depth_mm=0.5) for mm in (100, 1000))
+    thick, thicker = map(profile_weights, contacts)
     for (distance, plain, directed), (other, *weights) in zip(thick, thicker, strict=True):
         for weight, second in zip((plain, directed), weights, strict=True):
             np.testing.assert_allclose(weight, np.interp(distance, other, second), atol=0.05 * plain.max())

@@ -1,5 +1,3 @@
-"""Morphologies: construction, files, refusals."""
-
 import json
 
 import numpy as np

@@ -1,5 +1,3 @@
-"""What commands of design print, write and draw."""
-
 import json
 import shutil
 from collections.abc import Callable
@@ -22,8 +20,7 @@ from padforge.design.settings import SearchSettings
 from tests.design.conftest import max_distance_mm
 from tests.helpers.door import call
 from tests.helpers.folders import files_in
-from tests.helpers.golden import Golden, page_text
-from tests.helpers.json_text import json_text
+from tests.helpers.golden import Golden, json_text, page_text
 from tests.helpers.less import compare_little
 
 SETTINGS = """[pad]
@@ -85,10 +82,8 @@ def test_design(run, golden: Golden) -> None:
     document = document_of("out/pad/design.json")
     golden("design/design.json", json_text(document), forget=[VERSIONS, *SECONDS], rtol=1e-3)
     golden("design/design_morphology.json", json_text(document_of("out/pad/morphology.json")["knots"]), rtol=1e-3)
-    assert files_in(Path("out/pad")).keys() == {
-        *("design.json", "figures/design.png", "figures/design.svg", "morphology.json")
-    }
-
+    names = {"design.json", "figures/design.png", "figures/design.svg", "morphology.json"}
+    assert files_in(Path("out/pad")).keys() == names
     read = load_result(Path("out/pad"))
     assert summary_lines(read, Path("out/pad")) == printed.splitlines()[1:-1]
     assert (read.terms, read.straight, read.history) == tuple(document[x] for x in ("terms", "straight", "history"))
@@ -102,9 +97,8 @@ def test_summaries_of_searches(golden: Golden) -> None:
     broken = [Violation("max_length_mm", (fibre,), 600.0, 500.0) for fibre in range(1, 13)]
     names = [f"expected_error_mm_{n}" for n in (0, 1, 2)]
     errors, straight = (dict(zip(names, values, strict=True)) for values in ((0.5, 1.0, 2.0), (0.52, 1.06, 3.0)))
-    stopped = SearchResult(
-        Morphology.straight(6), errors, broken, "start 1", straight, seconds=61.25, stopped="out of time"
-    )
+    ended = {"seconds": 61.25, "stopped": "out of time"}
+    stopped = SearchResult(Morphology.straight(6), errors, broken, "start 1", straight, **ended)
     vain = replace(stopped, violations=[], candidate="straight fibres", stopped="")
     one = {"terms": {"expected_error_mm_0": 0.1}, "straight": {"expected_error_mm_0": 1.0}}
     free = replace(vain, **one, candidate="start 2", enforced=False)

@@ -1,5 +1,3 @@
-"""What functions and commands of design refuse, in one line each."""
-
 import json
 from collections.abc import Callable
 from functools import reduce
@@ -30,7 +28,6 @@ UNSORTED[1] = UNSORTED[1, :, ::-1]
 
 
 def knots_of(change: Callable[[Any], Any]) -> Callable[[], Morphology]:
-    """A pad whose knots are changed."""
     return lambda: Morphology(change(KNOTS))
 
 
@@ -46,7 +43,6 @@ def keep_out(*polygon: Any) -> Callable[[], None]:
 
 
 def depths(depths_mm: object) -> Callable[[], object]:
-    """Signals of two presses by their depths."""
     return lambda: design.indented_signals(PAD, [[1, 1], [2, 2]], depths_mm, Contact())  # pyright: ignore[reportArgumentType]
 
 

@@ -1,5 +1,3 @@
-"""Sections of the report on a design, its press and its contacts."""
-
 from pathlib import Path
 from typing import Any
 
@@ -37,7 +35,7 @@ def design_document(enforce: bool = True) -> dict[str, Any]:
         PRESS,
     )
     return {
-        "terms": TERMS,
+        "terms": TERMS.copy(),
         "straight": STRAIGHT,
         "descriptions": describe_terms(TERMS),
         "violations": VIOLATIONS if enforce else [],

@@ -1,5 +1,3 @@
-"""`pad.toml`: defaults, comments, refusals."""
-
 import tomllib
 from typing import Any
 
@@ -13,8 +11,6 @@ from padforge.design.settings import PUBLISHED_CONTACT, Layout, Scatter, read_co
 from tests.helpers.golden import Golden
 
 MODELS = {model.section(): model for model in (PadSettings, Contact, SearchSettings, RulesSettings)}
-
-
 REFUSED = {
     PadSettings: [
         *({"grid": 0}, {"gird": 4}, {"horizontals": 0, "verticals": 0}, {"bent_radius_mm": "round"}),
@@ -47,7 +43,7 @@ REFUSED = {
 
 
 def test_refusals_name_key_value_and_limits(golden: Golden) -> None:
-    """In one line, of a file and of a model alike."""
+    """In one line, of a file and of a model alike; a wrong override is not blamed on the file."""
     lines = []
     for model, table in ((model, table) for model, tables in REFUSED.items() for table in tables):
         with pytest.raises(InputError, match=r"^pad\.toml: [^\n]*$") as refused:
@@ -56,9 +52,6 @@ def test_refusals_name_key_value_and_limits(golden: Golden) -> None:
     golden("design/settings_refusals.txt", "\n".join(lines))
     with pytest.raises(InputError, match=r"^\[search\] contacts\[1\]\.radius: got -1, .*greater"):
         SearchSettings(**REFUSED[SearchSettings][0])
-
-
-def test_wrong_override_is_not_blamed_on_the_file():
     spec = Spec({"pad": {"grid": 2, "pitch_mm": 0}}, "pad.toml")
     with pytest.raises(InputError, match=r"^\[pad\] horizontals: got 300, input should be less than or equal to 256"):
         spec.section(PadSettings, horizontals=300, pitch_mm=8.0)
@@ -159,16 +152,13 @@ def test_default_contact_is_a_layer_or_published():
     assert SearchSettings(method="genetic").default_contact == PUBLISHED_CONTACT
 
 
-def test_pad_settings_of_a_rectangle_and_its_sensed_area():
+def test_pad_settings_set_layout_pitches_and_sensed_area():
     assert PadSettings(horizontals=3, verticals=6, pitch_mm=(8, 15)).layout == Layout(3, 6, 8.0, 15.0)
     assert PadSettings(grid=5, verticals=0).layout.counts == (5, 0)
     assert sensed_rectangle(Layout.create(4)) == PadSettings().sensed == ((0.5, 0.5), (4.5, 4.5))
     assert sensed_rectangle(Layout.create(4), "fibres") == ((1, 1), (4, 4))
     assert sensed_rectangle(Layout.create(1), "fibres") == ((0.5, 0.5), (1.5, 1.5))
     assert PadSettings(grid=3, pitch_mm=2, sensed_mm=(8, 3)).sensed == ((0, 1.25), (4, 2.75))
-
-
-def test_size_of_a_pad_sets_its_pitches():
     pad = PadSettings(size_mm=(120, 30), horizontals=2, verticals=7)
     assert (pad.layout, pad.layout.size_mm) == (Layout(2, 7, 15.0, 10.0), (120, 30))
     assert pad == PadSettings(pitch_mm=(15, 10), horizontals=2, verticals=7)

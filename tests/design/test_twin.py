@@ -1,5 +1,3 @@
-"""Twins: what their files keep, what they refuse, and what their fibres answer as laid."""
-
 from dataclasses import replace
 
 import numpy as np
@@ -80,9 +78,8 @@ def test_effects_that_another_pad_does_not_have(twin: Twin, golden: Golden) -> N
     all_uneven = tuple(None if size is None else np.linspace(0.5, 1.5, size) for size in sizes)
     changes = {}, {"sensitivity": even}, {"sensitivity": (all_uneven[0], *even[1:])}, {"angular_weight": 0.1 * WEIGHT}
     both = {"sensitivity": all_uneven, "angular_weight": 0.1 * WEIGHT}
-    golden(
-        "design/twin_effects.txt", "\n".join(str(replace(twin, **each).ignored_effects()) for each in (*changes, both))
-    )
+    effects = [str(replace(twin, **each).ignored_effects()) for each in (*changes, both)]
+    golden("design/twin_effects.txt", "\n".join(effects))
 
 
 def test_settings_for_a_twin_without_a_channel_that_responds_are_refused(twin, tmp_path):

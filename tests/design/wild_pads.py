@@ -1,5 +1,3 @@
-"""Pads as wild as a morphology may be, presses of every kind, and pads in the mirror."""
-
 from typing import Literal
 
 import numpy as np

@@ -1,5 +1,3 @@
-"""The pages of the documentation, and what is found in them."""
-
 import re
 from pathlib import Path
 
@@ -13,7 +11,6 @@ BLOCK = re.compile(
 
 
 def command_lines(body: str) -> list[str]:
-    """Return the commands of a block of shell, each as one line."""
     return body.replace("\\\n", " ").splitlines()
 
 

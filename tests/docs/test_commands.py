@@ -1,5 +1,3 @@
-"""Commands in the documentation and in helps parse."""
-
 import re
 import shlex
 from collections.abc import Iterator
@@ -76,9 +74,7 @@ def test_commands_on_pages_parse_and_quote_commas(page: Path, parser: click.Comm
 @pytest.mark.parametrize(
     ("name", "command"), list(every(cli)), ids=lambda value: value if isinstance(value, str) else ""
 )
-def test_help_examples_parse_and_groups_list_all_commands_uncut(
-    name: str, command: click.Command, parser: click.Command
-) -> None:
+def test_help_examples_parse_and_groups_list_all_commands_uncut(name, command, parser) -> None:
     examples = [line for line in cleandoc(command.help or "").splitlines() if line.startswith("padforge ")]
     assert [line for line in examples if line.startswith(name)]
     for line in examples:

@@ -1,16 +1,13 @@
-"""The example of devices of one's own is installed as the page says, and records."""
-
-import sys
 import tomllib
 from importlib import invalidate_caches
 from pathlib import Path
 
 import pytest
 
-from padforge.cli import main
 from padforge.design import Morphology
 from padforge.sense.recording.recording import Recording
 from tests.docs.pages import BLOCK, ROOT
+from tests.helpers.door import called, refused
 
 PAGE = ROOT / "docs" / "howto-boards.md"
 SPEC = """
@@ -40,25 +37,17 @@ def install(folder: Path) -> None:
     (about / "entry_points.txt").write_text("\n".join(lines))
 
 
-def test_device_example_records(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture) -> None:
+def test_device_example_records(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     install(tmp_path)
     monkeypatch.syspath_prepend(tmp_path)
     invalidate_caches()
-    monkeypatch.chdir(tmp_path)
-    Morphology.straight(2).save("morphology.json")
-    command = ["padforge", "sense", "record", "--rig", "jumper", "--spec", "pad.toml", "--out", "run"]
-
-    def record(spec: str) -> tuple[int, str]:
-        Path("pad.toml").write_text(spec)
-        monkeypatch.setattr(sys, "argv", command)
-        with pytest.raises(SystemExit) as ended:
-            main()
-        return ended.value.code or 0, capsys.readouterr().err  # type: ignore[return-value]
-
-    code, said = record(SPEC)
-    assert (code, '"unwatched"' in said) == (2, True)
-    code, said = record(SPEC + 'max_force_n = "unwatched"\n')
-    assert code == 0, said
-    recording = Recording.open("run")
+    Morphology.straight(2).save(tmp_path / "morphology.json")
+    (tmp_path / "pad.toml").write_text(SPEC)
+    command = "sense", "record", "--rig", "jumper", "--spec", "pad.toml", "--out", "run"
+    assert '"unwatched"' in refused(*command, cwd=tmp_path)
+    (tmp_path / "pad.toml").write_text(SPEC + 'max_force_n = "unwatched"\n')
+    ended = called(*command, cwd=tmp_path)
+    assert ended.code == 0, ended
+    recording = Recording.open(tmp_path / "run")
     assert (recording.fibres, len(recording.presses_mm)) == (4, 3)
     assert recording.source["devices"]["arm"] == {"model": "jumper"}

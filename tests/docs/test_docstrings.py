@@ -11,14 +11,7 @@ import pytest
 
 pytestmark = pytest.mark.slow
 ROOT = Path(__file__).parents[2]
-
-
 STAGES = ("design", "fabricate", "sense")
-
-
-@cache
-def stage(name: str) -> Any:
-    return package().members[name]
 
 
 @cache
@@ -52,11 +45,10 @@ def stated_parameters(function: Any) -> set[str] | None:
 
 
 def exported(name: str) -> Iterator[Any]:
-    """What a stage exports, as it is defined."""
     for node in ast.parse((ROOT / name / "__init__.pyi").read_text(encoding="utf-8")).body:
         if isinstance(node, ast.ImportFrom):
             for alias in node.names:
-                member = stage(name)
+                member = package().members[name]
                 for part in f"{node.module}.{alias.name}".split("."):
                     member = member.members[part]
                 yield member
@@ -78,7 +70,7 @@ def test_docstrings_state_all_parameters_or_none() -> None:
     partial = {
         function.path: parameters(function) ^ stated
         for name in STAGES
-        for function in public_functions(stage(name))
+        for function in public_functions(package().members[name])
         if (stated := stated_parameters(function)) is not None and function.name != "__init__"
     }
     assert all(any(path.startswith(f"padforge.{name}.") for path in partial) for name in STAGES)

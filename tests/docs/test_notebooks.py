@@ -1,5 +1,3 @@
-"""Notebooks are those of their scripts, and run."""
-
 from pathlib import Path
 
 import nbformat
@@ -16,9 +14,8 @@ def test_notebook_is_that_of_its_script(script: str) -> None:
     """`python docs/notebooks.py` makes them anew; each shows figures, and no progress of what it waited for."""
     stored = nbformat.read(notebooks.FOLDER / f"{script}.ipynb", as_version=4)
     made = notebooks.make_notebook(script)
-    assert [(cell.cell_type, cell.source) for cell in stored.cells] == [
-        (cell.cell_type, cell.source) for cell in made.cells
-    ]
+    kept, now = ([(cell.cell_type, cell.source) for cell in each.cells] for each in (stored, made))
+    assert kept == now
     outputs = [output for cell in stored.cells for output in cell.get("outputs", [])]
     assert sum("image/png" in output.get("data", {}) for output in outputs) == 4
     assert {output.output_type for output in outputs} <= {"stream", "execute_result", "display_data"}

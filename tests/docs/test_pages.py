@@ -1,5 +1,3 @@
-"""Links of the documentation lead somewhere, no page knows a machine, and numbers in them are the program's."""
-
 import json
 import re
 from pathlib import Path
@@ -32,16 +30,12 @@ def test_links_and_pictures_exist_and_no_path_of_a_machine(page: Path) -> None:
         there = page.parent / name if name else page
         assert there.exists(), f"{relative(page)}: {target}"
         if anchor:
-            assert anchor in anchors(there.read_text(encoding="utf-8")), f"{relative(page)}: {target}"
+            headings = re.findall(r"^#+ (.+)$", BLOCK.sub("", there.read_text(encoding="utf-8")), re.MULTILINE)
+            anchors = {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
+            assert anchor in anchors, f"{relative(page)}: {target}"
     assert str(ROOT) not in text
     assert not re.search(r"(?<![\w.:/])/(work|home|tmp|opt|root|Users|mnt)/", text)
     assert not re.search(r"\b[A-Z]:\\", text)
-
-
-def anchors(text: str) -> set[str]:
-    """The anchors of a page's headings."""
-    headings = re.findall(r"^#+ (.+)$", BLOCK.sub("", text), re.MULTILINE)
-    return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
 
 
 def test_readme_devcontainer_and_pre_commit_agree() -> None:
@@ -67,22 +61,18 @@ def test_workflows_name_actions_by_commit() -> None:
         assert re.fullmatch(r"[\w-]+/[\w-]+@[0-9a-f]{40} # v\d+\.\d+\.\d+", action), action
 
 
-def test_presses_by_hand_suffice_for_health() -> None:
+def test_presses_of_pages_suffice_for_health_and_are_those_of_their_table() -> None:
     """Of the recording that is then calibrated; the text names the least that does."""
     text, share = read("docs/howto-by-hand.md"), 1 - LocalizerSettings().test_share
     [presses] = re.findall(r"--presses (\d+) --out out/mine", text)
     [least] = re.findall(r"Fewer than (\d+)", text)
     assert round(share * int(least)) == MIN_PRESSES <= share * int(presses)
     assert f"{presses} presses take about" in text
-
-
-def test_tutorial_counts_the_presses_of_its_table() -> None:
     text = read("docs/tutorial-sense.md")
     assert re.findall(r"error in mm on (\d+) presses", text)[0] == re.findall(r"The table evaluates (\d+) ", text)[0]
 
 
 def section(title: str) -> str:
-    """Return the text below a heading of the page on the method, as one line."""
     return " ".join(read("docs/method.md").partition(f"{title}\n")[2].partition("\n##")[0].split())
 
 

@@ -1,5 +1,3 @@
-"""Releases: what is unreleased becomes the section of a version, everywhere or nowhere."""
-
 import importlib.util
 import re
 import subprocess
@@ -25,12 +23,16 @@ FILES = {
 }
 
 
+def commit(folder: Path) -> None:
+    for words in ("init -q", "add .", "-c user.name=a -c user.email=a@b commit -q -m Pads"):
+        subprocess.run(["git", *words.split()], cwd=folder, check=True)
+
+
 @pytest.fixture
 def checkout(tmp_path: Path) -> Path:
     for name, text in FILES.items():
         (tmp_path / name).write_text(text)
-    for words in ("init -q", "add .", "-c user.name=a -c user.email=a@b commit -q -m Pads"):
-        subprocess.run(["git", *words.split()], cwd=tmp_path, check=True)
+    commit(tmp_path)
     return tmp_path
 
 
@@ -49,48 +51,26 @@ def test_cut_writes_the_version_everywhere_and_returns_its_notes(checkout: Path)
         release.notes(checkout, "0.1.0")
 
 
-@pytest.mark.parametrize(
-    ("version", "name", "text", "said"),
-    [
-        ("0.2", "", "", "version: got 0.2, allowed is X.Y.Z"),
-        ("0.1.0", "", "", "got 0.1.0, allowed is one above 0.1.0"),
-        (
-            "0.2.0",
-            "CHANGELOG.md",
-            "## Unreleased\n\nNothing yet.\n\n## 0.1.0\n\n- Moulds.\n",
-            "nothing under Unreleased",
-        ),
-        (
-            "0.2.0",
-            "pyproject.toml",
-            'version = "0.1.0"\nurl = "https://OWNER"\n',
-            "toml: line 2 has the placeholder OWNER",
-        ),
-        (
-            "0.2.0",
-            "CITATION.cff",
-            "version: 0.1.0\nemail: a@example.org\n",
-            "cff: line 2 has the placeholder example.org",
-        ),
-    ],
-)
-def test_cut_is_refused_and_changes_nothing(checkout: Path, version: str, name: str, text: str, said: str) -> None:
-    if name:
+REFUSED = [
+    ("0.2", {}, "version: got 0.2, allowed is X.Y.Z"),
+    ("0.1.0", {}, "got 0.1.0, allowed is one above 0.1.0"),
+    ("0.2.0", {"CHANGELOG.md": "## Unreleased\n\nNothing yet.\n\n## 0.1.0\n"}, "nothing under Unreleased"),
+    ("0.2.0", {"pyproject.toml": 'version = "0.1.0"\nurl = "//OWNER"\n'}, "toml: line 2 has the placeholder OWNER"),
+    ("0.2.0", {"CITATION.cff": "version: 0.1.0\nat: a@example.org\n"}, "cff: line 2 has the placeholder example.org"),
+]
+
+
+@pytest.mark.parametrize(("version", "changed", "said"), REFUSED)
+def test_cut_is_refused_and_changes_nothing(checkout: Path, version: str, changed: dict[str, str], said: str) -> None:
+    for name, text in changed.items():
         (checkout / name).write_text(text)
-        subprocess.run(
-            ["git", "-c", "user.name=a", "-c", "user.email=a@b", "commit", "-qam", "-"], cwd=checkout, check=True
-        )
+        with pytest.raises(ValueError, match=f"not committed, such as {name}"):
+            release.cut(checkout, "0.2.0", DAY)
+        commit(checkout)
     before = texts(checkout)
-    with pytest.raises(ValueError, match=re.escape(said)) as error:
+    with pytest.raises(ValueError, match=rf"^[^\n]*{re.escape(said)}[^\n]*$"):
         release.cut(checkout, version, DAY)
-    assert "\n" not in str(error.value)
     assert texts(checkout) == before
-
-
-def test_cut_is_refused_with_uncommitted_changes(checkout: Path) -> None:
-    (checkout / "new.txt").touch()
-    with pytest.raises(ValueError, match=r"not committed, such as new\.txt"):
-        release.cut(checkout, "0.2.0", DAY)
 
 
 def test_files_of_the_project_agree_on_its_version(tmp_path: Path) -> None:

@@ -57,23 +57,28 @@ OUTPUT = re.compile(r"\s*```text\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 
 
 class Shown(NamedTuple):
-    """Lines that a page shows: where, of what, and how what is printed may differ from them."""
+    """Lines that a page shows: where, and how what is printed may differ from them."""
 
-    text: str
-    begin: int  # in the text of the page; -1 if it shows nothing
-    is_part: bool  # of a file, which may have more
-    share: float  # by which decimals may differ
-    varies: bool  # whether all numbers may
+    text: str = ""
+    begin: int = -1  # in the text of the page; -1 if it shows nothing
+    how: str = ""
+    is_part: bool = False  # of a file, which may have more
 
     @property
     def lines(self) -> list[str]:
         lines = self.text.strip().splitlines()
         return ["...", *lines, "..."] if self.is_part else lines
 
+    @property
+    def varies(self) -> bool:
+        return "numbers vary" in self.how
 
-def shown(text: str, begin: int, how: str, is_part: bool = False) -> Shown:
-    share = re.search(r"decimals within (\d+) %", how)
-    return Shown(text, begin, is_part, int(share[1]) / 100 if share else 0.0, "numbers vary" in how)
+    def has(self, line: str, other: str) -> bool:
+        """Whether a line and a printed one are equal or of one kind, or alike within a share of their decimals."""
+        if self.varies:
+            return same_kind(line, other)
+        share = re.search(r"decimals within (\d+) %", self.how)
+        return line.rstrip() == other.rstrip() or bool(share and alike(line, other, int(share[1]) / 100))
 
 
 def difference(page: Shown, printed: str) -> str:
@@ -81,17 +86,14 @@ def difference(page: Shown, printed: str) -> str:
     shows = [SECONDS.sub("# s", line) for line in page.lines]
     prints = [SECONDS.sub("# s", line) for line in printed.strip().splitlines()]
     if "..." in shows:
-        is_same = same_kind if page.varies else lambda one, other: same(one, other, page.share)
-        return "" if find_lines(shows, prints, is_same) else f"no lines like those of the page:\n{printed}"
+        return "" if find_lines(shows, prints, page.has) else f"no lines like those of the page:\n{printed}"
     if page.varies:
         odd = ({kind(line) for line in shows} ^ {kind(line) for line in prints}) - VERDICTS
         return f"{sorted(odd)} are lines of the page or printed, not both" if odd else ""
     if len(shows) != len(prints):
         return f"{len(prints)} lines, the page has {len(shows)}"
-    for line, other in zip(shows, prints, strict=True):
-        if not same(line, other, page.share):
-            return f"{other!r}, the page has {line!r}"
-    return ""
+    differ = ((line, other) for line, other in zip(shows, prints, strict=True) if not page.has(line, other))
+    return next((f"{other!r}, the page has {line!r}" for line, other in differ), "")
 
 
 def find_lines(shows: list[str], prints: list[str], is_same: Callable[[str, str], bool]) -> list[str] | None:
@@ -107,11 +109,6 @@ def find_lines(shows: list[str], prints: list[str], is_same: Callable[[str, str]
     return None if end is None else [prints[0], *end]
 
 
-def same(page: str, line: str, share: float) -> bool:
-    """Whether two lines are equal, or alike within a share of their decimals."""
-    return page.rstrip() == line.rstrip() or bool(share and alike(page, line, share))
-
-
 def same_kind(page: str, line: str) -> bool:
     return kind(page) == kind(line)
 
@@ -124,12 +121,10 @@ VERDICTS = {
 
 
 def masked(line: str) -> str:
-    """A line without its numbers, and with single spaces."""
     return " ".join(NUMBER.sub("#", line).split())
 
 
 def kind(line: str) -> str:
-    """A line without its numbers and lists of numbers."""
     return re.sub(r"#(?:(?:,| /) #)*", "#", masked(line))
 
 
@@ -139,22 +134,17 @@ are learnt again."""
 
 
 def alike(page: str, line: str, share: float) -> bool:
-    """Whether two lines differ by their decimals alone, and these by no more than a share of them."""
+    """Whether two lines differ by their decimals alone, and these by a share of them or one of the last digits."""
     page, line = (OF_THE_PAD.sub("N", each) for each in (page, line))
     if masked(page) != masked(line):
         return False
     for one, other in zip(NUMBER.findall(page), NUMBER.findall(line), strict=True):
         chances = one.startswith("1e") and other.startswith("1e")
-        decimals = "." in one or "." in other
-        if one != other and not chances and not (decimals and abs(float(other) - float(one)) <= slack(one, share)):
+        last_digit = 1.001 * 10.0 ** -len(one.partition(".")[2].partition("e")[0])
+        is_near = abs(float(other) - float(one)) <= max(share * abs(float(one)), last_digit)
+        if one != other and not chances and not (is_near and "." in one + other):
             return False
     return True
-
-
-def slack(number: str, share: float) -> float:
-    """A share of a number, but no less than one of its last digits."""
-    digits = len(number.partition(".")[2].partition("e")[0])
-    return max(share * abs(float(number)), 1.001 * 10.0**-digits)
 
 
 def followed(page: str, once: Once) -> tuple[Path, str]:
@@ -187,11 +177,11 @@ def follow(page: Path, folder: Path) -> str:
             continue
         how = block["how"] or ""
         if block["kind"] == "file":
-            lines = shown(block["body"], block.start("body"), how, is_part=True)
+            lines = Shown(block["body"], block.start("body"), how, is_part=True)
             printed = contents(folder, how.partition(",")[0])
         else:
             output = OUTPUT.match(text, block.end())
-            lines = shown(output[1], output.start(1), how) if output else shown("", -1, how)
+            lines = Shown(output[1], output.start(1), how) if output else Shown(how=how)
             code = re.search(r"exit code (\d+)", how)
             printed = run(block["body"], folder, int(code[1]) if code else 0)
         if differs := difference(lines, printed):
@@ -218,7 +208,6 @@ def rewritten(text: str, page: Shown, printed: str) -> str:
 
 
 def contents(folder: Path, name: str) -> str:
-    """The text of a file, or the files of a folder, by their names in order."""
     path = folder / name
     if path.is_dir():
         files = (each.relative_to(folder).as_posix() for each in path.rglob("*") if each.is_file())
@@ -238,7 +227,6 @@ def run(commands: str, folder: Path, code: int) -> str:
 
 
 def run_padforge(words: list[str], folder: Path) -> Ended:
-    """Run padforge in this process, which has all libraries loaded."""
     share = SHORTER if "--twin" in words or words[:2] == ["design", "compare"] else 1
     with (
         patch.dict(os.environ, COLUMNS="80"),

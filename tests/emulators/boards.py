@@ -28,19 +28,16 @@ _POLL_S = 0.01
 
 
 def emulated_header(rate_hz: float, channels: int) -> LineHeader:
-    """Return the header of an emulated board."""
     return LineHeader(rate_hz, 12, SUPPLY_V, channels, extra=(("name", "emulated"), ("serial", "0")))
 
 
 def format_header(header: LineHeader) -> bytes:
-    """Return a header as it is sent."""
     numbers = ((name, f"{getattr(header, name):g}") for name in ("rate_hz", "bits", "reference_v", "channels"))
     words = [*header.extra, *numbers, *([("check", "crc32")] if header.checked else [])]
     return _format_line("# padforge-line 1 " + " ".join(map("=".join, words)), header.checked)
 
 
 def format_sample(time_us: int, counts: Sequence[int], checked: bool) -> bytes:
-    """Return a sample as it is sent."""
     return _format_line(",".join(map(str, (time_us, *counts))), checked)
 
 
@@ -73,7 +70,6 @@ class SerialDevice(ABC):
         self.unplug()
 
     def unplug(self) -> None:
-        """Remove the device from its port, for good."""
         self._ending = True
         self._thread.join()
 
@@ -135,7 +131,6 @@ class EmulatedLineBoard(SerialDevice):
         return self._start_s + (np.asarray(index) + 1) * period_s
 
     def reset(self) -> None:
-        """Start anew, as by its button."""
         self._resetting = True  # done by the board's own thread, for which the start must not vanish within a step
 
     def _step(self, data: bytes) -> None:
@@ -156,7 +151,6 @@ class EmulatedLineBoard(SerialDevice):
         self._out += self._add_noise(data)
 
     def _sample(self) -> None:
-        """Send the samples that are due."""
         if self._silent:
             return
         if self._start_s is None or self._resetting:

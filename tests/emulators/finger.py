@@ -23,8 +23,6 @@ PATIENCE_S = 3.0  # time after which a press that was not detected is given up
 
 @dataclass
 class FingerStroke:
-    """A press of the finger."""
-
     kind: str  # "press", one of `MISHAPS`, or "echo", the second tap
     position_mm: Array  # of the touch; shape (2,)
     depth_mm: float  # when it is down
@@ -33,7 +31,6 @@ class FingerStroke:
     slide_mm: float = 0.0  # how far it slides along x within a second
 
     def contact(self, time_s: float) -> tuple[Array, float]:
-        """Return position and depth at a time, mm."""
         since_s, until_s = time_s - self.down_s, self.up_s + TRAVEL_S - time_s
         slide_mm = np.array([min(max(since_s, 0.0), 1.0) * self.slide_mm, 0.0])
         share = min(max(min(since_s, until_s) / TRAVEL_S, 0.0), 1.0)

@@ -41,11 +41,9 @@ class ExecutedMove:
 
     @property
     def end_s(self) -> float:
-        """Time of its end."""
         return self.start_s + self.duration_s
 
     def position(self, time_s: float) -> Position:
-        """Return the nozzle's position at a time from the start on."""
         return self.move.position(min(time_s - self.start_s, self.duration_s))
 
 
@@ -75,7 +73,6 @@ class Firmware:
         self.halted = False
 
     def position(self, time_s: float) -> Position:
-        """Return the true position of the nozzle at a time, mm."""
         number = bisect_right(self.moves, time_s, key=lambda move: move.start_s) - 1
         return self.moves[max(number, 0)].position(time_s)
 
@@ -84,14 +81,12 @@ class Firmware:
         self._busy_until_s = until_s
 
     def kill(self, now_s: float) -> None:
-        """Stop for good."""
         self._cut(now_s)
         self._say("Error:Printer halted. kill() called!")
         self.halted = True
         self._lines.clear()
 
     def restart(self, now_s: float) -> None:
-        """Restart, as after a reset."""
         self._cut(now_s)
         self.halted, self._last_number = False, 0
         self._text.clear()
@@ -100,7 +95,6 @@ class Firmware:
         self._say("start", "Marlin 2.1.2", "echo: Last Updated: 2023-07-16 | Author: (none, default config)")
 
     def receive(self, data: bytes, now_s: float) -> None:
-        """Take bytes from the host."""
         if self.halted:
             return
         *lines, tail = (bytes(self._text) + data).split(b"\n")
@@ -170,9 +164,8 @@ class Firmware:
         end = (float(words.get(axis, value)) for axis, value in zip("XYZ", start, strict=True))
         x, y, z = (min(max(value, 0.0), limit) for value, limit in zip(end, self._bed_mm, strict=True))  # endstops
         self._feed = float(words["F"]) / 60 if "F" in words else self._feed
-        move = StraightMove(start, (x, y, z), self._feed, self._acceleration).limit_axes(
-            self._max_mm_s, self._max_mm_s2
-        )
+        move = StraightMove(start, (x, y, z), self._feed, self._acceleration)
+        move = move.limit_axes(self._max_mm_s, self._max_mm_s2)
         if move.length_mm:
             start_s = max(now_s + START_S, self.moves[-1].end_s)
             self.moves.append(ExecutedMove(start_s, move, move.duration_s))
@@ -235,7 +228,6 @@ class EmulatedPrinter(SerialDevice):
     busy = partialmethod(_change, "busy")  # take no command for some seconds: a person is at the display
 
     def true_positions(self, times_s: ArrayLike) -> Array:
-        """Return the (n, 3) true positions of the nozzle at (n,) monotonic times, mm."""
         times = np.atleast_1d(np.asarray(times_s, dtype=np.float64)).tolist()
         with self._lock:
             return np.array([self.firmware.position(time_s) for time_s in times]).reshape(-1, 3)

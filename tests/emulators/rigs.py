@@ -56,7 +56,6 @@ def emulate_printer(
 def _emulate_board(
     pad: Morphology, contact: Contact, rig: RigSettings, tip_positions: SampleSource
 ) -> Iterator[EmulatedLineBoard]:
-    """Run a board that samples the pad below the tip."""
     frame, inputs = RobotFrame.from_settings(rig), rig.inputs(len(pad.knots))
     n_inputs = max(MIN_INPUTS, 1 + max(inputs))
     model = LivePad(pad, contact, rig, rig.board_rate_hz, np.random.default_rng(rig.seed))

@@ -40,7 +40,6 @@ _TYPES = (
     (r"actual_digital_(in|out)put_bits", "UINT64"),
     (r"actual_tool_accelerometer|payload_cog", "VECTOR3D"),
     (r"joint_mode", "VECTOR6INT32"),
-    (r"actual_robot_(current|voltage)|actual_main_voltage", "DOUBLE"),
     (r"(actual|target)_(q|qd|qdd|current|moment|TCP_\w+)|actual_current_as_torque|actual_joint_voltage", "VECTOR6D"),
     (r"joint_(control_output|temperatures)|ft_raw_wrench|payload_inertia", "VECTOR6D"),
     (r"\w+", "DOUBLE"),
@@ -53,12 +52,10 @@ def variable_type(name: str) -> str:
 
 
 def recipe_layout(types: list[str]) -> struct.Struct:
-    """Return the layout of the values of a recipe."""
     return struct.Struct(">" + "".join(_CODES[kind] for kind in types))
 
 
 def pack_frame(kind: int, payload: bytes) -> bytes:
-    """Return a frame with its header."""
     return HEADER.pack(HEADER.size + len(payload), kind) + payload
 
 
@@ -75,7 +72,6 @@ class Connection:
         self.text = b""  # received, but not yet complete
 
     def pack_state(self, state: dict[str, Any]) -> bytes:
-        """Return the values of the output recipe."""
         names, widths, layout = self.outputs
         values: list[Any] = []
         for name, width in zip(names, widths, strict=True):
@@ -135,18 +131,15 @@ class EmulatedUR5:
         self._commands.put((name, arguments, done))
         done.result(COMMAND_S)
 
-    protective_stop = partialmethod(_command, "protective_stop")
-    """Stop the arm as after a collision: the program is paused."""
+    protective_stop = partialmethod(_command, "protective_stop")  # as after a collision: the program is paused
     emergency_stop = partialmethod(_command, "emergency_stop")  # press the red button
-    clear = partialmethod(_command, "clear")
-    """Unlock the arm, power on and release the brakes, as a person does after a stop."""
+    clear = partialmethod(_command, "clear")  # what a person does after a stop: unlock, power on, release the brakes
     play = partialmethod(_command, "play")  # press play at the pendant: a paused program goes on
     stop_program = partialmethod(_command, "stop_program")  # press stop at the pendant: the program ends
     refuse = partialmethod(_command, "_refuse")  # refuse new connections, or accept them again; open ones stay
     drop = partialmethod(_command, "_drop")  # close the connections to a port; new ones are accepted
     slow = partialmethod(_command, "_slow")  # delay every answer and every command by some seconds
-    restart = partialmethod(_command, "_restart")
-    """Restart the controller: all connections end, and it is back after some seconds."""
+    restart = partialmethod(_command, "_restart")  # all connections end, and it is back after some seconds
 
     def freeze(self, frozen: bool) -> None:
         """Send no more states, or go on; all else goes on."""
@@ -157,15 +150,12 @@ class EmulatedUR5:
         self._unplugged = unplugged
 
     def break_force_sensor(self, broken: bool) -> None:
-        """Send no number for the force, or a number again."""
         self._controller.has_force = not broken
 
     def push(self, sideways_n: float) -> None:
-        """Push the tool along x with a force from now on."""
         self._controller.sideways_n = sideways_n
 
     def remote_control(self, remote: bool) -> None:
-        """Switch to remote control, or to local control."""
         self._controller.remote = remote
 
     def _listen(self) -> None:
@@ -229,7 +219,6 @@ class EmulatedUR5:
             self._send(connection, pack_frame(DATA, connection.pack_state(state)))
 
     def _poll(self, timeout: float) -> None:
-        """Wait for the sockets."""
         if self._unplugged:
             clock.sleep(timeout)
             return

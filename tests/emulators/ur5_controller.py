@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from padforge.sense.arrays import Array
-from padforge.sense.rig.arms.motion import TrapezoidalProfile
+from padforge.sense.rig.arms.motion import Position, TrapezoidalProfile
 from padforge.sense.rig.arms.rtde import PLAYING, RUNNING, STOPPED
 
 Series = Literal["cb3", "e"]
@@ -47,29 +47,24 @@ class Motion:
         return self._move is not None
 
     def move_to(self, end: Array, speed: float, acceleration: float, now: float) -> None:
-        """Start a move from rest."""
         offset = end - self.pose
         length = float(np.linalg.norm(offset[:3]) or np.linalg.norm(offset[3:]))
         self._move = self.pose, end, TrapezoidalProfile(length, speed, acceleration), now
 
     def stop(self) -> None:
-        """Stop for good."""
         self._move, self._interrupted, self.velocity = None, None, np.zeros(6)
 
     def interrupt(self) -> None:
-        """Stop, and remember the move under way."""
         move = self._move
         self.stop()
         self._interrupted = move and (move[1], move[2].max_speed, move[2].acceleration)
 
     def resume(self, now: float) -> None:
-        """Go on with the interrupted move."""
         if move := self._interrupted:
             self._interrupted = None
             self.move_to(*move, now)
 
     def update(self, now: float) -> None:
-        """Advance to the time `now`."""
         if self._move is None:
             return
         start, end, profile, start_s = self._move
@@ -84,20 +79,12 @@ class Motion:
 class Controller:
     """A controller, from one control cycle to the next; times are seconds of the host's monotonic clock."""
 
-    def __init__(
-        self,
-        series: Series,
-        pose: Array,
-        surface: float = -np.inf,
-        stiffness: float = 2000.0,
-        now: float = 0.0,
-        tcp: tuple[float, float, float] = (0.0, 0.0, 0.0),
-    ) -> None:
+    def __init__(self, series: Series, pose: Array, plane: float, stiffness: float, now: float, tcp: Position) -> None:
         """Switch it on at the time `now`, its tool at `pose`, above a springy plane; its height in m and N/m."""
         self.series: Series = series
         self.tcp, self.now = tcp, now
         self.motion = Motion(pose)
-        self._surface, self._stiffness = surface, stiffness
+        self._surface, self._stiffness = plane, stiffness
         self.remote, self.sideways_n = True, 0.0  # in remote control; the force that pushes the tool along x
         self.has_force = True  # whether the force of the states is a number
         self.dashboard_log: list[str] = []
@@ -118,7 +105,6 @@ class Controller:
         self._n_operations = self._n_writes = 0
 
     def tick(self, now: float) -> None:
-        """Run one control cycle."""
         self.now = now
         self.motion.update(now)
         if self._program_start is not None and now >= self._program_start:
@@ -138,7 +124,6 @@ class Controller:
             self._kicked = now
 
     def upload(self, text: str) -> None:
-        """Take a program, which replaces a running one."""
         if self._safety != NORMAL:
             return
         self.stop_program()
@@ -146,7 +131,6 @@ class Controller:
         self._program_start = self.now + START_S
 
     def stop_program(self) -> None:
-        """End the program and brake the arm."""
         self._threads, self._program_start, self._watchdog_s = [], None, np.inf
         self._runtime = STOPPED
         self.motion.stop()
@@ -159,7 +143,6 @@ class Controller:
             self._runtime = PAUSED
 
     def emergency_stop(self) -> None:
-        """Brake, end the program, power off."""
         self.stop_program()
         self._safety, self._mode = EMERGENCY, POWER_OFF
 
@@ -174,7 +157,6 @@ class Controller:
             self.motion.resume(self.now)
 
     def answer_dashboard(self, line: str) -> str:
-        """Return the dashboard's answer to a line."""
         self.dashboard_log.append(line)
         if line == "stop":
             self.stop_program()
@@ -190,7 +172,6 @@ class Controller:
         return answers.get(line, f"could not understand: '{line}'")
 
     def surface_force(self) -> float:
-        """Return the force of the plane on the tool, N, upwards."""
         return self._stiffness * max(0.0, self._surface - float(self.motion.pose[2]))
 
     def state(self) -> dict[str, Any]:
@@ -280,7 +261,6 @@ class PoseLog:
         self._rows: list[tuple[float, ...]] = []
 
     def append(self, time_s: float, pose: ArrayLike, force_n: float) -> None:
-        """Add a row: time on the host's monotonic clock, pose in mm and rad, force on the tool."""
         self._rows.append((time_s, *np.asarray(pose).tolist(), force_n))
 
     def rows(self, since_s: float = -np.inf) -> Array:
@@ -289,7 +269,6 @@ class PoseLog:
         return np.array(self._rows[max(first, 0) :])
 
     def poses(self, times_s: ArrayLike) -> Array:
-        """Return the (n, 6) poses in mm and rad at monotonic times."""
         times = np.atleast_1d(np.asarray(times_s, dtype=np.float64))
         rows = self.rows(np.min(times, initial=np.inf))
         return np.column_stack([np.interp(times, rows[:, 0], column) for column in rows.T[1:7]])

@@ -1,5 +1,3 @@
-"""Figures instead of the files that they would be written to, and moulds without drawings that no test looks at."""
-
 from pathlib import Path
 
 import pytest

@@ -1,5 +1,4 @@
-"""Pads and settings with a known shape or a known fault."""
-
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -27,7 +26,7 @@ def winding_pad(*places: tuple[float, float]) -> Morphology:
 
 
 def with_settings(
-    mould: dict[str, object] | None = None, printer: dict[str, object] | None = None, **sections: dict[str, object]
+    mould: Mapping[str, object] | None = None, printer: Mapping[str, object] | None = None, **sections: Mapping
 ) -> FabricationSettings:
     """Return the defaults with some keys changed, section by section."""
     changed = {"mould": mould, "printer": printer, **sections}

@@ -1,5 +1,3 @@
-"""Moulds made and written: all files or none, whole, read back by others, the same bytes again."""
-
 import errno
 import json
 import logging
@@ -32,6 +30,7 @@ from padforge.fabricate.outputs import pictures
 from tests.fabricate.planted import level_pad, with_settings
 from tests.helpers.folders import files_in
 from tests.helpers.less import small_pictures
+from tests.helpers.refusals import refusal_table
 
 PAD = Morphology.random((1, 2), 2, seed=7, pitch_mm=(12.0, 10.0))
 FILES = {f"{body}.{suffix}" for body in ("mould", "lid", "conductive", "holder") for suffix in ("stl", "3mf")}
@@ -152,49 +151,30 @@ def test_shrinkage_enlarges_the_mould_and_keeps_the_pad(tmp_path):
     assert [row[2:4] for row in grown.crossings["table"]] == [row[2:4] for row in kept.crossings["table"]]
 
 
-def other_solid(monkeypatch, solid) -> None:
-    """Plant a solid in place of the CAD model of the lid, the body with the lowest base."""
-    right = model.body_solid
-    monkeypatch.setattr(model, "body_solid", lambda body: solid() if body.base[0].top_mm == LID_MM else right(body))
-
-
-def in_pieces(monkeypatch, body: str) -> None:
+def test_refused_builds_write_nothing(tmp_path, monkeypatch, golden):
+    """For what is asked, or for what is planted in a sound mould with a lid."""
+    out, two_levels, right = tmp_path / "out", with_settings({"levels": "two"}), model.body_solid
     pieces = Body((Prism(shapely.box(0, 0, 9, 9), 0, 1), Prism(shapely.box(10, 0, 19, 9), 0, 1)))
-    monkeypatch.setattr(mould, body, lambda plan: pieces)
 
+    def planted(module: Any, name: str, value: object, *formats: str) -> None:
+        with monkeypatch.context() as patch:
+            patch.setattr(module, name, value)
+            build(Morphology.straight(1), out, formats, with_settings({"lid": True}))
 
-@pytest.mark.parametrize(
-    ("planted", "formats", "line"),
-    [
-        (None, ["obj"], "'obj', allowed are stl, 3mf, step, svg, dxf, png, gcode"),
-        (None, ["svg"], "2 crossings"),
-        (partial(in_pieces, body="lid_body"), ["stl"], r"^lid: .*the mesh has 2 bodies.*nothing was written"),
-        (
-            partial(other_solid, solid=lambda: Solid.make_box(1, 1, 1)),
-            ["step"],
-            r"^lid: the CAD solid of its lid does not match its mesh \(volume .*; nothing was written$",
-        ),
-        (
-            partial(other_solid, solid=lambda: Compound([Solid.make_box(1, 1, 1)])),
-            ["step"],
-            "^lid: the CAD kernel finds its lid invalid; leave step out",
-        ),
-        (
-            lambda m: m.setattr(step_file.STEPCAFControl_Writer, "Write", lambda *_: None),
-            ["stl", "step"],
-            r"mould\.step: cannot be written \(the CAD kernel could not write it",
-        ),
-    ],
-)
-def test_build_refuses_in_one_line_and_writes_nothing(tmp_path, monkeypatch, planted, formats, line):
-    pad, settings = Morphology.straight(1), with_settings({"lid": True})
-    if planted:
-        planted(monkeypatch)
-    else:
-        pad, settings = level_pad(1.8, 1.2), with_settings({"levels": "two"})
-    with pytest.raises(InputError, match=line):
-        build(pad, tmp_path / "out", formats, settings)
-    assert not (tmp_path / "out").exists() or not files_in(tmp_path / "out")
+    def other_lid(solid: Any) -> Any:
+        return lambda body: solid if body.base[0].top_mm == LID_MM else right(body)
+
+    box = Solid.make_box(1, 1, 1)
+    rows = {
+        "a format": partial(build, level_pad(1.8, 1.2), out, ["obj"], two_levels),
+        "crossings of two levels": partial(build, level_pad(1.8, 1.2), out, ["svg"], two_levels),
+        "a lid in pieces": partial(planted, mould, "lid_body", lambda plan: pieces, "stl"),
+        "another solid": partial(planted, model, "body_solid", other_lid(box), "step"),
+        "an invalid solid": partial(planted, model, "body_solid", other_lid(Compound([box])), "step"),
+        "no file": partial(planted, step_file.STEPCAFControl_Writer, "Write", lambda *_: None, "stl", "step"),
+    }
+    golden("fabricate/refusals_of_builds.txt", refusal_table(rows))
+    assert not out.exists() or not files_in(out)
 
 
 def test_interrupted_build_keeps_the_old_mould(tmp_path, monkeypatch):

@@ -1,5 +1,3 @@
-"""Wild pads, and settings at the ends of what each key allows: a closed mould, or one line that says why not."""
-
 import json
 from collections.abc import Mapping
 
@@ -16,6 +14,7 @@ from padforge.fabricate.mould import mould_body
 from padforge.fabricate.plan import Plan
 from tests.design.wild_pads import KINDS, wild_knots
 from tests.fabricate.planted import with_settings
+from tests.helpers.refusals import require_one_line
 
 ENDS = {
     "floor_mm": [0.4, 50.0],
@@ -39,10 +38,6 @@ def wild(kind: str) -> Morphology:
     return Morphology(wild_knots(kind, 2, 4, np.random.default_rng(3)))
 
 
-def require_one_line(error: InputError) -> None:
-    assert len(str(error).splitlines()) == 1
-
-
 def require_closed(pad: Morphology, mould: Mapping[str, object]) -> None:
     try:
         plan = Plan(pad, with_settings(dict(mould)))
@@ -50,10 +45,8 @@ def require_closed(pad: Morphology, mould: Mapping[str, object]) -> None:
     except InputError as error:
         require_one_line(error)
         return
-    broken = [
-        finding.message for finding in check_solid(TriangleMesh.weld(vertices, triangles)) if finding.status == "fail"
-    ]
-    assert not broken
+    findings = check_solid(TriangleMesh.weld(vertices, triangles))
+    assert not [finding.message for finding in findings if finding.status == "fail"]
     size = np.ptp(vertices.astype(float), axis=0)
     assert min(size[:2]) > pad.layout.size_mm[0] + 2 * plan.settings.mould.border_mm
     assert size[2] > plan.settings.mould.floor_mm

@@ -1,5 +1,3 @@
-"""Files of meshes: there and back, damaged, or made to be awkward; each is read and judged, or refused in one line."""
-
 import itertools
 import json
 import zipfile
@@ -49,13 +47,6 @@ def test_read_mesh_reads_what_is_whole_of_an_stl_with_a_warning(tmp_path, caplog
     assert caplog.messages == [f"{path}: {warning}"]
 
 
-@pytest.mark.parametrize("content", [BINARY[: 84 + 50 * 5], b"v 1.0 2.0 3.0\n" * 40], ids=["torn", "text"])
-def test_read_mesh_refuses_what_is_torn_or_no_stl(tmp_path, content):
-    (path := tmp_path / "other.stl").write_bytes(content)
-    with pytest.raises(InputError, match=r"other\.stl: "):
-        read_mesh(path)
-
-
 @pytest.mark.parametrize("suffix", [".stl", ".3mf"])
 def test_read_mesh_returns_what_was_written(tmp_path, suffix):
     moved = VERTICES + np.array([0.1, -123.456, 7])
@@ -85,9 +76,8 @@ def test_read_mesh_of_several_bodies_in_ascii_stl_and_3mf(tmp_path):
     text = "\n".join(trimesh.exchange.stl.export_stl_ascii(mesh) for mesh in (BOX, far))
     (tmp_path / "two.stl").write_text(text)
     trimesh.Scene([BOX, BOX.copy().apply_translation((5, 4, 0))]).export(tmp_path / "two.3mf")
-    apart, across = (
-        {finding.name: finding for finding in check_mesh(tmp_path / name)} for name in ("two.stl", "two.3mf")
-    )
+    found = (check_mesh(tmp_path / name) for name in ("two.stl", "two.3mf"))
+    apart, across = ({finding.name: finding for finding in findings} for findings in found)
     assert (apart["bodies"].status, apart["bodies"].measured) == ("fail", 2)
     assert apart["self_intersection"].status == "pass"
     assert across["bodies"].status == across["self_intersection"].status == "fail"
@@ -133,8 +123,6 @@ def test_read_mesh_leaves_out_what_is_not_printed(tmp_path, caplog, objects, ite
 
 
 BEYOND = TRIANGLE.replace('v3="2"', 'v3="9"')
-
-
 BROKEN_FILES = {
     "missing.3mf": model("", '<item objectid="1"/>'),
     "none.3mf": model("", ""),
@@ -142,7 +130,7 @@ BROKEN_FILES = {
     "outside.3mf": '<!DOCTYPE x [<!ENTITY a SYSTEM "file:///dev/zero">]><model>&a;</model>',
     "text.3mf": "no model at all",
 }
-TORN = [None, b"", b"solid\n", b"\0" * 84, b"\xff" * 500]
+TORN = [None, b"", b"solid\n", b"\0" * 84, b"\xff" * 500, BINARY[: 84 + 50 * 5], b"v 1.0 2.0 3.0\n" * 40]
 
 
 @pytest.mark.parametrize(
@@ -153,10 +141,8 @@ def test_check_mesh_refuses_other_files_in_one_line(tmp_path, name, content):
         packed(tmp_path / name, content)
     elif content is not None:
         (tmp_path / name).write_bytes(content)
-    with pytest.raises(InputError) as refusal:
+    with pytest.raises(InputError, match=rf"^[^\n]*{name}[^\n]*$"):
         check_mesh(tmp_path / name)
-    assert name in str(refusal.value)
-    assert "\n" not in str(refusal.value)
 
 
 @pytest.mark.parametrize("odd", [np.nan, np.inf])

@@ -6,22 +6,11 @@ import shapely
 import trimesh
 from shapely import affinity
 
-from padforge.common.validation import InputError
 from padforge.design.morphology import Morphology
+from padforge.fabricate import mould as bodies
 from padforge.fabricate.checks.plan_checks import check_plan
 from padforge.fabricate.mesh import build_mesh, mesh_arrays
-from padforge.fabricate.mould import (
-    Body,
-    Prism,
-    bed_frame,
-    conductive_plan,
-    holder_body,
-    lid_body,
-    mould_body,
-    registration_pins,
-    sizes,
-    well_outlines,
-)
+from padforge.fabricate.mould import Body, Prism, conductive_plan, lid_body, mould_body, well_outlines
 from padforge.fabricate.plan import Plan
 from padforge.fabricate.settings import WELL_MM
 from tests.fabricate.planted import with_settings
@@ -68,22 +57,9 @@ def test_random_and_published_moulds_are_closed(request, pad):
     assert_one_closed_body(as_read(mould_body(Plan(pad))))
 
 
-@pytest.mark.parametrize(
-    ("make", "pad", "mould", "line"),
-    [
-        (lid_body, (1, 3.5), {"lid": True, "spout": True}, "spout: got true for a pad 7 mm wide, allowed from 19"),
-        (mould_body, (2,), {"pins": True, "exit_mm": 0.0, "wall_mm": 1.0}, r"pins.*1 mm wide"),
-        (conductive_plan, (2, 5.0), {}, "exit_width_mm"),
-    ],
-)
-def test_bodies_without_room_are_refused(make, pad, mould, line):
-    with pytest.raises(InputError, match=line):
-        make(Plan(Morphology.straight(*pad), with_settings(mould)))
-
-
 def test_holder_fits_the_pad_with_its_leads():
     plan = Plan(Morphology.random(2, 2, seed=4), with_settings({"border_mm": 1.5, "floor_mm": 1.2}))
-    read, frame = as_read(holder_body(plan)), bed_frame(plan)
+    read, frame = as_read(bodies.holder_body(plan)), bodies.bed_frame(plan)
     assert_one_closed_body(read)
     floor, wall, out = plan.settings.mould.floor_mm, frame["walls_mm"], plan.tray.bounds[2]
     assert read.bounds == pytest.approx(np.array([[-out, -out, 0], [out, out, wall]]), abs=1e-4)
@@ -91,16 +67,13 @@ def test_holder_fits_the_pad_with_its_leads():
     rim = shapely.segmentize(over.buffer(plan.flare_mm + 0.1, join_style="mitre").exterior, 1.3)
     leads = [(-end[0], end[1]) for line in plan.lines for end in (line.coords[0], line.coords[-1])]
     beyond = [(x * 50, y) if abs(x) > abs(y) else (x, y * 50) for x, y in leads]
-    ways = [
-        shapely.LineString([end, away]).intersection(plan.tray).coords[-1]
-        for end, away in zip(leads, beyond, strict=True)
-    ]
+    lines = (shapely.LineString(ends) for ends in zip(leads, beyond, strict=True))
+    ways = [line.intersection(plan.tray).coords[-1] for line in lines]
     for x, y in [*rim.coords, *leads, *(0.999 * np.array(ways))]:
         assert height_at(read, x, y) == pytest.approx(floor)
     inside = out - 0.2
-    assert [
-        height_at(read, x, y) for x, y in ((inside, inside), (-inside, inside), (-inside, -inside))
-    ] == pytest.approx([wall] * 3)
+    for place in ((inside, inside), (-inside, inside), (-inside, -inside)):
+        assert height_at(read, *place) == pytest.approx(wall)
     with pytest.raises(ValueError, match="zero-size array"):
         height_at(read, inside, -inside)  # where fibres 1 and 3 start, as the pad lies
 
@@ -121,10 +94,8 @@ def test_ridges_run_to_the_end_of_their_slots():
 
 
 def test_walls_and_ridges_have_their_draft():
-    plan = Plan(
-        Morphology.straight(1, pitch_mm=20.0),
-        with_settings({"number_mm": 0.0, "exit_mm": 0.0, "wall_draft_deg": 10.0, "ridge_draft_deg": 10.0}),
-    )
+    leaning = {"number_mm": 0.0, "exit_mm": 0.0, "wall_draft_deg": 10.0, "ridge_draft_deg": 10.0}
+    plan = Plan(Morphology.straight(1, pitch_mm=20.0), with_settings(leaning))
     read = as_read(mould_body(plan))
     slope = math.tan(math.radians(10))
     for z in (3.0, 5.0, 7.5):  # on a wall clear of ridges
@@ -134,19 +105,19 @@ def test_walls_and_ridges_have_their_draft():
     across = np.abs(section.vertices[(np.abs(section.vertices[:, 0]) < 15) & (np.abs(section.vertices[:, 1]) < 2)])
     foot = 0.2 + 1.1 * slope  # the lowest terrace, one layer high, is as wide as the taper at its top
     assert across[:, 1].max() == pytest.approx(foot, abs=0.011)
-    assert sizes(plan)["ridge_foot_mm"] == pytest.approx(0.4 + 2 * 1.2 * slope)
+    assert bodies.sizes(plan)["ridge_foot_mm"] == pytest.approx(0.4 + 2 * 1.2 * slope)
 
 
 def test_lid_has_holes_for_pins_vents_and_spout():
     plan = Plan(Morphology.straight(2), with_settings({"lid": True, "pins": True}))
-    pin = sizes(plan)["pin_mm"]
+    pin = bodies.sizes(plan)["pin_mm"]
     assert pin == 2.0
     assert_one_closed_body(as_read(lid_body(plan)), genus=4 + 3)
     read = as_read(mould_body(plan))
     assert read.bounds[1, 2] == pytest.approx(8 + pin)
     assert_one_closed_body(read)
     holes = [hole.area for hole in lid_body(plan).cuts]
-    for peg in registration_pins(plan):  # a printed hole comes out narrower than drawn
+    for peg in bodies.registration_pins(plan):  # a printed hole comes out narrower than drawn
         (around,) = (hole for hole in holes if hole.intersects(peg.area))
         assert around.boundary.distance(peg.area) >= 0.1
     spout = Plan(Morphology.straight(2), with_settings({"lid": True, "spout": True}))
@@ -207,7 +178,7 @@ def test_crossing_gap_is_a_lower_bound():
 def test_pins_are_on_three_corners_so_that_a_lid_fits_one_way() -> None:
     """Half as wide as the corner they stand on, as high as wide; the far corner at the right has none."""
     plan = Plan(Morphology.straight(2), with_settings({"wall_mm": 3.0, "exit_mm": 2.0, "pins": True}))
-    pins = registration_pins(plan)
+    pins = bodies.registration_pins(plan)
     places = [pin.area.centroid.coords[0] for pin in pins]
     middle = plan.tray.bounds[2] - plan.corner_mm / 2
     assert np.array(places) == pytest.approx(np.array([(-1, -1), (1, -1), (-1, 1)]) * middle, abs=1e-6)

@@ -1,7 +1,4 @@
-"""Plans of moulds: ridges along the exact fibres, levels for those that cross, numbers beside them."""
-
-import itertools
-from itertools import permutations
+from itertools import combinations, permutations
 
 import numpy as np
 import pytest
@@ -59,7 +56,7 @@ def test_shrinkage_compensated_plan_shrinks_to_the_pad(leads):
 @settings(max_examples=25)
 @given(st.integers(1, 6), st.data())
 def test_assign_layers_separates_crossing_fibres(grid, data):
-    fibres = [*itertools.combinations(range(grid), 2), *itertools.combinations(range(grid, 2 * grid), 2)]
+    fibres = [*combinations(range(grid), 2), *combinations(range(grid, 2 * grid), 2)]
     pairs = data.draw(st.lists(st.sampled_from(fibres), max_size=12)) if fibres else []
     deep = data.draw(st.booleans())
     levels = assign_layers((grid, grid), [Crossing(i, j, (0.0, 0.0)) for i, j in pairs], deep)
@@ -103,11 +100,9 @@ def test_every_family_is_laid_at_the_depth_that_it_is_designed_for(fibres, deep)
 def test_require_levels_refuses_crossings_of_a_family():
     settings = with_settings({"levels": "two"})
     plan = Plan(level_pad(1.8, 1.2), settings)
-    with pytest.raises(
-        InputError, match=r'levels: got "two".*2 crossings: fibres 1 x 2 at \(-\d+\.\d, -?0\.0\)'
-    ) as refusal:
+    line = r'^[^\n]*levels: got "two"[^\n]*2 crossings: fibres 1 x 2 at \(-\d+\.\d, -?0\.0\)[^\n]*$'
+    with pytest.raises(InputError, match=line):
         plan.require_levels()
-    assert "\n" not in str(refusal.value)
     assert plan.heights_mm == (0.4, 1.2)
     Plan(Morphology.straight(3), settings).require_levels()
 
@@ -125,7 +120,7 @@ def test_digits_turned_over_or_upside_down_are_no_other_digits():
             assert share(number, other, *mirror) <= max(0.6, share(number, other, 1, 1) + 1e-6), (number, other, mirror)
 
 
-def test_numbers_keep_clear_of_ridges_walls_and_each_other():
+def test_numbers_keep_clear_of_all_and_are_next_to_the_start_of_their_fibre():
     plan = Plan(Morphology.random(4, 5, seed=3), with_settings({"min_silicone_mm": 0.6}))
     placed = [number for number in plan.numbers if number is not None]
     assert len(placed) >= len(plan.numbers) - 1
@@ -134,9 +129,6 @@ def test_numbers_keep_clear_of_ridges_walls_and_each_other():
         assert number.distance(ridges) > 0.6 - 0.01
         assert number.within(plan.cavity)
         assert all(number.distance(other) > 0.6 for other in placed[:i])
-
-
-def test_numbers_are_next_to_the_start_of_their_fibre():
     plan = Plan(Morphology.straight(4))
     starts = np.array([line.coords[0] for line in plan.lines])
     for fibre, number in enumerate(plan.numbers):

@@ -1,5 +1,3 @@
-"""Pads that are no squares: of two pitches, of one family, with holes, with leads to one side."""
-
 import math
 from dataclasses import replace
 
@@ -18,15 +16,14 @@ from padforge.fabricate.leads import lead_spacing
 from padforge.fabricate.mesh import build_mesh, mould_mesh
 from padforge.fabricate.mould import bed_frame, holder_body, lid_body, tray_body
 from padforge.fabricate.plan import Plan
-from padforge.fabricate.settings import DEFAULTS, FabricationSettings, MouldSettings
+from padforge.fabricate.settings import DEFAULTS, FabricationSettings
 from tests.fabricate.planted import with_settings
 
 PAD = Morphology.straight((3, 6), (8.0, 15.0))
 
 
 def settings(pad: Morphology, mould: dict | None = None, **more) -> FabricationSettings:
-    own = PadSettings(**{**pad.layout.settings, **more})
-    return replace(DEFAULTS, mould=MouldSettings(**{"number_mm": 0.0, **(mould or {})}), pad=own)
+    return with_settings({"number_mm": 0.0} | (mould or {}), pad={**pad.layout.settings, **more})
 
 
 def test_round_holes_are_round_pillars_whose_feet_are_the_heads_of_screws():

@@ -13,8 +13,6 @@ from scipy.sparse.linalg import splu
 
 
 class Pressed(NamedTuple):
-    """A layer under a tool; displacements at its nodes have the shape (r, z)."""
-
     r: np.ndarray
     z: np.ndarray
     outward: np.ndarray
@@ -55,9 +53,8 @@ def press(tool_depth, r_edges, z_edges, bonded):
         volume = weight * width * height / 4 * radius
         by_r, by_z, over_r, zero = by_x * 2 / width, by_y * 2 / height, value / radius[:, None], np.zeros_like(value)
         # strains rr, hoop, zz and shear / sqrt 2 of unknowns (outward, up); energy is G times their squares
-        strain = np.stack(
-            [np.hstack(pair) for pair in ((by_r, zero), (over_r, zero), (zero, by_z), (by_z / 2**0.5, by_r / 2**0.5))]
-        )
+        pairs = (by_r, zero), (over_r, zero), (zero, by_z), (by_z / 2**0.5, by_r / 2**0.5)
+        strain = np.stack([np.hstack(pair) for pair in pairs])
         stiffness = 2 * np.einsum("q,cqa,cqb->ab", volume, strain, strain)
         divergence = np.einsum("q,qa,qb->ab", volume, pressure, strain[:3].sum(axis=0))
         local = np.block([[stiffness, divergence.T], [divergence, np.zeros((4, 4))]])

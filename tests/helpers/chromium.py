@@ -63,11 +63,9 @@ class Chromium:
         self.wait_for_frames()
 
     def ask(self, expression: str) -> Any:
-        """The value of a JavaScript expression in the page, awaited if it is a promise."""
         return self.page.evaluate(expression)
 
     def wait_for(self, expression: str, wait_s: float = 30) -> None:
-        """Wait until a JavaScript expression in the page is true."""
         end_s = time.monotonic() + wait_s
         while self.ask(expression) is not True:
             assert time.monotonic() < end_s, f"{expression} never came true"
@@ -78,7 +76,6 @@ class Chromium:
         self.ask("new Promise(done => requestAnimationFrame(() => requestAnimationFrame(() => done(1))))")
 
     def press(self, key: str) -> None:
-        """Press and release a key, such as ArrowLeft, on what has the focus."""
         self.page.keyboard.press(key)
         self.wait_for_frames()
 
@@ -94,5 +91,4 @@ class Chromium:
         return np.asarray(seen.convert("RGB"), dtype=int)[y : y + height, x : x + width]
 
     def call(self, method: str, **parameters: Any) -> dict[str, Any]:
-        """The answer to a command of the DevTools protocol."""
         return self._session.send(method, parameters)

@@ -1,5 +1,3 @@
-"""Documents as a person reads them in a review."""
-
 import json
 import re
 from typing import Any

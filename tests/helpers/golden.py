@@ -25,15 +25,11 @@ DIGEST = re.compile(r"\b[0-9a-f]{64}\b")
 TIME = re.compile(r"\b\d{4}-\d\d-\d\d[T ]\d\d:\d\d:\d\d(?:\.\d+)?(?:Z|[+-]\d\d:\d\d)?")
 ROUNDING = 0.08  # relative difference that rounding may make: 0.14 may be 0.13, but 0.1 is not 0.2
 MANY_DIGITS = 8  # from here on the last digits are those of a processor
+MAX_VALUES = 12  # of a list or table of JSON on one line
 
 
 class Golden:
-    """Compares outputs with those that are kept.
-
-    Args:
-        folder: whose path outputs may state.
-        renew: write what differs instead of failing.
-    """
+    """Compares outputs, which may state the path of a folder, with those that are kept, or renews these."""
 
     def __init__(self, folder: Path, renew: bool) -> None:
         self._folder, self._renew = folder, renew
@@ -104,16 +100,25 @@ def _plain(value: Any) -> Any:
     return value.tolist()
 
 
-def json_text(value: Any, width: int = 150, indent: str = "") -> str:
-    """JSON with a line for each list or table that fits, in the order in which it is."""
-    line = json.dumps(value, ensure_ascii=False, default=_plain)
-    if len(indent) + len(line) <= width or not isinstance(value, dict | list):
-        return line
-    names = [f"{json.dumps(name)}: " for name in value] if isinstance(value, dict) else [""] * len(value)
-    items = value.values() if isinstance(value, dict) else value
-    parts = [f"{indent} {name}{json_text(item, width, indent + ' ')}" for name, item in zip(names, items, strict=True)]
-    begin, end = "{}" if isinstance(value, dict) else "[]"
-    return "\n".join([begin, ",\n".join(parts), indent + end])
+def json_text(document: Any, indent: str = "") -> str:
+    """JSON with a line for each list or table of at most `MAX_VALUES` values, and a line a member of longer ones.
+
+    Lines break by the numbers of values alone, so that no digit more or less moves one.
+    """
+    document = document if indent else json.loads(json.dumps(document, default=_plain))
+    if _size(document) <= MAX_VALUES:
+        return json.dumps(document, ensure_ascii=False)
+    is_table = isinstance(document, dict)
+    names = [f"{json.dumps(name)}: " if is_table else "" for name in document]
+    members = document.values() if is_table else document
+    lines = [f"{indent} {name}{json_text(part, indent + ' ')}" for name, part in zip(names, members, strict=True)]
+    begin, end = "{}" if is_table else "[]"
+    return f"{begin}\n" + ",\n".join(lines) + f"\n{indent}{end}"
+
+
+def _size(document: Any) -> int:
+    members = document.values() if isinstance(document, dict) else document
+    return sum(map(_size, members)) if isinstance(document, dict | list) else 1
 
 
 def page_text(page: str) -> str:
@@ -161,11 +166,14 @@ def figure_text(figure: Figure) -> str:
             style = f"{to_hex(colour)} {line.get_linestyle()} {line.get_marker()}"
             lines.append(f"  line {line.get_label()!r} {style}: {_summary(xy)}")
         for collection in axes.collections:
-            data = collection.get_offsets() if np.size(collection.get_offsets()) > 2 else _vertices(collection)
+            data = collection.get_offsets()
+            if np.size(data) <= 2:
+                data = np.concatenate([np.empty((0, 2)), *(path.vertices for path in collection.get_paths())])
             values = collection.get_array()
             shown = "" if values is None else f", {collection.get_cmap().name} {_numbers(collection.get_clim())}: "
             shown += "" if values is None else _summary(np.asarray(values, dtype=float).reshape(-1, 1))
-            faces = _colours(collection.get_facecolor()) if values is None else []
+            shades: Any = collection.get_facecolor() if values is None else []
+            faces = sorted({to_hex(shade) for shade in shades})
             kind = type(collection).__name__
             lines.append(f"  {kind} {collection.get_label()!r} {' '.join(faces)}: {_summary(data)}{shown}")
         for image in axes.images:
@@ -173,17 +181,14 @@ def figure_text(figure: Figure) -> str:
             extent = f"{_numbers(image.get_extent())} {image.get_cmap().name} {_numbers(image.get_clim())}"
             lines.append(f"  image {values.shape} {extent}: {_summary(values.reshape(-1, 1))}")
         for patch in axes.patches:
-            lines.append(f"  {type(patch).__name__} {to_hex(patch.get_facecolor())}: {_summary(_path_of(patch))}")
+            corners = patch.get_patch_transform().transform_path(patch.get_path()).vertices
+            lines.append(f"  {type(patch).__name__} {to_hex(patch.get_facecolor())}: {_summary(corners)}")
         for text in axes.texts:
             place = text.xy if isinstance(text, Annotation) else text.get_position()
             lines.append(f"  text {text.get_text()!r} at {_numbers(place)}")
         if legend := axes.get_legend():
             lines.append(f"  legend {[text.get_text() for text in legend.get_texts()]}")
     return "\n".join(lines)
-
-
-def _colours(colours: Any) -> list[str]:
-    return sorted({to_hex(colour) for colour in colours})
 
 
 def _legend_text(legend: Any) -> list[str]:
@@ -195,15 +200,6 @@ def _legend_text(legend: Any) -> list[str]:
             colour = sign.get_edgecolor()
         entries.append(f"{text.get_text()} {to_hex(colour)}")
     return entries
-
-
-def _vertices(collection: Any) -> Any:
-    paths = [path.vertices for path in collection.get_paths()]
-    return np.concatenate(paths) if paths else np.empty((0, 2))
-
-
-def _path_of(patch: Any) -> Any:
-    return patch.get_patch_transform().transform_path(patch.get_path()).vertices
 
 
 def _summary(data: Any) -> str:

@@ -45,7 +45,6 @@ def use_design() -> None:
 
 
 def use_other_stages() -> None:
-    """Call filters, a calibration and a twin."""
     from padforge import design, sense
     from padforge.design.twin import PlanTransform
     from padforge.sense.twin.as_built import AsBuiltPad, PadPlan

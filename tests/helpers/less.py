@@ -1,5 +1,3 @@
-"""Less of what takes most of the time of a command, where nobody looks at it."""
-
 import pytest
 
 

@@ -1,5 +1,3 @@
-"""Where the ranges of settings end."""
-
 from collections.abc import Iterable
 from typing import Any
 

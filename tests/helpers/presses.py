@@ -1,5 +1,3 @@
-"""Presses to train on, made of arrays."""
-
 import numpy as np
 
 from padforge.sense.localizer.moments import LATEST_WINDOWS, PRESS_WINDOWS

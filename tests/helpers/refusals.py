@@ -1,5 +1,3 @@
-"""What is refused, and in which words, as a table."""
-
 from collections.abc import Callable, Mapping
 
 from padforge.common.validation import InputError
@@ -19,3 +17,8 @@ def refusal_table(rows: Mapping[str, Callable[[], object]]) -> str:
             assert "\n" not in said, name
         lines.append(f"{name}:\n    {said}")
     return "\n".join(lines)
+
+
+def require_one_line(error: InputError) -> None:
+    assert "\n" not in str(error)
+    assert len(str(error)) < 5000

@@ -8,7 +8,6 @@ from padforge.sense.settings import IDEAL_RIG, RigSettings
 
 
 def ideal_rig(**values: Any) -> RigSettings:
-    """Return settings of a pad laid as planned, with some of them changed."""
     return RigSettings(**IDEAL_RIG.model_dump() | values)
 
 

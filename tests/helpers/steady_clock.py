@@ -37,7 +37,6 @@ class SteadyClock:
             return self._now_s
 
     def sleep(self, seconds: float) -> None:
-        """Wait until so much of this time has passed."""
         end_s = self.now() + seconds
         while (remaining_s := end_s - self.now()) > 0:
             time.sleep(min(remaining_s, WAIT_S))

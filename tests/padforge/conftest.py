@@ -1,5 +1,3 @@
-"""A small pad that has been made from end to end."""
-
 import shutil
 from collections.abc import Mapping
 from pathlib import Path
@@ -29,24 +27,21 @@ hidden = 16
 epochs = 4
 max_failures = 1
 """
-
-
-@pytest.fixture(scope="session")
-def pressed() -> dict[str, list[PageSection]]:
-    """Sections on presses that reports have had so far, by what they are made of."""
-    return {}
+SMALLEST = "[pad]\ngrid = 1\n[search]\nknots = 1\nstarts = 1\nsteps = 2\nmax_failures = 1\n[rules]\nenforce = false\n"
+PRESSED: dict[str, list[PageSection]] = {}
+"""Sections on presses that reports have had so far, by what they are made of."""
 
 
 @pytest.fixture(autouse=True)
-def press_drawn_once(monkeypatch: pytest.MonkeyPatch, pressed: dict[str, list[PageSection]]) -> None:
+def press_drawn_once(monkeypatch: pytest.MonkeyPatch) -> None:
     """A report draws a press only if no other has drawn the same: that is most of what it takes."""
 
     def remembered(document: Mapping, *materials: Any) -> list[PageSection]:
         settings = document["provenance"]["settings"]
         key = repr((settings["contact"], settings["pad"], materials))
-        if key not in pressed:
-            pressed[key] = press_sections(document, *materials)
-        return list(pressed[key])
+        if key not in PRESSED:
+            PRESSED[key] = press_sections(document, *materials)
+        return list(PRESSED[key])
 
     monkeypatch.setattr("padforge.design.report.press_sections", remembered)
 

@@ -1,5 +1,3 @@
-"""`padforge design compare`: which pad to make."""
-
 from types import SimpleNamespace
 
 import pytest

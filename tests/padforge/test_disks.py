@@ -1,5 +1,3 @@
-"""Disks that are full: files are whole or not there, without litter."""
-
 import json
 import os
 import resource
@@ -10,36 +8,22 @@ import pytest
 from padforge.common.files import write_json
 from padforge.design.morphology import Morphology
 from tests.helpers.door import called
+from tests.padforge.conftest import SMALLEST
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="limits as POSIX has them")
 
-CHEAP = """
-[pad]
-grid = 2
-[search]
-knots = 1
-starts = 1
-steps = 2
-max_failures = 1
-[rules]
-enforce = false
-[rig]
-presses = 24
-readings_per_press = 8
-"""
-"""Settings with which every command is done in about a second."""
 
-COMMANDS = {
-    "design": ("design", "--out", "pad"),
-    "fabricate": ("fabricate", "made/morphology.json", "--formats", "stl,3mf,svg,png", "--out", "pad"),
-    "record": ("sense", "record", "--out", "pad/recording"),
-}
-"""Commands that write into the folder `pad`, which has the results of an earlier search."""
-
-
-@pytest.mark.parametrize(("name", "limit"), [("design", 2000), ("fabricate", 2000), ("record", 0)])
-def test_full_disk_leaves_whole_files_and_no_temporary_ones(tmp_path: Path, name: str, limit: int):
-    (tmp_path / "pad.toml").write_text(CHEAP)
+@pytest.mark.parametrize(
+    ("command", "limit"),
+    [
+        ("design --out pad", 2000),
+        ("fabricate made/morphology.json --formats stl,3mf,svg,png --out pad", 2000),
+        ("sense record --out pad/recording", 0),
+    ],
+)
+def test_full_disk_leaves_whole_files_and_no_temporary_ones(tmp_path: Path, command: str, limit: int):
+    """Also of an earlier search in the folder that is written into."""
+    (tmp_path / "pad.toml").write_text(f"{SMALLEST}[rig]\npresses = 24\nreadings_per_press = 8\n")
     for folder in ("made", "pad"):
         Morphology.random(2, 1, 3).save(tmp_path / folder / "morphology.json")
     write_json(tmp_path / "pad" / "fabrication.json", {"format": "padforge-fabrication/1"})
@@ -47,7 +31,7 @@ def test_full_disk_leaves_whole_files_and_no_temporary_ones(tmp_path: Path, name
     allowed = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (limit, allowed[1]))
     try:
-        ended = called(*COMMANDS[name], cwd=tmp_path)
+        ended = called(*command.split(), cwd=tmp_path)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, allowed)
     assert (ended.code, ended.err.count("\n")) == (2, 1), ended

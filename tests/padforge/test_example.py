@@ -1,5 +1,3 @@
-"""`padforge example`: a pad and its recording, the same ones at every call."""
-
 from pathlib import Path
 
 import numpy as np

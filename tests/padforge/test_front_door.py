@@ -1,5 +1,3 @@
-"""The front door: what it imports and hands out, the settings it writes, and how it refuses."""
-
 import os
 import subprocess
 import sys
@@ -11,8 +9,7 @@ import pytest
 
 from padforge.common import compilation
 from tests.helpers.door import called, refused
-
-SMALLEST = "[pad]\ngrid = 1\n[search]\nknots = 1\nstarts = 1\nsteps = 1\nmax_failures = 1\n"
+from tests.padforge.conftest import SMALLEST
 
 
 def loaded_by(*codes: str) -> list[set[str]]:

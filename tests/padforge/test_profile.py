@@ -13,22 +13,13 @@ from padforge.design.settings import PUBLISHED_CONTACT, PadSettings, RulesSettin
 from padforge.fabricate import build
 
 
-@pytest.fixture
-def clock(monkeypatch):
-    """Time that goes only when a test says so."""
+def test_stages_of_other_threads_count_for_main_thread(monkeypatch):
     now = [0.0]
     monkeypatch.setattr(profiling.time, "perf_counter", lambda: now[0])
 
-    def passes(seconds):
-        now[0] += seconds
-
-    return passes
-
-
-def test_stages_of_other_threads_count_for_main_thread(clock):
     def work():
         with profiling.stage("aside"):
-            clock(3)
+            now[0] += 3
 
     with profiling.profiled() as profile, profiling.stage("main"):
         thread = threading.Thread(target=work)

@@ -1,5 +1,3 @@
-"""What commands never take away: a pad that others were made from, recordings, files of others, folders half done."""
-
 import json
 import shutil
 from pathlib import Path
@@ -12,8 +10,8 @@ from padforge.sense.recording.run_directory import Recorder
 from tests.helpers.door import called, refused
 from tests.helpers.folders import files_in
 from tests.helpers.less import blank_pictures
+from tests.padforge.conftest import SMALLEST
 
-SMALL = "[pad]\ngrid = 1\n[search]\nknots = 1\nstarts = 1\nsteps = 2\nmax_failures = 1\n[rules]\nenforce = false\n"
 DESIGN = "design --out pad"
 
 
@@ -25,7 +23,7 @@ def made_from(path: Path, **inputs: object) -> None:
 @pytest.fixture(scope="module")
 def designed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("designed")
-    (folder / "pad.toml").write_text(SMALL)
+    (folder / "pad.toml").write_text(SMALLEST)
     assert called(*DESIGN.split(), cwd=folder).code == 0
     Morphology.straight(1).save(folder / "other.json")
     assert called("design", "show", "other.json", "--out", "plan.svg", cwd=folder).code == 0

@@ -1,7 +1,4 @@
-"""The whole chain on a small pad, broken off, gone on with, and in a time that is given to all of it."""
-
 import json
-import math
 import os
 import re
 import signal
@@ -14,7 +11,6 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
-import trimesh
 from safetensors.numpy import load_file
 
 from padforge.common.parallel import Checkpoints
@@ -62,11 +58,6 @@ def test_run_makes_everything(finished: tuple[Path, str]) -> None:
     figures = "design.svg design.png mould.png tracks.png orientation.svg crossing.svg"
     figures += " error_map.png error_by_loss.png error_by_moment.png"
     assert {path.name for path in (out / "figures").iterdir()} == set(figures.split())
-    mesh = trimesh.load_mesh(out / "mould.stl")
-    assert mesh.is_watertight
-    assert mesh.body_count == 1
-    walls = 2 * (2 + 2 + 6 * math.tan(math.radians(2)))  # exits, walls and their lean
-    assert mesh.extents[:2] == pytest.approx([3 * 11.25 + walls] * 2, abs=1e-3)
     assert load_file(out / "localizer.safetensors")
     assert [row["n_failed"] for row in json.loads((out / "calibration.json").read_text())["errors"]] == [0, 1]
     for name in ("design", "fabrication", "calibration", "morphology", "localizer"):
@@ -163,9 +154,7 @@ def test_resume_repeats_stages_of_changed_files(folder: Path, monkeypatch: pytes
 
 
 @pytest.mark.slow
-def test_resume_continues_interrupted_search_and_calibration(
-    finished: tuple[Path, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_resume_continues_interrupted_search_and_calibration(finished, tmp_path, monkeypatch) -> None:
     """And a run broken off twice gives the same files as one that was not."""
     (tmp_path / "pad.toml").write_text(SMALL)
     compare_little(monkeypatch)
@@ -233,9 +222,8 @@ def test_time_budget_covers_all_stages(tmp_path: Path, brief: None, monkeypatch:
     """A search and a training of hours, which end, and what they left is finished."""
     monkeypatch.setattr("padforge.run.RESERVE_S", 1.0)
     monkeypatch.setattr("padforge.sense.localizer.training.MIN_STEPS", 1)
-    (tmp_path / "pad.toml").write_text(
-        SMALL.replace("steps = 10", "steps = 1000000").replace("epochs = 4", "epochs = 9999")
-    )
+    text = SMALL.replace("steps = 10", "steps = 1000000").replace("epochs = 4", "epochs = 9999")
+    (tmp_path / "pad.toml").write_text(text)
     run, given = calibrate_into, []
 
     def noted(*arguments, **more):

@@ -1,11 +1,7 @@
-"""The JSON Schema of pad.toml, which editors read: valid, and as strict as the settings as far as one key goes."""
-
 import json
 import tomllib
-from collections.abc import Iterator
 from pathlib import Path
 from pkgutil import resolve_name
-from typing import Any
 
 import jsonschema
 import pytest
@@ -16,36 +12,22 @@ from padforge.common.validation import InputError
 from padforge.settings import SECTIONS, check_settings, section_models
 from tests.docs.pages import BLOCK, PAGES, relative
 from tests.helpers.door import called
-from tests.helpers.golden import Golden
-from tests.helpers.json_text import json_text
+from tests.helpers.golden import Golden, json_text
 
 MODELS = section_models()
 
 
-def documented() -> Iterator[tuple[str, str]]:
-    """Every settings file on the pages, with the name of its page."""
-    for page in PAGES:
-        for block in BLOCK.finditer(page.read_text(encoding="utf-8")):
-            if block["language"] == "toml":
-                yield relative(page), block["body"]
-
-
 @pytest.fixture(scope="module")
-def schema(tmp_path_factory: pytest.TempPathFactory) -> Any:
+def validator(tmp_path_factory: pytest.TempPathFactory) -> jsonschema.Draft7Validator:
     ended = called("schema", cwd=tmp_path_factory.mktemp("schema"))
     assert (ended.code, ended.err) == (0, "")
-    return json.loads(ended.out)
+    return jsonschema.Draft7Validator(json.loads(ended.out))
 
 
-@pytest.fixture(scope="module")
-def validator(schema: Any) -> jsonschema.Draft7Validator:
-    return jsonschema.Draft7Validator(schema)
-
-
-def test_schema_is_valid(schema: Any, golden: Golden) -> None:
-    jsonschema.Draft7Validator.check_schema(schema)
-    assert "null" not in json.dumps(schema)  # which TOML does not have
-    golden("padforge/schema.json", json_text(schema))
+def test_schema_is_valid(validator: jsonschema.Draft7Validator, golden: Golden) -> None:
+    validator.check_schema(validator.schema)
+    assert "null" not in json.dumps(validator.schema)  # which TOML does not have
+    golden("padforge/schema.json", json_text(validator.schema))
 
 
 def test_written_settings(validator: jsonschema.Draft7Validator, tmp_path: Path, golden: Golden) -> None:
@@ -72,7 +54,8 @@ def test_written_settings(validator: jsonschema.Draft7Validator, tmp_path: Path,
 
 
 def test_documented_settings_validate(validator: jsonschema.Draft7Validator) -> None:
-    tables = [(page, tomllib.loads(text)) for page, text in documented()]
+    blocks = [(relative(page), block) for page in PAGES for block in BLOCK.finditer(page.read_text(encoding="utf-8"))]
+    tables = [(page, tomllib.loads(block["body"])) for page, block in blocks if block["language"] == "toml"]
     settings = [(page, table) for page, table in tables if table.keys() & SECTIONS.keys()]
     pages = {page for page, _ in settings}
     assert pages >= {"docs/tutorial-design.md", "docs/tutorial-sense.md", "docs/howto-boards.md"}
@@ -101,9 +84,7 @@ def test_documented_settings_validate(validator: jsonschema.Draft7Validator) -> 
         ("localizer", "method", "forest", False),
     ],
 )
-def test_schema_judges_a_key_as_the_settings_do(
-    validator: jsonschema.Draft7Validator, section: str, key: str, value: Any, is_valid: bool
-) -> None:
+def test_schema_judges_a_key_as_the_settings_do(validator, section, key, value, is_valid) -> None:
     assert validator.is_valid({section: {key: value}}) == is_valid
     spec = Spec({section: {key: value}})
     if is_valid:

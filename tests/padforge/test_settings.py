@@ -1,5 +1,3 @@
-"""Sections of settings that contradict each other: refused before any work, or followed by what they leave open."""
-
 from pathlib import Path
 
 import pytest

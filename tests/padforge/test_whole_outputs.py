@@ -1,32 +1,23 @@
-"""What padforge says of itself, and what it prints and writes for two finished pads, kept whole."""
-
 import json
-from collections.abc import Iterator
 from pathlib import Path
 
-import click
 import pytest
 
 from padforge.cli import cli
 from padforge.common import profiling
 from padforge.design import Contact, Morphology
 from padforge.design.contact import contact_press, fibre_strains, half_width_mm
+from tests.docs.test_commands import every
 from tests.helpers.door import called
 from tests.helpers.golden import json_text
-
-
-def command_names(command: click.Command) -> Iterator[tuple[str, ...]]:
-    """The words of a command, if it is a group, and of all below it."""
-    yield ()
-    for word, below in getattr(command, "commands", {}).items():
-        yield from ((word, *words) for words in command_names(below))
 
 
 @pytest.mark.parametrize("word", cli.commands)
 def test_helps(word: str, tmp_path: Path, golden, monkeypatch: pytest.MonkeyPatch) -> None:
     """Click keeps the names of a help option as they are when it is first asked for, so they are left out."""
     monkeypatch.setenv("COLUMNS", "100")
-    texts = [called(word, *words, "--help", cwd=tmp_path).out for words in command_names(cli.commands[word])]
+    names = (name for name, _ in every(cli.commands[word], word))
+    texts = [called(*name.split(), "--help", cwd=tmp_path).out for name in names]
     golden(f"padforge/help/{word}.txt", "\n\n".join(texts), forget=[r"(?:-h, )?--help +(?=Show)"])
 
 

@@ -17,15 +17,13 @@ from click.testing import CliRunner
 
 from padforge.design import Morphology
 from padforge.design.cli import design
-from tests.helpers.chromium import CHROMIUM, Chromium
+from tests.helpers.chromium import Chromium
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="Ctrl-C is a signal here")
 PATIENCE_S = 120  # kernels may have to be compiled first
 
 
 class Program:
-    """The command at work."""
-
     def __init__(self, folder: Path) -> None:
         command = [sys.executable, "-m", "padforge", "design", "edit", "--port", "0", "pad.json"]
         self.process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, cwd=folder)
@@ -39,7 +37,6 @@ class Program:
         assert connection.getresponse().status == 200
 
     def end(self) -> None:
-        """Press Ctrl-C."""
         self.process.send_signal(signal.SIGINT)
         _, said = self.process.communicate(timeout=PATIENCE_S)
         assert (self.process.returncode, "Traceback" in said) == (130, False)
@@ -47,7 +44,6 @@ class Program:
 
 @pytest.fixture
 def program(tmp_path: Path) -> Iterator[Program]:
-    """The command, which is gone afterwards."""
     Morphology.random(2, 3, 7, 10.0).save(tmp_path / "pad.json")
     program = Program(tmp_path)
     try:
@@ -63,8 +59,6 @@ TEXT = "document.getElementById('{}').innerText"
 
 @pytest.fixture
 def browser(program: Program, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Chromium]:
-    if CHROMIUM is None:
-        pytest.skip("no Chromium is installed")
     with Chromium(tmp_path_factory.mktemp("profile"), "--disable-gpu") as browser:
         browser.open(program.url, 1100, 900)
         browser.wait_for("document.getElementById('link').textContent == 'ready'", PATIENCE_S)
@@ -149,8 +143,7 @@ def test_page_follows_mouse_keys_and_other_pages(program: Program, browser: Chro
     browser.wait_for("view && view.fibres[0].knots[1][1] == 3.25", PATIENCE_S)
     assert browser.ask("document.scrollingElement.scrollWidth <= innerWidth") is True
     assert browser.complaints == []
-    assert {address for address in browser.requests if not address.startswith("data:")} <= {
-        program.url + path for path in ("", "events", "edit", "save")
-    }
+    asked = {address for address in browser.requests if not address.startswith("data:")}
+    assert asked <= {program.url + path for path in ("", "events", "edit", "save")}
     program.end()
     browser.wait_for("document.getElementById('link').textContent == 'ended in the terminal'")

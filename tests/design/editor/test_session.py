@@ -82,7 +82,6 @@ def test_save_does_not_replace_what_another_program_wrote_since(tmp_path):
 
 
 def test_save_does_not_replace_pad_with_mould(tmp_path):
-    """One that was saved before, and one that lies there from the beginning."""
     editor, _ = session(tmp_path, Morphology.straight(2))
     editor.save(b"{}")
     made = {"provenance": {"inputs": {"out.json": sha256(tmp_path / "out.json")}}}

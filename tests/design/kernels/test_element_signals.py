@@ -1,5 +1,6 @@
 """Signals of a measured profile and of a pressed layer against dense quadrature, to the precision that is asked for."""
 
+from functools import partial
 from itertools import pairwise
 
 import numpy as np
@@ -11,7 +12,7 @@ from padforge.design import Contact, Morphology, signals, signals_quantized
 from padforge.design.contact import fibre_axes, profile_weights
 from padforge.design.kernels.element_signals import LAYER_PRECISION, PROFILE_PRECISION
 from padforge.design.kernels.geometry import DEGREE
-from padforge.design.settings import DEFAULT_PITCH_MM
+from padforge.design.settings import DEFAULT_PITCH_MM, PUBLISHED_CONTACT
 from padforge.design.signal_gradients import FibreCurves
 from tests.design.wild_pads import Length
 
@@ -67,14 +68,16 @@ def test_signals_are_precise_where_a_bend_may_be_missed(contact, seed, press, fi
     assert signals(pad, [at], contact)[0, fibre] == pytest.approx(expected, rel=1e-3)
 
 
-@pytest.mark.parametrize("contact", [PROFILES["broad"], Contact()], ids=["profile", "layer"])
-def test_signals_of_elements_agree_in_every_form(contact):
-    """One press by one, of several pads, and of presses at once."""
+@pytest.mark.parametrize("function", [signals, signals_quantized])
+@pytest.mark.parametrize("contact", [PROFILES["broad"], Contact(), PUBLISHED_CONTACT], ids=lambda c: c.model)
+def test_signals_agree_in_every_form(contact, function):
+    """One press by one, of several pads, of presses at once, and of more than a thread takes."""
     pads = [Morphology.random(2, 3, seed=seed) for seed in (1, 2)]
-    presses = np.random.default_rng(0).uniform(0, 3, (2200, 2))
-    found = signals(np.array([pad.knots for pad in pads]), presses, contact)
-    np.testing.assert_array_equal(signals(pads[1], presses[[7]], contact), found[1, [7]])
-    together = signals(pads[0], presses.reshape(1100, 2, 2), contact)
+    presses = np.random.default_rng(0).uniform(0, 3, (4000, 2))
+    found = function(np.array([pad.knots for pad in pads]), presses, contact)
+    for part in (slice(7, 8), slice(1995, 2005)):
+        np.testing.assert_array_equal(function(pads[1], presses[part], contact), found[1, part])
+    together = function(pads[0], presses.reshape(2000, 2, 2), contact)
     np.testing.assert_allclose(together, found[0, ::2] + found[0, 1::2], rtol=1e-12, atol=1e-12)
 
 
@@ -104,6 +107,7 @@ def dense_oracle(pad, press, contact, fibre):
     """
     axis = pad.layout.family(fibre)
     distance, *weights = profile_weights(contact)[axis if contact.model == "layer" else 0]
+    spline = partial(CubicSpline, bc_type=((2, 0), (1, 0)))  # pyright: ignore[reportArgumentType]
     interpolate = panel_polynomials if contact.model == "layer" else spline
     plain, directed = (interpolate(distance**2, values) for values in weights)
     knots, centre = pad.unit_mm * pad.knots[fibre], pad.unit_mm * np.asarray(press)
@@ -125,21 +129,13 @@ def dense_oracle(pad, press, contact, fibre):
     return total / pad.unit_mm
 
 
-def spline(squares, values):
-    """The cubic spline through a measured profile."""
-    return CubicSpline(squares, values, bc_type=((2, 0), (1, 0)))  # pyright: ignore[reportArgumentType]
-
-
 def panel_polynomials(squares, values):
     """The function of a squared distance that is a polynomial between every eighth of them."""
-    begins = squares[:-1:DEGREE]
-    panels = [
-        Polynomial.fit(squares[i : i + DEGREE + 1], values[i : i + DEGREE + 1], DEGREE)
-        for i in range(0, len(squares) - 1, DEGREE)
-    ]
+    parts = [slice(i, i + DEGREE + 1) for i in range(0, len(squares) - 1, DEGREE)]
+    panels = [Polynomial.fit(squares[part], values[part], DEGREE) for part in parts]
 
     def evaluate(square):
-        panel = np.searchsorted(begins, square, side="right") - 1
+        panel = np.searchsorted(squares[:-1:DEGREE], square, side="right") - 1
         return np.piecewise(square, [panel == index for index in range(len(panels))], panels)
 
     return evaluate

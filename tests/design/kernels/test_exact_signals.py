@@ -51,7 +51,6 @@ def test_exact_signals_equal_the_oracle(weight, length, sides):
 
 @pytest.mark.parametrize("offset", [0.0, 0.3])
 def test_weighted_signals_of_a_straight_fibre_have_closed_forms(offset):
-    """Through a disc, beside its centre."""
     radius, half = 0.7, np.sqrt(0.7**2 - offset**2)
     root = np.sqrt(radius + offset**2)
     near = np.sqrt(max((radius / 100) ** 2 - offset**2, 0))  # where the weight is that of a hundredth of the radius
@@ -111,14 +110,6 @@ def test_signals_do_not_depend_on_batching(kind, grid, count, population, contac
 def test_signals_at_corners_and_along_edges(sides, press, fibre, expected):
     found = signals(Morphology.straight(2), [press], Contact(radius=0.6, sides=sides))[0, fibre]
     assert found == pytest.approx(expected, abs=1e-6)
-
-
-def test_signals_of_many_presses_are_those_of_each():
-    """More than a thread takes at once."""
-    pad, presses = Morphology.random(4, 5, seed=2), np.random.default_rng(2).uniform(0.5, 4.5, (4000, 2))
-    whole = signals(pad, presses, PUBLISHED_CONTACT)
-    for part in (slice(10), slice(1995, 2005)):
-        np.testing.assert_array_equal(whole[part], signals(pad, presses[part], PUBLISHED_CONTACT))
 
 
 def test_signals_of_no_presses_and_of_ones_far_away():

@@ -1,5 +1,3 @@
-"""The leave-one-out error against its closed form in double precision, which torch differentiates."""
-
 import numpy as np
 import pytest
 import torch

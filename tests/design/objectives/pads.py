@@ -1,5 +1,3 @@
-"""Pads that several tests of rules and penalties look at."""
-
 import numpy as np
 
 from padforge.design import Morphology

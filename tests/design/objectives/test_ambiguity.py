@@ -1,5 +1,3 @@
-"""Localisation ambiguity against closed forms, the losses it is a mean over, and its map by position."""
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -30,11 +28,6 @@ def test_ambiguities_of_presses_are_those_of_the_formula(seed, fibres, noise):
     assert pytest.approx(plain_ambiguities(signals, presses, masks, noise), abs=1e-7) == values.T
 
 
-def test_failure_shares_are_equal_or_as_weighted():
-    assert failure_shares(3) == (1 / 4,) * 4
-    assert failure_shares((1.0, 0.0, 3.0)) == (0.25, 0.0, 0.75)
-
-
 @settings(max_examples=20)
 @given(st.integers(0, 4) | st.lists(st.sampled_from([0.0, 1.0, 3.0]), min_size=1, max_size=5).filter(sum).map(tuple))
 def test_sample_failures_draws_one_set_of_each_possible_size(lost):
@@ -46,7 +39,9 @@ def test_sample_failures_draws_one_set_of_each_possible_size(lost):
     assert masks.sum(axis=1).min() == 1  # a pad is never left without a fibre
 
 
-def test_failure_subsets_are_all_or_a_sample():
+def test_failures_are_shared_equally_or_as_weighted_and_subsets_are_all_or_a_sample():
+    assert failure_shares(3) == (1 / 4,) * 4
+    assert failure_shares((1.0, 0.0, 3.0)) == (0.25, 0.0, 0.75)
     pairs = [(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)]
     assert failure_subsets(4, 2) == failure_subsets(4, 2, max_subsets=6) == pairs
     assert failure_subsets(3, 0) == [()]
@@ -57,14 +52,9 @@ def test_failure_subsets_are_all_or_a_sample():
     assert {fibre for loss in drawn for fibre in loss} == set(range(8))
 
 
-@pytest.mark.parametrize(
-    ("pad", "contact"),
-    [
-        (Morphology.random((2, 5), 3, 2, (8.0, 13.0)), PUBLISHED_CONTACT),
-        (Morphology.random((2, 5), 3, 2, (8.0, 5.0)), Contact()),
-    ],
-)
-def test_ambiguity_map_has_the_ambiguity_as_mean(pad, contact):
+@pytest.mark.parametrize(("pitch_y_mm", "contact"), [(13.0, PUBLISHED_CONTACT), (5.0, Contact())])
+def test_ambiguity_map_has_the_ambiguity_as_mean(pitch_y_mm, contact):
+    pad = Morphology.random((2, 5), 3, 2, (8.0, pitch_y_mm))
     size = PadSettings().for_layout(pad.layout)
     means = ambiguity_map(pad, free_presses(size), contact, 3, 0.05).mean(axis=1)
     # the map's signals are those of a search

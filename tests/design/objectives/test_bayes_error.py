@@ -1,5 +1,3 @@
-"""The expected error by Bayes' rule against closed forms and posteriors by explicit covariances."""
-
 import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
@@ -7,12 +5,7 @@ from scipy.stats import multivariate_normal
 from padforge.design import Contact, Morphology, PadSettings, SearchSettings
 from padforge.design.contact import relative_stretch
 from padforge.design.objectives import bayes_error as module
-from padforge.design.objectives.bayes_error import (
-    Positions,
-    bayes_positions,
-    expected_errors,
-    possible_positions,
-)
+from padforge.design.objectives.bayes_error import Positions, bayes_positions, expected_errors, possible_positions
 from padforge.design.objectives.criterion import evaluation_windows, straight_full_scale
 from padforge.design.settings import PUBLISHED_CONTACT, Scatter
 from tests.design.objectives.pads import square
@@ -37,7 +30,7 @@ def test_posteriors_match_explicit_covariances(monkeypatch):
     assert found == pytest.approx(expected, abs=1e-3)
 
 
-def test_positions_cover_the_pressed_area_once_and_no_keep_out():
+def test_positions_cover_the_pressed_area_once_and_no_keep_out_and_are_a_sample_of_huge_ones():
     size = PadSettings(grid=9, keep_out_mm=(square(-20.0, -20.0, 40.0),))
     pad, window = Morphology.straight(size.layout), evaluation_windows(size.sensed)[-1]
     possible = possible_positions(pad, PUBLISHED_CONTACT, size, window, 1.0)
@@ -46,9 +39,6 @@ def test_positions_cover_the_pressed_area_once_and_no_keep_out():
     assert not (abs(pad.to_mm(possible.centres) + 20) < 20).all(axis=1).any()
     near = ((possible.centres > window[0]) & (possible.centres < window[1])).all(axis=1)
     assert np.ptp(possible.log_prior[near]) == pytest.approx(0)
-
-
-def test_huge_pads_are_sampled():
     size = PadSettings(grid=96)
     pad = Morphology.straight(size.layout)
     possible = possible_positions(pad, PUBLISHED_CONTACT, size, evaluation_windows(size.sensed)[0], 1.0)
@@ -60,9 +50,8 @@ def test_expected_errors_are_those_of_other_presses_located_by_explicit_covarian
     """And a share more, for learning: of presses and readings that are drawn otherwise, on a grid of its own."""
     monkeypatch.setattr(module, "PRESSES", 3000)
     size, pad = PadSettings(grid=1), Morphology.random(1, 3, seed=1)
-    search = SearchSettings(
-        max_failures=(1.0,), noise=scatter.floor, scatter=scatter.share, scatter_common=scatter.common
-    )
+    scattered = {"noise": scatter.floor, "scatter": scatter.share, "scatter_common": scatter.common}
+    search = SearchSettings(max_failures=(1.0,), **scattered)
     contact = Contact(model="profile")  # whose full scale is that of the pad's straight fibres
     scale = straight_full_scale(size.layout, contact, size.sensed_mm)
     low, high = np.array(size.sensed)

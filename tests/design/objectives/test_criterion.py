@@ -5,20 +5,7 @@ import pytest
 
 from padforge.design.morphology import Morphology
 from padforge.design.objectives import criterion as module
-from padforge.design.objectives.criterion import (
-    BOUND_WEIGHT,
-    POWER,
-    REGRESSION_WEIGHT,
-    RIDGE,
-    WIDTH,
-    confusable,
-    criterion,
-    evaluation_windows,
-    place_window,
-    relative_error,
-    straight_full_scale,
-    window_presses,
-)
+from padforge.design.objectives.criterion import criterion, evaluation_windows, relative_error, window_presses
 from padforge.design.settings import Contact, PadSettings, Scatter
 from tests.design.objectives.pads import square
 
@@ -44,26 +31,27 @@ def random_responses(fibres=3):
 def leave_one_out_error(signals: np.ndarray, rows=None) -> float:
     """Mean error of regressions that each lack one press, of those in some rows, or of all."""
     rows = np.arange(SIDE**2) if rows is None else rows
-    scaled, places = signals.T / WIDTH, PLACES - PLACES.mean(axis=0)
+    scaled, places = signals.T / module.WIDTH, PLACES - PLACES.mean(axis=0)
     kernel = np.exp(-((scaled[:, None] - scaled[None]) ** 2).sum(axis=-1) / 2)
     distances = []
     for left_out in rows:
         others = rows[rows != left_out]
-        coefficients = np.linalg.solve(kernel[np.ix_(others, others)] + RIDGE * np.eye(len(others)), places[others])
+        matrix = kernel[np.ix_(others, others)] + module.RIDGE * np.eye(len(others))
+        coefficients = np.linalg.solve(matrix, places[others])
         distances.append(np.linalg.norm(kernel[left_out, others] @ coefficients - places[left_out]))
     return float(np.mean(distances))
 
 
 def bound(signals: np.ndarray, scatter: Scatter) -> float:
     """What noise adds, with all fibres, by which the expected error is above that of learning."""
-    return (error(signals, scatter) - REGRESSION_WEIGHT * leave_one_out_error(signals)) / BOUND_WEIGHT
+    return (error(signals, scatter) - module.REGRESSION_WEIGHT * leave_one_out_error(signals)) / module.BOUND_WEIGHT
 
 
 @pytest.mark.parametrize("size", [PadSettings(grid=16), PadSettings(horizontals=3, verticals=12)])
 def test_evaluation_windows_tile_the_pressed_area(size):
     low, high = np.array(size.sensed)
     windows = [np.array(window) for window in evaluation_windows(size.sensed)]
-    for window in (*windows, np.array(place_window(size.sensed, np.array([0.0, 0.9])))):
+    for window in (*windows, np.array(module.place_window(size.sensed, np.array([0.0, 0.9])))):
         assert (window[0] >= low - 1e-9).all()
         assert (window[1] <= high + 1e-9).all()
         assert np.ptp(window, axis=0).max() <= module.WINDOW + 1e-9
@@ -80,7 +68,7 @@ def test_expected_error_ignores_presses_in_keep_outs():
     scattered = [errors(each, kept, Scatter(0.02), presses.free) for each in (answers, changed)]
     assert scattered[0] == pytest.approx(scattered[1])
     rows = np.flatnonzero(presses.free)
-    expected = REGRESSION_WEIGHT * leave_one_out_error(answers, rows)
+    expected = module.REGRESSION_WEIGHT * leave_one_out_error(answers, rows)
     assert errors(answers, kept, SILENT, presses.free)[0] == pytest.approx(expected, rel=1e-5)
 
 
@@ -89,8 +77,8 @@ def test_relative_error_is_a_power_mean_of_shares_of_straight_fibres():
     assert relative_error(0.7 * straight, straight, shares)[0] == pytest.approx(0.7)
     errors = straight * [[0.6, 0.7], [1.0, 0.5]]
     value, gradient = relative_error(errors, straight, shares)
-    of_powers = np.array([0.6, 0.7, 1.0, 0.5]) ** POWER @ [1 / 3, 1 / 6, 1 / 3, 1 / 6]
-    assert value == pytest.approx(of_powers ** (1 / POWER))
+    of_powers = np.array([0.6, 0.7, 1.0, 0.5]) ** module.POWER @ [1 / 3, 1 / 6, 1 / 3, 1 / 6]
+    assert value == pytest.approx(of_powers ** (1 / module.POWER))
     step = 1e-6 * np.random.default_rng(0).standard_normal(errors.shape)
     ahead, behind = (relative_error(errors + sign * step, straight, shares)[0] for sign in (1, -1))
     assert (ahead - behind) / 2 == pytest.approx((gradient * step).sum(), rel=1e-5)
@@ -102,9 +90,8 @@ def test_expected_error_without_signals_is_that_of_the_prior():
     silent = np.zeros((2, SIDE**2))
     assert bound(silent, Scatter(0.1)) == pytest.approx(np.sqrt(2 * 16 / 12))
     # about the mean distance of a place of a square of side 4 from its middle, 0.3826 sides
-    assert error(silent) - BOUND_WEIGHT * np.sqrt(2 * 16 / 12) == pytest.approx(
-        REGRESSION_WEIGHT * 4 * 0.3826, rel=0.03
-    )
+    regression = error(silent) - module.BOUND_WEIGHT * np.sqrt(2 * 16 / 12)
+    assert regression == pytest.approx(module.REGRESSION_WEIGHT * 4 * 0.3826, rel=0.03)
 
 
 @pytest.mark.parametrize("scatter", [SILENT, Scatter(0.05, 0.18, 0.36)])
@@ -132,20 +119,18 @@ def test_confusable_matches_all_differences():
     near, far = rng.uniform(0, 1, (6, 20)), 0.4 * rng.uniform(0, 1, (6, 200))
     near[4:] = 0.0
     masks = np.array([[1.0, 1, 1, 1, 1, 1], [1, 0, 1, 1, 0, 1]])
-    distances = [
-        np.sqrt((m[:, None, None] * (far[:, :, None] - near[:, None]) ** 2).sum(axis=0)).min(axis=1) for m in masks
-    ]
-    least = np.min(distances, axis=0) / WIDTH
+    squares = (far[:, :, None] - near[:, None]) ** 2
+    distances = [np.sqrt(np.tensordot(mask, squares, axes=1)).min(axis=1) for mask in masks]
+    least = np.min(distances, axis=0) / module.WIDTH
     expected = np.sort(np.argsort(least)[: module.MAX_PARTNERS])
-    found = confusable(near, far, masks).tolist()
+    found = module.confusable(near, far, masks).tolist()
     assert found == [index for index in expected.tolist() if least[index] < module.MAX_PARTNER_DISTANCE]
     assert 0 < len(found) <= module.MAX_PARTNERS
 
 
 def test_window_presses_sample_the_remaining_pad_coarsely():
-    """Without the presses in a keep-out."""
     size = PadSettings(grid=9)
-    window = place_window(size.sensed, 0.6)
+    window = module.place_window(size.sensed, 0.6)
     presses = window_presses(size, window, SIDE, np.random.default_rng(2))
     each = presses.positions.reshape(SIDE, SIDE, 2)
     assert np.diff(each[..., 0], axis=1) == pytest.approx(presses.step[0])
@@ -171,7 +156,7 @@ def test_evaluation_of_a_huge_pad_samples_windows_and_presses():
 
 def test_full_scale_of_straight_fibres_is_by_their_length_alone():
     profile = Contact(model="profile")
-    small, large = (straight_full_scale(PadSettings(grid=n).layout, profile, "beyond") for n in (4, 96))
+    small, large = (module.straight_full_scale(PadSettings(grid=n).layout, profile, "beyond") for n in (4, 96))
     assert large * 97 == pytest.approx(small * 5, rel=0.02)
 
 

@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.interpolate import PchipInterpolator
@@ -15,8 +14,6 @@ from padforge.design.paths.curves import crossings, lengths, refine
 from padforge.design.settings import Layout, PadSettings, RulesSettings
 from padforge.design.signal_gradients import FibreCurves
 from tests.design.objectives.pads import bent, only, swung
-
-pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 def axes(pad):
@@ -74,81 +71,67 @@ def test_penalty_gradients_match_finite_differences(pad, rules, tolerance):
     for seed in range(3):
         step = 1e-7 * np.random.default_rng(seed).standard_normal((2, *across.shape))
         step[:, :, [0, -1]] = 0
-        ahead, behind = (
-            sum(penalties(along + sign * step[0], across + sign * step[1], size, rules).values.values())
-            for sign in (1, -1)
-        )
+        ends = (penalties(along + s * step[0], across + s * step[1], size, rules).values for s in (1, -1))
+        ahead, behind = (sum(values.values()) for values in ends)
         parts = gradient * step
         assert (ahead - behind) / 2 == pytest.approx(parts.sum(), abs=tolerance * np.abs(parts).sum())
 
 
-class Slopes(torch.autograd.Function):
-    """The slopes of PCHIP curves as a torch function."""
-
-    @staticmethod
-    def forward(ctx, along, across):
-        ctx.curves = FibreCurves(along.detach().numpy(), across.detach().numpy(), Layout.create(len(along) // 2))
-        return torch.from_numpy(ctx.curves.slope)
-
-    @staticmethod
-    def backward(ctx, *upstream):
-        by_slope = upstream[0].numpy()[None]
-        gradient = np.concatenate([np.zeros((2, *by_slope.shape[1:])), by_slope])
-        return tuple(torch.from_numpy(ctx.curves.by_knots(gradient)))
-
-
-def turns_and_end_slopes(along, across, rules, bent_radius_mm, unit_mm, all_bends, margin):
-    """Both integrals with what they integrate over held, as torch differentiates them; (F, n) knots of PCHIP curves."""
-    shares = (1 - torch.cos(torch.arange(12, dtype=torch.float64) * np.pi / 12)) / 2
-    slope = Slopes.apply(along, across)
-    h, rise = along.diff(dim=1)[..., None], across.diff(dim=1)[..., None]
-    d0, d1, v0 = slope[:, :-1, None], slope[:, 1:, None], across[:, :-1, None]
+def turns_and_end_slopes(along, across, rules, bent_radius_mm, all_bends, margin):
+    """What both integrals are of, (F, n) and (F, m), and the arc lengths that its samples stand for; grid units."""
+    shares, unit_mm = (1 - np.cos(np.arange(12) * np.pi / 12)) / 2, 11.25
+    slope = FibreCurves(along, across, Layout.create(len(along) // 2)).slope
+    h, rise, v0 = np.diff(along)[..., None], np.diff(across)[..., None], across[:, :-1, None]
+    d0, d1 = slope[:, :-1, None], slope[:, 1:, None]
     c2, c3 = 3 * rise / h - 2 * d0 - d1, d0 + d1 - 2 * rise / h
     columns = (
         along[:, :-1, None] + h * shares,
         v0 + h * shares * (d0 + shares * (c2 + shares * c3)),
         d0 + shares * (2 * c2 + 3 * shares * c3),
     )
-    t, v, rate = (
-        torch.cat([x.flatten(1), last[:, -1:]], dim=1) for x, last in zip(columns, (along, across, slope), strict=True)
-    )
-    pad = torch.nn.functional.pad
-    arc = pad(torch.hypot(t.diff(dim=1), v.diff(dim=1)).cumsum(dim=1), (1, 0))
-    halves = lambda at: pad(at.detach().diff(dim=1) / 2, (1, 0)) + pad(at.detach().diff(dim=1) / 2, (0, 1))  # noqa: E731
-    radius, window, run = (x / unit_mm for x in (rules.min_mean_bend_radius_mm, rules.min_mean_bend_radius_mm / 2, 1.0))
-    run = t[:, -1].mean().detach()
-    beyond = torch.cat([0 * arc[:, :1] - window, 0 * arc[:, :1], arc, arc[:, -1:], arc[:, -1:] + window], dim=1)
-    turned = pad(pad(rate.atan(), (2, 2)).diff(dim=1).abs().cumsum(dim=1), (1, 0))
+    lasts = (along, across, slope)
+    t, v, rate = (np.hstack([x.reshape(len(x), -1), y[:, -1:]]) for x, y in zip(columns, lasts, strict=True))
+    arc = np.pad(np.hypot(np.diff(t), np.diff(v)).cumsum(axis=1), ((0, 0), (1, 0)))
+    window, border = rules.min_mean_bend_radius_mm / 2 / unit_mm, rules.border_mm / unit_mm
+    beyond = np.hstack([0 * arc[:, :1] - window, 0 * arc[:, :1], arc, arc[:, -1:], arc[:, -1:] + window])
+    turned = np.pad(np.abs(np.diff(np.pad(np.arctan(rate), ((0, 0), (2, 2))))).cumsum(axis=1), ((0, 0), (1, 0)))
     beside = rules.min_mean_bend_radius_mm / 2 / bent_radius_mm
     excess = []
     for towards in [1, -1][: 1 + all_bends]:  # windows begin or end at samples
         other = beyond + towards * window
-        after = torch.searchsorted(beyond.detach(), other.detach()).clamp(1, beyond.shape[1] - 1)
-        a0, a1, t0, t1 = (x.gather(1, i) for x in (beyond, turned) for i in (after - 1, after))
-        angle = t0 + ((other - a0) / (a1 - a0)).clamp(0, 1) * (t1 - t0) - turned
+        angle = np.empty_like(other)
+        for row, (at, of, turns) in enumerate(zip(other, beyond, turned, strict=True)):
+            after = np.searchsorted(of, at).clip(1, len(of) - 1)
+            share = ((at - of[after - 1]) / (of[after] - of[after - 1])).clip(0, 1)
+            angle[row] = turns[after - 1] + share * (turns[after] - turns[after - 1]) - turns
         begins_on_pad = (other >= 0) & (other <= arc[:, -1:])
-        around = pad(torch.full_like(arc, beside), (2, 2)) if towards > 0 else beside * begins_on_pad
-        excess.append(torch.relu(torch.sqrt(angle**2 + around**2 + 1e-30) * margin * radius / window - 1))
-    in_zone = (t < rules.border_mm / unit_mm) | (t > t[:, -1:] - rules.border_mm / unit_mm)
-    end_slopes = torch.relu(rate.abs() - 1) * in_zone * halves(arc)
-    turns = torch.stack(excess).mean(dim=0) * halves(beyond)
-    return turns.sum(dim=1).mean() / run, end_slopes.sum(dim=1).mean() / run
+        around = np.pad(np.full_like(arc, beside), ((0, 0), (2, 2))) if towards > 0 else beside * begins_on_pad
+        excess.append(np.maximum(np.hypot(angle, around) * margin * 2 - 1, 0))
+    in_zone = (t < border) | (t > t[:, -1:] - border)
+    halves = [(np.diff(x, prepend=x[:, :1]) + np.diff(x, append=x[:, -1:])) / 2 for x in (beyond, arc)]
+    return (np.mean(excess, axis=0), np.maximum(np.abs(rate) - 1, 0) * in_zone), halves
 
 
 @pytest.mark.parametrize(("bent_radius_mm", "all_bends", "margin"), [(1e6, True, 1.0), (30.0, False, 1.3)])
-def test_turns_and_end_slopes_and_their_gradients_are_those_of_torch(bent_radius_mm, all_bends, margin):
+def test_turns_and_end_slopes_and_their_gradients_are_those_of_plain_numpy(bent_radius_mm, all_bends, margin):
     """With the arc lengths that samples stand for held: their changes are left out of the gradient."""
     pad, rules = Morphology.random(2, 4, seed=5), only(min_mean_bend_radius_mm=9.0, border_mm=12.0)
-    along, across = (torch.tensor(axis, requires_grad=True) for axis in axes(pad))
-    expected = turns_and_end_slopes(along, across, rules, bent_radius_mm, pad.unit_mm, all_bends, margin)
-    torch.stack(expected).sum().backward()
-    size = PadSettings(grid=2, bent_radius_mm=bent_radius_mm)
+    how, size = (rules, bent_radius_mm, all_bends, margin), PadSettings(grid=2, bent_radius_mm=bent_radius_mm)
+    held = turns_and_end_slopes(*axes(pad), *how)[1]
+
+    def integrals(along, across):
+        parts, _ = turns_and_end_slopes(along, across, *how)
+        return [(part * halves).sum(axis=1).mean() / 3 for part, halves in zip(parts, held, strict=True)]
+
     values, *gradient = penalties(*axes(pad), size, rules, margin, all_bends=all_bends)
-    assert values["min_mean_bend_radius_mm"] == pytest.approx(expected[0].item(), rel=1e-9)
-    assert values["end_slopes"] == pytest.approx(expected[1].item(), rel=1e-9)
-    assert along.grad is not None
-    assert across.grad is not None
-    np.testing.assert_allclose(gradient, torch.stack([along.grad, across.grad]).numpy(), atol=1e-9)
+    found = [values[name] for name in ("min_mean_bend_radius_mm", "end_slopes")]
+    assert found == pytest.approx(integrals(*axes(pad)), rel=1e-9)
+    for seed in range(3):
+        step = 1e-6 * np.random.default_rng(seed).standard_normal((2, *axes(pad)[0].shape))
+        step[:, :, [0, -1]] = 0
+        ahead, behind = (sum(integrals(*(axes(pad) + sign * step))) for sign in (1, -1))
+        parts = gradient * step
+        assert (ahead - behind) / 2 == pytest.approx(parts.sum(), abs=1e-5 * np.abs(parts).sum())
 
 
 @pytest.mark.parametrize("margin", [1.0, 1.2])
@@ -166,9 +149,8 @@ def test_penalties_of_plain_pads_have_closed_forms(margin):
     # turning points a PCHIP is half as steep again
     share = 1 - 0.8 / margin * np.sin(np.arctan(0.4 / 3.0)) / 0.4
     expected = COMMON_WEIGHT * share * 1.6 / margin / 11.25 / 8 / 5  # by its share of the length of all fibres
-    assert found(slanting(2.0), only(max_common_track_mm=1.6), margin)["max_common_track_mm"] == pytest.approx(
-        expected, rel=0.05
-    )
+    terms = found(slanting(2.0), only(max_common_track_mm=1.6), margin)
+    assert terms["max_common_track_mm"] == pytest.approx(expected, rel=0.05)
     # all fibres of the grid are 56.25 mm long; one alone counts by its share of the pad
     assert found(straight, only(max_length_mm=45.0), margin)["max_length_mm"] == pytest.approx(1.25 * margin - 1)
     pad = bent(3.0)
@@ -220,7 +202,7 @@ def test_max_crossings_penalty_counts_those_above_the_fewest_that_families_have(
 
 
 @pytest.mark.parametrize("margin", [1.0, 1.5])
-def test_folds_penalty_matches_dense_distances(margin):
+def test_folds_penalty_matches_dense_distances_and_spares_steep_fibres(margin):
     """Against the nearest of many points of SciPy's curve that lie half a turn of a gap away or more."""
     knots = np.array([[0, 1], [0.9, 1], [1.0, 1.9], [1.1, 1.9], [1.2, 1.0], [2, 1.0]])
     straight = np.stack([np.ones(6), np.linspace(0, 2, 6)], axis=-1)
@@ -239,11 +221,7 @@ def test_folds_penalty_matches_dense_distances(margin):
     rules = only(min_gap_mm=4.0)
     assert found(pad, rules, margin)["folds"] == pytest.approx(expected, rel=0.2)
     assert {v.fibres for v in check_rules(pad, rules)} == {(1,)}
-
-
-def test_folds_penalty_spares_steep_fibres_without_folds():
-    """Whose samples lie further apart than the gap."""
-    knots = np.array([[0, 1], [0.5, 1.9], [1.5, 1.9], [2, 1]])
+    knots = np.array([[0, 1], [0.5, 1.9], [1.5, 1.9], [2, 1]])  # whose samples lie further apart than the gap
     pad = Morphology(np.stack([knots, np.stack([np.ones(4), np.linspace(0, 2, 4)], axis=-1)]), 11.25)
     assert found(pad, only(min_gap_mm=0.5))["folds"] == 0
     assert check_rules(pad, only(min_gap_mm=0.5)) == []

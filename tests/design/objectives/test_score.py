@@ -1,5 +1,3 @@
-"""Scores of pads: every term by name, whatever the size of the pad."""
-
 import numpy as np
 import pytest
 
@@ -31,11 +29,8 @@ def test_score_evaluates_the_sensed_area(little_scored):
     assert layer["published_objective"] == published_terms(pad)[0].objective  # a layer has none of its own
 
 
-def test_sharpness_has_a_closed_form():
+def test_sharpness_has_a_closed_form_and_a_gradient():
     assert sharpness(np.array([[0.0, 1.0, 2.0, 3.0], [0.0, 0.0, 1.0, 0.0]])) == pytest.approx((1 + 2) / 4)
-
-
-def test_sharpness_has_a_gradient():
     travel, cross, *_ = fibre_axes(Morphology.random(3, 4, seed=2))
     knots, move = np.array([travel[0], cross[0]]), np.random.default_rng(3).standard_normal((2, 6, 6))
     size = PadSettings(grid=3)
@@ -62,16 +57,12 @@ RULES = [
 ]
 
 
-def wild_pad(kind, seed):
-    rng = np.random.default_rng(seed)
-    count = 0 if kind == "no knots" else int(rng.integers(1, 7))
-    return Morphology(wild_knots(kind, 1 + seed % 2, count, rng), rng.choice([0.1, 11.25, 1000.0]))
-
-
 @pytest.mark.parametrize("kind", [*KINDS, "no knots"])
 def test_score_rules_and_plan_of_wild_pads_are_finite(kind, little_scored):
     seed = [*KINDS, "no knots"].index(kind)
-    pad, contact, rules = wild_pad(kind, seed), CONTACTS[seed % 4], RULES[seed % 3]
+    rng, contact, rules = np.random.default_rng(seed), CONTACTS[seed % 4], RULES[seed % 3]
+    count = 0 if kind == "no knots" else int(rng.integers(1, 7))
+    pad = Morphology(wild_knots(kind, 1 + seed % 2, count, rng), rng.choice([0.1, 11.25, 1000.0]))
     terms = score(pad, contact, seed % 9, (1e-9, 0.1, 10.0)[seed % 3], rules)
     assert np.isfinite([*terms.values()]).all()
     assert 0 <= terms["published_entropy"] <= 2 * np.log2(49) + 1e-9

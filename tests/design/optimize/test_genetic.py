@@ -1,5 +1,3 @@
-"""The genetic search: its objective, resuming, its origin, and the published result."""
-
 import numpy as np
 import pytest
 
@@ -12,9 +10,9 @@ PAD, CONTACT = PadSettings(grid=3), PUBLISHED_CONTACT
 SMALL = SearchSettings(method="genetic", knots=3, population=20, generations=30)
 
 
-def bred(generations, search=SMALL, origin=None, state=None, pad=PAD):
+def bred(generations, search=SMALL, origin=None, pad=PAD):
     """A search after so many generations, and its best objective after each."""
-    breeding = GeneticSearch(SearchProblem(pad, (CONTACT,), search, RulesSettings(), origin), state)
+    breeding = GeneticSearch(SearchProblem(pad, (CONTACT,), search, RulesSettings(), origin))
     objectives = []
     for _ in range(generations):
         breeding.advance()

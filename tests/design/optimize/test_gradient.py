@@ -1,5 +1,3 @@
-"""The gradient search: its free variables, initial paths, and steps and repair within the rules."""
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -12,23 +10,10 @@ from padforge.design.morphology import MARGIN
 from padforge.design.objectives.criterion import criterion_errors
 from padforge.design.objectives.penalties import penalties
 from padforge.design.objectives.rules import check_rules
-from padforge.design.optimize.gradient import (
-    FINE_STEPS,
-    REPAIR_STEPS,
-    Adam,
-    GradientSearch,
-    Parametrization,
-    border_width,
-)
+from padforge.design.optimize import gradient
 from padforge.design.optimize.problem import SearchProblem
 from padforge.design.paths.curves import refine
-from padforge.design.settings import (
-    PUBLISHED_CONTACT,
-    PUBLISHED_SEARCH,
-    PadSettings,
-    RulesSettings,
-    SearchSettings,
-)
+from padforge.design.settings import PUBLISHED_CONTACT, PUBLISHED_SEARCH, PadSettings, RulesSettings, SearchSettings
 
 PAD, FREE = PadSettings(grid=2, sensed_mm="fibres"), RulesSettings(enforce=False)
 BRIEF = PUBLISHED_SEARCH.model_copy(update={"starts": 1, "steps": 20, "max_failures": 1, "knots": 6})
@@ -36,7 +21,7 @@ BRIEF = PUBLISHED_SEARCH.model_copy(update={"starts": 1, "steps": 20, "max_failu
 
 def begun(search, rules):
     contacts = tuple(served_contacts(PUBLISHED_CONTACT, search).values())
-    return GradientSearch(SearchProblem(PAD, contacts, search, rules), 0)
+    return gradient.GradientSearch(SearchProblem(PAD, contacts, search, rules), 0)
 
 
 def advance(run, steps):
@@ -46,7 +31,6 @@ def advance(run, steps):
 
 
 def finished(search, rules):
-    """Fibres after all steps and repair."""
     run = begun(search, rules)
     while not run.done:
         run.advance()
@@ -57,21 +41,21 @@ def finished(search, rules):
 @given(st.integers(1, 6), st.integers(0, 99))
 def test_gradients_by_free_variables_match_differences(knots, seed):
     rng, pad = np.random.default_rng(seed), Morphology.random((2, 3), knots, seed, pitch_mm=(8.0, 15.0))
-    fibres = Parametrization.from_knots(pad.knots, pad.layout, 0.02)
+    fibres = gradient.Parametrization.from_knots(pad.knots, pad.layout, 0.02)
     weights = rng.standard_normal((2, 5, knots + 2))
     variables, gradients = (fibres.spans, fibres.across), fibres.gradients(*weights)
-    for variable, gradient in zip(variables, gradients, strict=True):
+    for variable, slope in zip(variables, gradients, strict=True):
         move, values = rng.standard_normal(variable.shape), []
         for step in (1e-5, -2e-5):
             variable += step * move
             values.append((weights * np.array(fibres.axes())).sum())
         variable += 1e-5 * move
-        assert (gradient * move).sum() == pytest.approx((values[0] - values[1]) / 2e-5, rel=1e-5, abs=1e-7)
+        assert (slope * move).sum() == pytest.approx((values[0] - values[1]) / 2e-5, rel=1e-5, abs=1e-7)
 
 
 def test_steps_of_adam_ignore_what_is_no_number():
     variable = np.array([0.3, -1.0, 2.0])
-    Adam([variable]).step((np.array([np.nan, np.inf, -np.inf]),), 0.1)
+    gradient.Adam([variable]).step((np.array([np.nan, np.inf, -np.inf]),), 0.1)
     assert variable.tolist() == [0.3, -1.0, 2.0]
 
 
@@ -100,9 +84,9 @@ def test_common_tracks_count_at_the_end_of_a_search(monkeypatch):
 def test_border_of_knots_is_that_of_the_rules_and_leaves_room_on_the_narrow_side():
     pad = PadSettings(horizontals=2, verticals=5, pitch_mm=(10.0, 8.0))  # 60 by 24 mm
     unit_mm, side_mm = pad.layout.unit_mm, min(pad.layout.size_mm)
-    assert border_width(pad, RulesSettings(border_mm=3.0)) == pytest.approx(3.0 / unit_mm)
-    assert border_width(pad, RulesSettings(border_mm=50.0)) == pytest.approx(0.45 * side_mm / unit_mm)
-    assert border_width(pad, RulesSettings(border_mm=3.0, enforce=False)) == MARGIN
+    assert gradient.border_width(pad, RulesSettings(border_mm=3.0)) == pytest.approx(3.0 / unit_mm)
+    assert gradient.border_width(pad, RulesSettings(border_mm=50.0)) == pytest.approx(0.45 * side_mm / unit_mm)
+    assert gradient.border_width(pad, RulesSettings(border_mm=3.0, enforce=False)) == MARGIN
 
 
 @settings(max_examples=5)
@@ -139,10 +123,10 @@ def test_repair_moves_only_fibres_that_break_rules_and_goes_on_from_its_state():
     knots[0, 3, 1] += 0.35
     search = SearchSettings(knots=5, steps=1, starts=1, contacts="assumed")
     problem = SearchProblem(PAD, (PUBLISHED_CONTACT,), search, rules, Morphology(knots))
-    run = GradientSearch(problem, 0)
+    run = gradient.GradientSearch(problem, 0)
     run.finish()
     advance(run, 7)
-    resumed = GradientSearch(problem, 0, run.state())
+    resumed = gradient.GradientSearch(problem, 0, run.state())
     for each in (run, resumed):
         advance(each, 600)
     assert check_rules(run.morphology(), rules) == []
@@ -155,7 +139,7 @@ def test_repair_moves_only_fibres_that_break_rules_and_goes_on_from_its_state():
 def test_what_fine_steps_do_not_repair_firm_ones_do():
     """Fibres as tangled as after three steps alone."""
     run = begun(SearchSettings(knots=9, steps=3, starts=1, seed=3, contacts="assumed"), RulesSettings())
-    advance(run, 3 + FINE_STEPS)
+    advance(run, 3 + gradient.FINE_STEPS)
     assert check_rules(run.morphology(), RulesSettings()) != []
-    advance(run, REPAIR_STEPS)
+    advance(run, gradient.REPAIR_STEPS)
     assert check_rules(run.morphology(), RulesSettings()) == []

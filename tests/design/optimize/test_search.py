@@ -1,5 +1,3 @@
-"""Both searches through their one face: what they find, judge and refuse, and that they depend on the seed alone."""
-
 import pickle
 import re
 from concurrent.futures import Executor, Future
@@ -18,6 +16,7 @@ from padforge.design.optimize.problem import build_problem
 from padforge.design.optimize.search import SearchOptions, choose, search, search_for_twin
 from padforge.design.paths.curves import refine
 from padforge.design.settings import PUBLISHED_CONTACT, PadSettings, RulesSettings, SearchSettings
+from tests.design.objectives.pads import square
 
 PAD, FREE, RULES = PadSettings(grid=2), RulesSettings(enforce=False), RulesSettings()
 SMALL = SearchSettings(knots=3, starts=2, steps=10, population=10, generations=3, max_failures=1, contacts="assumed")
@@ -52,10 +51,8 @@ def test_search_reports_scores_beside_those_of_straight_fibres():
     pad, contact = PadSettings(grid=2, sensed_mm=(20, 30)), Contact(radius=0.9)
     settings = QUICK.model_copy(update={"noise": 0.03, "steps": 5})
     result = search(pad, contact, settings, FREE)
-    scored, straight = (
-        score(each, contact, 1, 0.05, FREE, pad, settings.response_scatter)
-        for each in (result.morphology, Morphology.straight(2))
-    )
+    how = contact, 1, 0.05, FREE, pad, settings.response_scatter
+    scored, straight = (score(each, *how) for each in (result.morphology, Morphology.straight(2)))
     assert result.terms == scored
     assert result.straight == pytest.approx({name: straight[name] for name in straight if "_mm_" in name}, rel=1e-6)
     assert describe_terms(scored).keys() == scored.keys()
@@ -94,11 +91,8 @@ def test_search_prefers_a_pad_within_the_rules_to_one_that_errs_less(monkeypatch
     assert error_mm < result.terms["expected_error_mm_0"]
 
 
-HOLE = ((-4.0, 2.0), (4.0, 2.0), (4.0, 10.0), (-4.0, 10.0))
-
-
 def test_search_around_a_keep_out_obeys_the_rules():
-    pad = PadSettings(horizontals=2, verticals=2, pitch_mm=(8.0, 15.0), keep_out_mm=(HOLE,))
+    pad = PadSettings(horizontals=2, verticals=2, pitch_mm=(8.0, 15.0), keep_out_mm=(square(0.0, 6.0, 8.0),))
     result = search(pad, None, QUICK.model_copy(update={"knots": 6}), RULES)
     assert result.violations == check_rules(result.morphology, RULES, pad) == []
     assert result.morphology.layout == pad.layout
@@ -137,21 +131,16 @@ def test_search_of_pads_of_one_family(method, counts, monkeypatch):
     assert np.isfinite([*found.terms.values()]).all()
 
 
-PLAIN = {"default": np.array([1.0, 1.0, 1.5, 2.0]), "straight fibres": np.array([0.9, 1.2, 2.0, 3.0])}
-
-
-@pytest.mark.parametrize(
-    ("twin", "expected"),
-    [
+def test_choose_takes_no_pad_that_is_worse_than_plain_ones():
+    """Of pads each of which is worse somewhere it takes the least bad."""
+    plain = {"default": np.array([1.0, 1.0, 1.5, 2.0]), "straight fibres": np.array([0.9, 1.2, 2.0, 3.0])}
+    for twin, expected in (
         ([0.9, 0.9, 1.0, 1.5], "twin"),  # better everywhere
         ([0.92, 1.02, 1.0, 1.0], "twin"),  # within what networks tell
         ([1.02, 0.5, 0.5, 0.5], "default"),  # far better with fibres failed, but an eighth worse with all alive
         ([2.0, 2.0, 2.0, 3.5], "default"),
-    ],
-)
-def test_choose_takes_no_pad_that_is_worse_than_plain_ones(twin, expected):
-    assert choose(PLAIN | {"twin": np.array(twin)}) == expected
-    # of pads each of which is worse somewhere the least bad
+    ):
+        assert choose(plain | {"twin": np.array(twin)}) == expected
     errors = {"default": np.array([2.0, 1.0]), "straight fibres": np.array([1.0, 2.0]), "twin": np.array([1.3, 1.3])}
     assert choose(errors) == "twin"
 
@@ -206,12 +195,9 @@ def test_comparison_of_straight_fibres_is_1(fibres):
 def test_pads_are_compared_by_a_geometric_mean_and_weighted_terms():
     pad, curved = PadSettings(grid=2), Morphology.random(2, 3, seed=1)
     search = SearchSettings(max_failures=(3.0, 1.0))
-    contacts = served_contacts(Contact(), search).values()
-    curved_errors, straight_errors = (
-        np.array([criterion_errors(fibres, contact, search, pad) for contact in contacts])
-        for fibres in (curved, Morphology.straight(2))
-    )
-    log_ratios = np.log(curved_errors / straight_errors) @ [0.75, 0.25]
+    contacts, both = served_contacts(Contact(), search).values(), (curved, Morphology.straight(2))
+    errors = np.array([[criterion_errors(each, contact, search, pad) for contact in contacts] for each in both])
+    log_ratios = np.log(errors[0] / errors[1]) @ [0.75, 0.25]
     comparison = build_problem(pad, Contact(), search, FREE).comparison(curved)
     assert comparison == pytest.approx(np.exp(log_ratios.mean()))
     smooth = build_problem(pad, Contact(), search.model_copy(update={"sharpness": 2.0}), FREE)

@@ -1,5 +1,3 @@
-"""Searches that end before they are done, and that go on where they were broken off, also by process."""
-
 import json
 import os
 import signal
@@ -13,12 +11,12 @@ import numpy as np
 import pytest
 
 from padforge import InputError
-from padforge.cli import cli
 from padforge.common import parallel as computing
 from padforge.common.command_line import run_to_end
 from padforge.common.parallel import Checkpoints
 from padforge.design import PadSettings, RulesSettings, SearchOptions, SearchSettings, design_run, search
 from padforge.design.optimize import search as stopping
+from tests.helpers.door import called, refused
 
 PAD = PadSettings(grid=1)
 SMALL = SearchSettings(knots=3, starts=2, steps=30, population=10, generations=5, max_failures=1, contacts="assumed")
@@ -30,7 +28,7 @@ class KilledError(Exception):
     """Stands for a kill in mid-search."""
 
 
-def test_checkpoints_of_other_searches_are_refused_and_stay_until_cleared(tmp_path):
+def test_checkpoints_of_other_searches_and_files_of_others_are_refused_and_stay(tmp_path):
     folder, quick = tmp_path / "search", SMALL.model_copy(update={"starts": 1, "steps": 2})
     run = SearchOptions(keep_in=folder, resume=True)
     first = search(PAD, None, quick, FREE, run=run)
@@ -39,6 +37,16 @@ def test_checkpoints_of_other_searches_are_refused_and_stay_until_cleared(tmp_pa
         search(PAD, None, quick.model_copy(update={"seed": 5}), FREE, run=run)
     Checkpoints(folder, {}).clear()
     assert not list(tmp_path.iterdir())
+    names = ["search.json", "start_0.npz", "start_0_notes.npz", "other"]
+    for name in names:
+        (tmp_path / name).write_text('{"format": "somebody/1"}')
+    with pytest.raises(InputError, match=r"search\.json: "):
+        Checkpoints(tmp_path, {}).begin(resume=False)
+    assert sorted(path.name for path in tmp_path.iterdir()) == sorted(names)
+    Checkpoints(tmp_path / "own", {}).save(0, {"done": np.array(True)})
+    (tmp_path / "own" / "start_0_notes.npz").write_text("notes")
+    Checkpoints(tmp_path / "own", {}).begin(resume=False)
+    assert [path.name for path in (tmp_path / "own").iterdir()] == ["start_0_notes.npz"]
 
 
 @pytest.mark.parametrize("method", ["descent", "genetic"])
@@ -53,7 +61,6 @@ def test_search_returns_the_best_so_far_on_ctrl_c(method):
 
 @pytest.mark.parametrize("time_budget", [0.3, 1e-6])
 def test_search_within_a_time_budget_returns_the_best_so_far(time_budget):
-    """Also where it ends before the first step."""
     result = search(PAD, None, SMALL.model_copy(update={"steps": 10**6}), run=SearchOptions(time_budget=time_budget))
     assert (result.stopped, result.violations) == ("out of time", [])
     assert result.morphology.knots.shape == (2, 5, 2)
@@ -144,19 +151,6 @@ def test_search_broken_off_anywhere_resumes_as_if_unbroken(method, tmp_path, mon
         assert (result.morphology, result.history) == (unbroken.morphology, unbroken.history)
 
 
-def test_checkpoints_remove_no_files_of_others(tmp_path):
-    names = ["search.json", "start_0.npz", "start_0_notes.npz", "other"]
-    for name in names:
-        (tmp_path / name).write_text('{"format": "somebody/1"}')
-    with pytest.raises(InputError, match=r"search\.json: "):
-        Checkpoints(tmp_path, {}).begin(resume=False)
-    assert sorted(path.name for path in tmp_path.iterdir()) == sorted(names)
-    Checkpoints(tmp_path / "own", {}).save(0, {"done": np.array(True)})
-    (tmp_path / "own" / "start_0_notes.npz").write_text("notes")
-    Checkpoints(tmp_path / "own", {}).begin(resume=False)
-    assert [path.name for path in (tmp_path / "own").iterdir()] == ["start_0_notes.npz"]
-
-
 SETTINGS = """
 [pad]
 grid = 1
@@ -171,17 +165,7 @@ enforce = false
 """
 
 
-def design_here(folder, monkeypatch, *arguments):
-    """The exit code of the command in this process."""
-    (folder / "pad.toml").write_text(SETTINGS)
-    monkeypatch.chdir(folder)
-    monkeypatch.setattr(sys, "argv", ["padforge", "design", "--out", "pad", *arguments])
-    return run_to_end(cli, "padforge", {})
-
-
-def test_interrupted_design_says_so_and_keeps_its_states(tmp_path, monkeypatch, capsys):
-    """It writes the best so far."""
-
+def test_interrupted_design_says_so_and_keeps_its_states(tmp_path, monkeypatch):
     def interrupted(*asked, run, **others):
         def report(*progress):
             signal.raise_signal(signal.SIGINT)
@@ -189,15 +173,17 @@ def test_interrupted_design_says_so_and_keeps_its_states(tmp_path, monkeypatch, 
         return search(*asked, run=replace(run, on_progress=report), **others)
 
     monkeypatch.setattr(design_run, "search", interrupted)
-    assert design_here(tmp_path, monkeypatch) == 130
-    assert "interrupted: the best so far" in capsys.readouterr().out
+    (tmp_path / "pad.toml").write_text(SETTINGS)
+    ended = called("design", "--out", "pad", cwd=tmp_path)
+    assert (ended.code, "interrupted: the best so far" in ended.out) == (130, True)
     assert json.loads((tmp_path / "pad" / "design.json").read_text())["stopped"] == "interrupted"
     assert (tmp_path / "pad" / "search" / "start_0000.npz").exists()
 
 
 @pytest.mark.filterwarnings("ignore")
-def test_absent_scheduler_is_refused_in_one_line(tmp_path, monkeypatch, capsys):
+def test_absent_scheduler_is_refused_in_one_line(tmp_path, monkeypatch):
     pytest.importorskip("distributed")
     monkeypatch.setattr(computing, "SCHEDULER_S", 0.2)
-    assert design_here(tmp_path, monkeypatch, "--scheduler", "tcp://127.0.0.1:9") == 2
-    assert "--scheduler is tcp://127.0.0.1:9: no Dask scheduler answers there" in capsys.readouterr().err
+    (tmp_path / "pad.toml").write_text(SETTINGS)
+    said = refused("design", "--scheduler", "tcp://127.0.0.1:9", cwd=tmp_path)
+    assert "--scheduler is tcp://127.0.0.1:9: no Dask scheduler answers there" in said

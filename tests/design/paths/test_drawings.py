@@ -1,5 +1,3 @@
-"""Drawings as pads: others' are placed and read, and what is none is told in one line."""
-
 import re
 from pathlib import Path
 from typing import Any
@@ -38,7 +36,6 @@ PATHS = paths(*WAYS)
 
 @pytest.fixture(scope="module")
 def plain(tmp_path_factory) -> Morphology:
-    """What the paths are."""
     return import_plan(svg(tmp_path_factory.mktemp("plain"), PATHS), LAYOUT, 0.4).pad
 
 

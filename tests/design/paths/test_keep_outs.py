@@ -1,5 +1,3 @@
-"""Keep-outs and bent pads: exact rules against closed forms, penalties with a true gradient, courses that pass by."""
-
 import numpy as np
 import pytest
 from hypothesis import given, settings

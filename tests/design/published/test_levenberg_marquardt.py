@@ -1,67 +1,50 @@
-"""The published localizer: its derivatives, what it learns, and inputs that break such code."""
-
 import numpy as np
 import pytest
 import torch
 
 from padforge.benchmarks import networks as benchmark
-from padforge.design.published.levenberg_marquardt import (
-    RIDGE,
-    ProjectedFit,
-    activations,
-    append_ones,
-    dual_matrix,
-    gauss_newton_matrix,
-    jacobian_product,
-)
+from padforge.common.parallel import one_thread
+from padforge.design.published import levenberg_marquardt as lm
 from padforge.design.published.networks import fit_batch, initial_weights
 
-pytestmark = pytest.mark.usefixtures("one_thread")
+
+@pytest.fixture(autouse=True)
+def _one_thread():
+    """As in a search: several that wait for a busy machine take many times as long."""
+    with one_thread():
+        yield
 
 
 def rms(difference):
     return float(np.sqrt((difference**2).mean()))
 
 
-def fit(inputs, targets, rng, hidden=50, epochs=1000, validation=None):
-    """One network, by a batch of one."""
-    checked = None if validation is None else (validation[0][None], validation[1])
-    return fit_batch(inputs, targets, [rng], hidden, epochs, checked)[0]
-
-
 def waves(presses):
-    """Three smooth outputs of two inputs."""
     x, y = presses.T
     return np.column_stack([np.sin(2 * x) * y, np.exp(-(x**2) - y**2), 30 + x * y])
-
-
-def network_parts(networks, inputs, hidden, outputs, samples=40, alternatives=1):
-    """Weights, inputs with ones and targets of a batch."""
-    rng = np.random.default_rng(inputs)
-    x = torch.from_numpy(rng.uniform(-1, 1, (networks, samples, inputs)))
-    y = torch.from_numpy(rng.uniform(-1, 1, (networks, alternatives, samples, outputs)))
-    weights = [initial_weights(np.ones(inputs, bool), hidden, rng).T for _ in range(networks)]
-    return torch.from_numpy(np.stack(weights)), append_ones(x), y
 
 
 def jacobians(x, fit):
     """J and R J of one network, every column by automatic differentiation, and the output weights held."""
 
     hidden = fit.hidden[0].clone().requires_grad_()
-    outputs = activations(hidden[None], x[None])[0] @ fit.output[0]
+    outputs = lm.activations(hidden[None], x[None])[0] @ fit.output[0]
     rows = [torch.autograd.grad(each, hidden, retain_graph=True)[0].ravel() for each in outputs.ravel()]
     jacobian = torch.stack(rows).unflatten(0, outputs.shape)
     gram = fit.neurons[0].mT @ fit.neurons[0]
-    gram.diagonal().add_(RIDGE * len(x))
+    gram.diagonal().add_(lm.RIDGE * len(x))
     projection = torch.eye(len(x)) - fit.neurons[0] @ torch.linalg.solve(gram, fit.neurons[0].mT)
     return jacobian.flatten(0, 1), torch.einsum("qr,rkp->qkp", projection, jacobian).flatten(0, 1)
 
 
 @pytest.mark.parametrize(("inputs", "hidden", "outputs"), [(3, 7, 2), (1, 1, 1)])
 def test_primal_and_dual_equations_match_the_jacobian(inputs, hidden, outputs):
-    weights, x, y = network_parts(2, inputs, hidden, outputs)
-    fit = ProjectedFit.solve(weights, x, y[:, 0])
-    slope, primal, dual = jacobian_product(x, fit, fit.error), gauss_newton_matrix(x, fit), dual_matrix(x, fit)
+    rng = np.random.default_rng(inputs)
+    x = lm.append_ones(torch.from_numpy(rng.uniform(-1, 1, (2, 40, inputs))))
+    y = torch.from_numpy(rng.uniform(-1, 1, (2, 40, outputs)))
+    weights = np.stack([initial_weights(np.ones(inputs, bool), hidden, rng).T for _ in range(2)])
+    fit = lm.ProjectedFit.solve(torch.from_numpy(weights), x, y)
+    slope, primal, dual = lm.jacobian_product(x, fit, fit.error), lm.gauss_newton_matrix(x, fit), lm.dual_matrix(x, fit)
     for network in range(2):
         alone = fit.rows(torch.tensor([network]))
         jacobian, projected = jacobians(x[network], alone)
@@ -77,7 +60,7 @@ def test_fit_batch_counts_the_nearest_alternative_target():
     rng = np.random.default_rng(9)
     inputs = rng.uniform(0.1, 1, (400, 1))
     root = np.sqrt(inputs) * rng.choice([-1, 1], (400, 1))
-    told = fit(inputs, root, np.random.default_rng(0), hidden=8)(inputs)
+    told = fit_batch(inputs, root, [np.random.default_rng(0)], hidden=8)[0](inputs)
     free = fit_batch(inputs, root, [np.random.default_rng(0)], hidden=8, alternatives=-root[None])[0](inputs)
     assert rms(np.abs(free) - np.sqrt(inputs)) < 0.1
     assert rms(np.abs(told) - np.sqrt(inputs)) > 0.3
@@ -109,7 +92,7 @@ def test_fit_batch_trains_networks_independently_and_ignores_constant_inputs():
 def test_fit_batch_does_not_overfit_noise():
     rng = np.random.default_rng(2)
     inputs, noise = rng.uniform(-1, 1, (200, 3)), rng.normal(size=(200, 1))
-    network = fit(inputs, noise, rng)
+    [network] = fit_batch(inputs, noise, [rng])
     assert rms(network(rng.uniform(-1, 1, (200, 3)))) < 1
     assert rms(network(inputs) - noise) > 0.7
 

@@ -1,17 +1,10 @@
-"""Evaluation by simulation: the published order of the pads, and fresh test presses."""
-
 from functools import partial
 
 import numpy as np
 import pytest
 
 from padforge.design import Contact, Morphology, signals
-from padforge.design.published.networks import (
-    SimulatedPresses,
-    fit_batch,
-    fresh_presses,
-    training_presses,
-)
+from padforge.design.published.networks import SimulatedPresses, fit_batch, fresh_presses, training_presses
 from padforge.design.settings import PUBLISHED_CONTACT, Layout, between_fibres
 
 

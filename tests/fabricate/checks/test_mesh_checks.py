@@ -1,33 +1,72 @@
 """What the checks find on sound trays and blocks and on ones with a known fault, by the title of each."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import numpy as np
 import shapely
 import trimesh
-from manifold3d import CrossSection, Manifold
+from manifold3d import CrossSection, Manifold, OpType
+from shapely.geometry.base import BaseGeometry
 
 from padforge.design.morphology import Morphology
+from padforge.fabricate.checks import Finding
+from padforge.fabricate.checks.mesh_checks import check_triangles
 from padforge.fabricate.mesh import mesh_arrays, mould_mesh
-from padforge.fabricate.plan import Plan
+from padforge.fabricate.plan import Plan, polygon_rings
 from padforge.fabricate.settings import PrinterSettings
-from tests.fabricate.checks.trays import (
-    CROSS,
-    DEPTH,
-    FLOOR,
-    SIZE,
-    block,
-    check_body,
-    finding_lines,
-    line,
-    prism,
-    ridge,
-    spanning,
-    together,
-    tray,
-)
+
+FLOOR, DEPTH, SIZE = 2.0, 6.0, 20.0
+"""Floor and depth of the trays here, and the width of what they hold, mm."""
+
+
+def line(*points: tuple[float, float], width: float = 0.4) -> BaseGeometry:
+    return shapely.LineString(points).buffer(width / 2, cap_style="flat")
+
+
+def prism(area: BaseGeometry, bottom: float, top: float) -> Manifold:
+    rings = [ring for polygon in polygon_rings(area) for ring in polygon]
+    return Manifold.extrude(CrossSection(rings), top - bottom).translate((0, 0, bottom))
+
+
+def ridge(area: BaseGeometry, height: float = 0.4) -> Manifold:
+    return prism(area, FLOOR - 0.2, FLOOR + height)
+
+
+def tray(*adds: Manifold, draft_deg: float = 2.0, wall: float = 2.0, floor: float = FLOOR) -> Manifold:
+    """A square tray; its walls lean outwards, or inwards for less than 0, and are as thick as said at the rim."""
+    deep = DEPTH + FLOOR - floor
+    flare = 1 + 2 * deep * math.tan(math.radians(draft_deg)) / SIZE
+    outer = SIZE * max(flare, 1.0) + 2 * wall
+    box = Manifold.cube((outer, outer, FLOOR + DEPTH), True).translate((0, 0, (FLOOR + DEPTH) / 2))
+    cavity = Manifold.extrude(CrossSection.square((SIZE, SIZE), True), deep, scale_top=(flare, flare))
+    above = Manifold.cube((SIZE * flare, SIZE * flare, 1), True).translate((0, 0, FLOOR + DEPTH))
+    hollow = Manifold.batch_boolean([cavity.translate((0, 0, floor)), above], OpType.Add)
+    return Manifold.batch_boolean([box - hollow, *adds], OpType.Add)
+
+
+def spanning(y: float, width: float = 0.4) -> BaseGeometry:
+    return line((-SIZE / 2 - 0.5, y), (SIZE / 2 + 0.5, y), width=width)
+
+
+def block(*sizes: float, at: tuple[float, float, float] = (0, 0, 0)) -> trimesh.Trimesh:
+    return trimesh.creation.box(sizes, trimesh.transformations.translation_matrix(at))
+
+
+def finding_lines(findings: Iterable[Finding], passed: bool = False) -> list[str]:
+    """A line for each finding; those that pass only if they are asked for."""
+    lines = []
+    for finding in findings:
+        if passed or finding.status != "pass":
+            values = f"{finding.measured} / {finding.limit}"
+            places = "".join(f" ({x:z.1f}, {y:z.1f})" for x, y in finding.positions_mm[:4])
+            more = f" and {len(finding.positions_mm) - 4} more" if len(finding.positions_mm) > 4 else ""
+            lines.append(f"  {finding.status} {finding.name} {values}: {finding.message};{places}{more}")
+    return lines
+
+
+CROSS = [ridge(spanning(3.0), 1.2), ridge(spanning(-3.0), 1.2), ridge(shapely.affinity.rotate(spanning(1), 90, (0, 0)))]
 
 
 def cube(x: float, y: float, z: float, at: tuple[float, float, float] = (0, 0, 0)) -> Manifold:
@@ -35,7 +74,8 @@ def cube(x: float, y: float, z: float, at: tuple[float, float, float] = (0, 0, 0
 
 
 def meshes(*parts: trimesh.Trimesh) -> trimesh.Trimesh:
-    return trimesh.Trimesh(*together(*parts), process=False)
+    corners = np.concatenate([part.triangles for part in parts]).reshape(-1, 3)
+    return trimesh.Trimesh(corners, np.arange(len(corners)).reshape(-1, 3), process=False)
 
 
 def turned(solid: trimesh.Trimesh) -> trimesh.Trimesh:
@@ -51,13 +91,11 @@ def flipped(solid: trimesh.Trimesh) -> trimesh.Trimesh:
 
 
 def hollows(count: int) -> trimesh.Trimesh:
-    """A long box and hollows in a row within it."""
     inside = [turned(block(0.5, 0.5, 0.5, at=(n - count / 2, 0, 0))) for n in range(count)]
     return meshes(block(120, 2, 2), *inside)
 
 
 def star() -> trimesh.Trimesh:
-    """A prism over a pentagram, one shell that winds twice around its middle."""
     turns, n = 4 * np.pi * np.arange(5) / 5, np.arange(5)
     ring = 5 * np.column_stack([np.cos(turns), np.sin(turns)])
     layers = [np.column_stack([np.vstack([ring, [[0, 0]]]), np.full(6, z)]) for z in (0, 4)]
@@ -84,13 +122,11 @@ def lid() -> Manifold:
 
 
 def crossing(angle_deg: float) -> Manifold:
-    """A tray with two ridges of one height that cross at an angle."""
     both = shapely.union(spanning(0.5), shapely.affinity.rotate(spanning(0.5), angle_deg, (0, 0.5)))
     return tray(ridge(both & shapely.box(-10.5, -10.5, 10.5, 10.5)))
 
 
 def bends() -> Manifold:
-    """A tray with a ridge around a bend, an 8 and a slot in its wall."""
     turns = [(6 * math.cos(t), 6 * math.sin(t)) for t in np.linspace(0, 4, 200)]
     eight = [line((-1, -2), (1, -2), (1, 2), (-1, 2), (-1, -2)), line((-1, 0), (1, 0)), line((-1, 1.9), (-1, 2.2))]
     slot = Manifold.cube((2, 1.5, DEPTH + 1)).translate((-1, SIZE / 2 - 0.5, FLOOR))
@@ -123,7 +159,6 @@ def gable(lean_deg: float) -> Manifold:
 
 
 def head() -> Manifold:
-    """A tray with a ridge that is wider at its top."""
     return tray(*CROSS, ridge(line((2, -6), (7, -6)), 1.2), prism(line((2, -6), (7, -6), width=1.5), 2.8, 3.2))
 
 
@@ -152,12 +187,10 @@ def slot_of_a_foot(low: float, high: float) -> Manifold:
 
 
 def on_a_foot(foot: float) -> Manifold:
-    """A block whose foot is set back by a millimetre."""
     return cube(10, 10, 4, at=(0, 0, 2 + foot)) + cube(8, 8, foot + 0.5, at=(0, 0, (foot + 0.5) / 2))
 
 
 def narrow(layers: float) -> Manifold:
-    """A tray with a ridge of half the width of a line, and as high as so many layers of 0.2 mm."""
     return tray(ridge(spanning(0.0, width=0.2), layers * 0.2))
 
 
@@ -249,7 +282,11 @@ def test_findings_of_meshes(golden):
     lines = []
     for title, case in CASES.items():
         make, options = case if isinstance(case, tuple) else (case, {})
-        printer = PrinterSettings.model_validate(options.get("printer", {}))
-        findings = check_body(make(), **options | {"printer": printer})
-        lines += [title, *finding_lines(findings.values(), passed=title in WITH_PASSED)]
+        printer: Any = PrinterSettings.model_validate(options.get("printer", {}))
+        body = make()
+        if isinstance(body, Manifold):
+            mesh = body.to_mesh()
+            body = trimesh.Trimesh(mesh.vert_properties, mesh.tri_verts, process=False)
+        findings = check_triangles(body.vertices, body.faces, **options | {"printer": printer})
+        lines += [title, *finding_lines(findings, passed=title in WITH_PASSED)]
     golden("fabricate/findings_of_meshes.txt", "\n".join(lines))

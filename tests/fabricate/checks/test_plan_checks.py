@@ -14,7 +14,8 @@ from padforge.fabricate.checks.plan_checks import check, check_plan, compute_ben
 from padforge.fabricate.fibre_placement import check_toolpath, plan_toolpath
 from padforge.fabricate.plan import Plan
 from padforge.fabricate.settings import FabricationSettings
-from tests.fabricate.checks.trays import finding_lines
+from tests.design.objectives.pads import square
+from tests.fabricate.checks.test_mesh_checks import finding_lines
 from tests.fabricate.planted import level_pad, with_settings
 
 STRAIGHT = Morphology.straight(2)
@@ -55,27 +56,20 @@ def bump(family: int, up: int) -> Morphology:
 
 
 def narrow_bump(ratio: float, **mould: object) -> dict[str, Any]:
-    """A track whose half width has this ratio to the radius of the bump."""
     return {"mould": {"tolerance_mm": 1e-3, "exit_width_mm": 2.0, "ridge_width_mm": 2 / 3 * ratio} | mould}
 
 
 def cut_mm(rise: float) -> float:
-    """By how much a corner cuts the inner wall of a track of 0.4 mm."""
     return 0.2 * (1 - np.cos(np.arctan(4 / 3 * rise) / 2))
 
 
 def beside(gap_mm: float) -> Morphology:
-    """Two tracks of 0.4 mm with a gap between them."""
     return level_pad(1.5 - (gap_mm + 0.4) / 20, 1.5 + (gap_mm + 0.4) / 20)
 
 
 def designed_for(**contact: Any) -> Morphology:
     origin = {"settings": {"contact": Contact(**contact).model_dump(mode="json")}}
     return Morphology.from_layout(STRAIGHT.knots, STRAIGHT.layout, origin)
-
-
-def square(half: float, x: float = 0.0, y: float = 0.0) -> list[list[float]]:
-    return [[x - half, y - half], [x + half, y - half], [x + half, y + half], [x - half, y + half]]
 
 
 SHALLOW = one_fibre([0, 0.8, 1.2, 2], [1, 0.5, 1.5, 1], 1, 20.0)
@@ -128,7 +122,7 @@ CASES: dict[str, tuple[Morphology, dict[str, Any]]] = {
     "corner that is cut a little": (corner(0, -0.6), {"mould": {"tolerance_mm": 1.03 * cut_mm(-0.6)}}),
     "corner that is cut": (corner(0, -0.6), {"mould": {"tolerance_mm": 0.97 * cut_mm(-0.6)}}),
     "corner of the vertical fibre that is cut": (corner(1, 0.8), {"mould": {"tolerance_mm": 0.97 * cut_mm(0.8)}}),
-    "holes": (STRAIGHT, {"pad": {"keep_out_mm": [square(0.15), square(2.0, 5.625, 5.625), [0.0, -9.0, 3.0, 9.0]]}}),
+    "holes": (STRAIGHT, {"pad": {"keep_out_mm": [square(0, 0, 0.3), square(5.625, 5.625, 4), [0, -9, 3, 9]]}}),
     "a cut": (STRAIGHT, {"pad": {"keep_out_mm": [[[-1, -20], [1, -20], [1, 20], [-1, 20]]]}}),
     "bent, the fibre bears all": (STRAIGHT, {"pad": {"bent_radius_mm": 20.0}, "fibre": {"max_strain": 1.0}}),
     "bent, the fibre bears 10 %": (STRAIGHT, {"pad": {"bent_radius_mm": 20.0}, "fibre": {"max_strain": 0.1}}),

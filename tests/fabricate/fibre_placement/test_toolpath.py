@@ -1,5 +1,3 @@
-"""How fast a needle goes along fibres, and whether it has room and fits its tracks."""
-
 import math
 from itertools import pairwise
 
@@ -27,18 +25,16 @@ def least_radii(plan: Plan, stroke: Stroke, window_mm: float) -> np.ndarray:
     slope = np.where(inside, PchipInterpolator(travel, cross)(t, 1), 0.0)
     arc = np.concatenate([[0], np.cumsum(np.hypot(1, (slope[1:] + slope[:-1]) / 2) * np.diff(t))])
     turned = np.concatenate([[0], np.cumsum(np.abs(np.diff(np.arctan(slope))))])
-    radius = window_mm / np.maximum(
-        np.interp(arc + window_mm / 2, arc, turned) - np.interp(arc - window_mm / 2, arc, turned), 1e-9
-    )
+    before, after = (np.interp(arc + side * window_mm / 2, arc, turned) for side in (-1, 1))
+    radius = window_mm / np.maximum(after - before, 1e-9)
     along = stroke.positions_mm[:, family] * (-1 if family == 0 else 1)
     return np.array([radius[(t >= a) & (t <= b)].min(initial=1e9) for a, b in pairwise(along)])
 
 
 @pytest.mark.parametrize("stretch", [math.inf, 0.3])
 def test_feeds_in_bends_are_within_machine_and_fibre_limits(stretch):
-    plan = Plan(
-        Morphology.random(2, 3, seed=6), with_settings(dispenser={"acceleration_mm_s2": 60.0, "feed_mm_s": 12.0})
-    )
+    settings = with_settings(dispenser={"acceleration_mm_s2": 60.0, "feed_mm_s": 12.0})
+    plan = Plan(Morphology.random(2, 3, seed=6), settings)
     slow = 0
     for stroke in strokes(plan, stretch):
         radius = least_radii(plan, stroke, 0.3)

@@ -1,6 +1,7 @@
 # pyright: reportPrivateImportUsage=false
 # ezdxf does not mark what its own manual imports as exported.
 
+import io
 import re
 from pathlib import Path
 from xml.etree import ElementTree
@@ -8,33 +9,14 @@ from xml.etree import ElementTree
 import ezdxf
 import numpy as np
 import pytest
-from ezdxf.document import Drawing
-from scipy.interpolate import PchipInterpolator
+from scipy.interpolate import BPoly, PchipInterpolator
 
 from padforge.design.morphology import Morphology
 from padforge.fabricate.outputs.drawings import orientation_sentence, tracks_dxf, tracks_svg
 from padforge.fabricate.plan import Plan, fibre_layers
 from tests.fabricate.planted import with_settings
 
-PAD = Morphology.random(3, 3, seed=7)
-SVG = "{http://www.w3.org/2000/svg}"
-TONGUES = [{"exit_mm": 0.0}, {"border_mm": 2.0}]
-
-
-def numbers_in(text: str) -> np.ndarray:
-    """Return the coordinates of an SVG path; shape (n, 2), y upwards."""
-    return np.array(re.findall(r"-?\d+(?:\.\d+)?", text), dtype=float).reshape(-1, 2) * (1, -1)
-
-
-def svg_groups(plan: Plan) -> dict[str, ElementTree.Element]:
-    return {group.get("id", ""): group for group in ElementTree.fromstring(tracks_svg(plan)).findall(f"{SVG}g")}
-
-
-def bezier_points(control: np.ndarray) -> np.ndarray:
-    """Return points (n, 2) of Bezier segments (s, 4, 2)."""
-    u = np.linspace(0, 1, 25)[:, None, None]
-    a, b, c, d = np.moveaxis(control, 1, 0)
-    return ((1 - u) ** 3 * a + 3 * (1 - u) ** 2 * u * b + 3 * (1 - u) * u**2 * c + u**3 * d).reshape(-1, 2)
+DOCS = Path(__file__).parents[3] / "docs"
 
 
 def assert_on_curve(plan: Plan, fibre: int, positions_mm: np.ndarray) -> None:
@@ -56,30 +38,22 @@ def assert_ends(plan: Plan, fibre: int, ends_mm: np.ndarray) -> None:
     assert ends_mm[:, 1 - axis] == pytest.approx(level, abs=1e-4)
 
 
-@pytest.mark.parametrize("mould", TONGUES)
-def test_tracks_svg_has_exact_curves(mould):
-    plan = Plan(PAD, with_settings(mould))
-    paths = {path.get("id"): path for group in svg_groups(plan).values() for path in group.findall(f"{SVG}path")}
+@pytest.mark.parametrize("mould", [{"exit_mm": 0.0}, {"border_mm": 2.0}])
+def test_tracks_are_exact_curves_in_svg_and_dxf(mould):
+    plan = Plan(Morphology.random(3, 3, seed=7), with_settings(mould))
+    drawing = ElementTree.fromstring(tracks_svg(plan))
+    paths = {path.get("id"): path.get("d", "") for path in drawing.iter("{http://www.w3.org/2000/svg}path")}
     for fibre in range(6):
-        path = paths[f"{('horizontal', 'vertical')[fibre // 3]}-{fibre % 3 + 1}"].get("d", "")
+        path = paths[f"{('horizontal', 'vertical')[fibre // 3]}-{fibre % 3 + 1}"]
         assert re.sub(r"[^A-Z]", "", path) == "MLCCCCL"
-        points = numbers_in(path)
+        points = np.array(re.findall(r"-?\d+(?:\.\d+)?", path), dtype=float).reshape(-1, 2) * (1, -1)
         assert_ends(plan, fibre, points[[0, -1]])
-        assert_on_curve(plan, fibre, bezier_points(np.stack([points[1 + 3 * i : 5 + 3 * i] for i in range(4)])))
+        beziers = [BPoly(points[1 + 3 * i : 5 + 3 * i, None], [0, 1])(np.linspace(0, 1, 25)) for i in range(4)]
+        assert_on_curve(plan, fibre, np.concatenate(beziers))
 
-
-def read_dxf(text: str, folder: Path) -> Drawing:
-    path = folder / "tracks.dxf"
-    path.write_text(text, encoding="utf-8")
-    return ezdxf.readfile(path)
-
-
-@pytest.mark.parametrize("mould", TONGUES)
-def test_tracks_dxf_has_exact_splines(mould, tmp_path):
-    plan = Plan(PAD, with_settings(mould))
-    document = read_dxf(tracks_dxf(plan), tmp_path)
-    drawn = [list(document.modelspace().query(f'SPLINE[layer=="{layer.name}"]')) for layer in fibre_layers(plan)]
-    for layer, splines in zip(fibre_layers(plan), drawn, strict=True):
+    document = ezdxf.read(io.StringIO(tracks_dxf(plan)))
+    for layer in fibre_layers(plan):
+        splines = document.modelspace().query(f'SPLINE[layer=="{layer.name}"]')
         for fibre, spline in zip(layer.fibres, splines, strict=True):
             curve = spline.construction_tool()
             assert curve.degree == 3
@@ -94,13 +68,7 @@ def test_tracks_dxf_has_exact_splines(mould, tmp_path):
             assert_on_curve(plan, fibre, np.vstack([ends, points[inside]]))
 
 
-DOCS = Path(__file__).parents[3] / "docs"
-
-
 def test_howto_pages_agree_with_orientation_sentence():
-    pad, rig, printer = (
-        " ".join((DOCS / f"howto-{page}.md").read_text(encoding="utf-8").split()) for page in ("pad", "rig", "printer")
-    )
-    assert pad.count(orientation_sentence((4, 4), "edges")) == 1
-    assert "the tracks are up" in rig
-    assert "with its tracks up" in printer
+    pad, rig, printer = orientation_sentence((4, 4), "edges"), "the tracks are up", "with its tracks up"
+    for page, sentence in {"pad": pad, "rig": rig, "printer": printer}.items():
+        assert sentence in " ".join((DOCS / f"howto-{page}.md").read_text(encoding="utf-8").split())

@@ -5,27 +5,13 @@ from matplotlib.figure import Figure
 
 from padforge.common.plotting import FAINT, HORIZONTAL, PAPER, VERTICAL
 from padforge.design.morphology import Morphology
-from padforge.fabricate.mesh import mould_mesh
+from padforge.fabricate.mesh import mesh_arrays, mould_mesh
+from padforge.fabricate.outputs import pictures
 from padforge.fabricate.outputs.laying_page import laying_document
-from padforge.fabricate.outputs.pictures import (
-    TURN_DEG,
-    draw_crossing,
-    draw_findings,
-    draw_mould,
-    draw_orientation,
-    draw_tracks,
-)
 from padforge.fabricate.plan import Plan, fibre_layers
 from padforge.sense.rig.config import RobotFrame
 from padforge.sense.settings import RigSettings
 from tests.fabricate.planted import level_pad, with_settings
-
-PLAN = Plan(level_pad(1.8, 1.2))
-
-
-def mesh_of(plan: Plan) -> tuple[np.ndarray, np.ndarray]:
-    mesh = mould_mesh(plan).to_mesh()
-    return np.asarray(mesh.vert_properties, dtype=float), np.asarray(mesh.tri_verts, dtype=np.intp)
 
 
 def faces_of(figure: Figure) -> tuple[np.ndarray, list[str]]:
@@ -38,19 +24,16 @@ def faces_of(figure: Figure) -> tuple[np.ndarray, list[str]]:
 def colour_at(faces: tuple[np.ndarray, list[str]], x: float, y: float) -> str:
     """Return the colour of the uppermost triangle at a position, mm."""
     corners, colours = faces
-    (a, b, c), point = np.moveaxis(corners, 1, 0), np.array([x, y])
-    cross = [
-        u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0] for u, v in ((b - a, point - a), (c - b, point - b), (a - c, point - c))
-    ]
-    signs = np.array(cross)
-    return colours[np.flatnonzero((signs >= 0).all(axis=0) | (signs <= 0).all(axis=0))[-1]]
+    sides, ways = np.roll(corners, -1, axis=1) - corners, np.array([x, y]) - corners
+    cross = sides[..., 0] * ways[..., 1] - sides[..., 1] * ways[..., 0]
+    return colours[np.flatnonzero((cross >= 0).all(axis=1) | (cross <= 0).all(axis=1))[-1]]
 
 
 def test_mould_picture_has_colours_by_family_and_height(tmp_path, figures):
     mould: dict[str, object] = {"wall_draft_deg": 10.0, "ridge_draft_deg": 8.0, "pins": True}
     keep_outs = [[[8, 8], [9, 8], [9, 9], [8, 9]], [-9.0, -9.0, 2.0, 4.0]]
     plan = Plan(level_pad(1.8, 1.2), with_settings(mould, pad={"keep_out_mm": keep_outs}))
-    draw_mould(plan, *mesh_of(plan), [], tmp_path / "mould.png")
+    pictures.draw_mould(plan, *mesh_arrays(mould_mesh(plan)), [], tmp_path / "mould.png")
     faces = faces_of(figures[0])
     for layer in fibre_layers(plan):
         for fibre in layer.fibres:
@@ -68,7 +51,8 @@ def test_mould_picture_has_colours_by_family_and_height(tmp_path, figures):
 def test_mesh_picture_has_upper_faces_on_top(tmp_path, figures):
     """A roof that rises by 10 along x, under a small plate at 7 in its upper left corner, all 20 above z = 0."""
     vertices = [[0, 0, 0], [10, 0, 10], [10, 10, 10], [0, 10, 0], [1, 7, 7], [3, 7, 7], [3, 9, 7], [1, 9, 7.0]]
-    draw_findings(np.add(vertices, (0, 0, 20)), [[4, 5, 6], [4, 6, 7], [0, 1, 2], [0, 2, 3]], [], tmp_path / "mesh.png")
+    triangles = [[4, 5, 6], [4, 6, 7], [0, 1, 2], [0, 2, 3]]
+    pictures.draw_findings(np.add(vertices, (0, 0, 20)), triangles, [], tmp_path / "mesh.png")
     plate, roof = (colour_at(faces_of(figures[0]), 2, y) for y in (8, 3))
     assert sum(bytes.fromhex(plate[1:])) < sum(bytes.fromhex(roof[1:]))  # the ramp darkens with height
     assert figures[0].axes[0].get_xlim() == (0, 10)
@@ -77,7 +61,7 @@ def test_mesh_picture_has_upper_faces_on_top(tmp_path, figures):
 
 # Orientation
 
-POSES = {0: (False, 0.0), 1: (True, 0.0), 2: (True, TURN_DEG)}
+POSES = {0: (False, 0.0), 1: (True, 0.0), 2: (True, pictures.TURN_DEG)}
 WIDTH_MM = 64.0
 
 
@@ -97,7 +81,7 @@ def texts_in(figure: Figure, panel: int, low: float, high: float) -> dict[str, n
 def test_panels_match_frame_of_rig(tmp_path, figures):
     """Fibres, axes and numbers are drawn where `RobotFrame`, which poses the rig's presses, has them."""
     plan = Plan(Morphology.random(3, 2, seed=4))
-    draw_orientation(plan, tmp_path / "orientation.svg")
+    pictures.draw_orientation(plan, tmp_path / "orientation.svg")
     scale = 21.0 / plan.tray.bounds[2]
     tracks = [np.array(line.get_xydata()) for line in figures[0].axes[0].lines if len(line.get_xydata()) > 1]
     order = [fibre for layer in fibre_layers(plan) for fibre in layer.fibres]
@@ -113,23 +97,22 @@ def test_panels_match_frame_of_rig(tmp_path, figures):
             assert np.hypot(*number) > np.hypot(*expected)
         for axis, unit in zip("xy", np.eye(2), strict=True):
             if panel < 2:  # in the last one there are the axes of the arm as well
-                assert texts[axis] / np.hypot(*texts[axis]) == pytest.approx(
-                    np.array(frame.pose(unit, 0.0)[:2]), abs=0.01
-                )
+                direction = np.array(frame.pose(unit, 0.0)[:2])
+                assert texts[axis] / np.hypot(*texts[axis]) == pytest.approx(direction, abs=0.01)
 
 
 def test_section_is_of_the_narrowest_crossing(tmp_path, figures):
     """Of a pad of three depths whose first crossing is a wide one."""
     plan = Plan(Morphology.random((1, 2), 2, seed=1))
     crossings = laying_document(plan, 1.0)["crossings"]
-    draw_crossing(plan, tmp_path / "crossing.svg")
+    pictures.draw_crossing(plan, tmp_path / "crossing.svg")
     assert crossings["table"][0][-1] > crossings["gap_mm"]
     [*_, gap] = [text.get_text() for text in figures[0].axes[0].texts]
     assert gap == f"{crossings['gap_mm']:.2g} mm"
 
 
 def test_fibres_are_drawn_as_wide_as_they_are(tmp_path, figures):
-    draw_tracks(Plan(level_pad(1.0, 2.0), with_settings(fibre={"diameter_mm": 2.0})), tmp_path / "tracks.png")
+    pictures.draw_tracks(Plan(level_pad(1.0, 2.0), with_settings(fibre={"diameter_mm": 2.0})), tmp_path / "tracks.png")
     [axes] = figures[0].axes
     x_min, x_max = axes.get_xlim()
     points_per_mm = 72 * figures[0].get_figwidth() * axes.get_position().width / (x_max - x_min)

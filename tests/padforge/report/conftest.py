@@ -1,5 +1,3 @@
-"""A folder with what every stage leaves, made up, and the report on it."""
-
 import json
 import shutil
 from pathlib import Path
@@ -11,9 +9,10 @@ from padforge.common.files import provenance
 from padforge.common.plotting import save_figure
 from padforge.design.morphology import Morphology
 from padforge.design.report import draw_plan
-from padforge.design.settings import Contact, PadSettings, RulesSettings, SearchSettings
+from padforge.design.settings import Contact
 from padforge.fabricate import build
 from padforge.report import write_report
+from tests.design import test_reports as made_up
 from tests.helpers.less import small_pictures
 
 HOSTILE = '</script><img src="x" onerror="document.title=1"> & <b>'
@@ -26,27 +25,9 @@ def written(path: Path, document: dict) -> None:
 
 
 def design_document() -> dict:
-    used = {"pad": PadSettings(grid=2), "contact": Contact(), "search": SearchSettings(), "rules": RulesSettings()}
-    settings = {name: section.model_dump(mode="json") for name, section in used.items()}
-    return {
-        "format": "padforge-design/1",
-        "terms": {
-            "expected_error_mm_0": 0.675,
-            "expected_error_mm_1": 0.9,
-            "ambiguity_mm_0": 1.125,
-            "ambiguity_mm_1": 2.25,
-            "information": 9.5,
-        },
-        "descriptions": {"information": "mutual information, bits"},
-        "straight": {
-            "expected_error_mm_0": 1.35,
-            "expected_error_mm_1": 2.7,
-            "ambiguity_mm_0": 2.8125,
-            "ambiguity_mm_1": 5.625,
-        },
-        "violations": [],
-        "provenance": provenance("padforge design", 3) | {"settings": settings},
-    }
+    document: dict = made_up.design_document() | {"violations": [], "descriptions": {"sharpness": "how jagged"}}
+    document["provenance"] |= provenance("padforge design", 3)
+    return {"format": "padforge-design/1"} | document
 
 
 def errors(by_subset: dict[tuple[int, ...], float]) -> dict:
@@ -72,15 +53,6 @@ def calibration_document() -> dict:
     }
 
 
-def contacts_document() -> dict:
-    """Of a pad that errs by half as much as straight fibres, but not under the published disc."""
-    errors = {("as assumed", "designed"): [0.5, 0.75], ("as assumed", "straight"): [1.0, 1.5]}
-    errors |= {("published disc, K = 0.6", "designed"): [4.0, 6.0], ("published disc, K = 0.6", "straight"): [3.0, 5.0]}
-    rows = [{"contact": contact, "pad": pad, "errors_mm": each} for (contact, pad), each in errors.items()]
-    scatter = {"floor": 0.02, "share": 0.18, "common": 0.36}
-    return {"format": "padforge-contacts/1", "scatter": scatter, "rows": rows, "provenance": provenance("padforge run")}
-
-
 def study_document() -> dict:
     return {
         "format": "padforge-study-drift/1",
@@ -93,7 +65,6 @@ def study_document() -> dict:
 
 @pytest.fixture(scope="session")
 def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with what every stage leaves, and a study."""
     folder = tmp_path_factory.mktemp("made")
     PAD.save(folder / "morphology.json")
     with pytest.MonkeyPatch.context() as patch:
@@ -102,7 +73,8 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     save_figure(draw_plan(PAD, Contact()), folder / "figures" / "design.svg")
     written(folder / "design.json", design_document())
     written(folder / "calibration.json", calibration_document())
-    written(folder / "contacts.json", contacts_document())
+    contacts = {"format": "padforge-contacts/1", "provenance": provenance("padforge run")} | made_up.contacts_document()
+    written(folder / "contacts.json", contacts)
     source = {"kind": "simulated", "rig": {"rate_hz": 13.3, "depth_mm": 5.0}}
     made_by = provenance("padforge sense record")
     start = {"format": "padforge-recording/1", "fibres": 4, "source": source, "provenance": made_by}
@@ -114,7 +86,6 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def pad(made: Path, tmp_path: Path) -> Path:
-    """A copy of it, to be changed."""
     return shutil.copytree(made, tmp_path / "pad")
 
 

@@ -1,5 +1,3 @@
-"""The mould in the report: its mesh, and how a browser draws and turns it."""
-
 import base64
 import json
 import re
@@ -52,7 +50,7 @@ def test_large_mesh_uses_wide_indices(tmp_path: Path, monkeypatch) -> None:
     assert volume(mesh) == pytest.approx(sphere.volume, rel=1e-4)
 
 
-def test_view_colours_heights_from_the_lowest_point_of_the_mesh(made: Path, tmp_path: Path) -> None:
+def test_section_names_sizes_and_colours_heights_from_the_lowest_point_of_the_mesh(made: Path, tmp_path: Path) -> None:
     """Tops of ridges are where the family has its height above the floor, wherever the mesh begins."""
     document = json.loads((made / "fabrication.json").read_text())
     mould = trimesh.load_mesh(made / "mould.stl", process=False)
@@ -60,6 +58,7 @@ def test_view_colours_heights_from_the_lowest_point_of_the_mesh(made: Path, tmp_
     mould.export(tmp_path / "mould.stl")
     document["sha256"] = {"mould.stl": sha256(tmp_path / "mould.stl")}
     document["settings"]["mould"]["floor_mm"] = 1.5
+    document["sizes"]["pad_mm"] = [120.0, 30.25]
     document["fibres"] = [fibre | {"depth_mm": 0.9} for fibre in document["fibres"]]  # of a pad that has shrunk
     section, _ = fabrication_sections(tmp_path, document)
     data = json.loads("".join(section.body).partition('id="mould-mesh">')[2].partition("</script>")[0])
@@ -70,6 +69,7 @@ def test_view_colours_heights_from_the_lowest_point_of_the_mesh(made: Path, tmp_
     assert data["low"] == pytest.approx(mould.bounds[0], abs=1e-4)
     size = " x ".join(f"{side:.4g}" for side in np.ptp(mould.vertices, axis=0))
     assert f"The mould, {size} mm. Tops of" in "".join(section.body)
+    assert section.figures[0] == ("120 x 30.25 mm", "pad, as it is cast")
 
 
 @pytest.mark.parametrize("deep", ["horizontal", "vertical"])
@@ -83,12 +83,6 @@ def test_key_of_colours_gives_numbers_the_family_of_their_height(tmp_path: Path,
     first, second = (" and the numbers" * (family == low) for family in ("horizontal", "vertical"))
     key = f"Tops of horizontal ridges{first} are blue, of vertical ones{second} orange."
     assert key in "".join(section.body)
-
-
-def test_section_names_both_sides_of_the_pad(made: Path) -> None:
-    document = json.loads((made / "fabrication.json").read_text())
-    document["sizes"]["pad_mm"] = [120.0, 30.25]
-    assert fabrication_sections(made, document)[0].figures[0] == ("120 x 30.25 mm", "pad, as it is cast")
 
 
 def test_oversized_mesh_is_simplified_or_omitted(made: Path, pad: Path, monkeypatch) -> None:
@@ -153,14 +147,10 @@ def test_browser_draws_and_rotates_mould(chromium: Chromium, page: Path) -> None
     assert chromium.ask("document.querySelectorAll('details').forEach(each => each.open = true)") is None
     assert chromium.ask("document.scrollingElement.scrollWidth <= innerWidth") is True
     assert chromium.complaints == []
-    assert {address.split(",")[0][:20] for address in chromium.requests if address != page.as_uri()} <= {
-        "data:image/png;base6",
-        "data:image/svg+xml;b",
-    }
-    assert (
-        chromium.ask("performance.getEntriesByType('resource').filter(each => !each.name.startsWith('data:')).length")
-        == 0
-    )
+    asked = {address.split(",")[0][:20] for address in chromium.requests if address != page.as_uri()}
+    assert asked <= {"data:image/png;base6", "data:image/svg+xml;b"}
+    loaded = "performance.getEntriesByType('resource').filter(each => !each.name.startsWith('data:')).length"
+    assert chromium.ask(loaded) == 0
 
     # On paper there is the picture instead, and nothing is folded.
     chromium.call("Emulation.setEmulatedMedia", media="print")
@@ -171,9 +161,8 @@ def test_browser_draws_and_rotates_mould(chromium: Chromium, page: Path) -> None
     chromium.call("Emulation.setEmulatedMedia", media="")
 
     # A context that is lost comes back.
-    chromium.ask(
-        "void (lose = document.querySelector('canvas').getContext('webgl2').getExtension('WEBGL_lose_context'))"
-    )
+    context = "document.querySelector('canvas').getContext('webgl2')"
+    chromium.ask(f"void (lose = {context}.getExtension('WEBGL_lose_context'))")
     hidden = "new Promise(done => setTimeout(() => done(document.getElementById('mould-view').hidden), 100))"
     chromium.ask("lose.loseContext()")
     assert chromium.ask(hidden) is True

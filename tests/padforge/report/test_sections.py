@@ -1,5 +1,3 @@
-"""The report: one page that holds everything, lets nothing in, and is honest about files it cannot read."""
-
 import json
 import re
 import shutil
@@ -124,10 +122,8 @@ DAMAGED = {
 @pytest.mark.parametrize(("name", "content"), [(name, text) for name, texts in DAMAGED.items() for text in texts])
 def test_report_refuses_damaged_file_in_one_line(pad: Path, name: str, content: str) -> None:
     (pad / name).write_text(content)
-    with pytest.raises(InputError) as told:
+    with pytest.raises(InputError, match=rf"^{re.escape(str(pad / name))}: [^\n]*$"):
         write_report(pad)
-    assert str(told.value).startswith(f"{pad / name}: ")
-    assert "\n" not in str(told.value)
 
 
 def test_report_refuses_mould_of_other_checks(pad: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,5 +1,3 @@
-"""The words, tables and pictures of a whole report, and of sections on documents of distinct numbers."""
-
 import json
 import re
 from pathlib import Path
