@@ -73,6 +73,10 @@ def test_calibration_learns_nothing_from_its_test_nor_networks_from_presses_of_r
         assert np.array_equal(other.networks[name]["last.b"][:, :, places], weights["last.b"][:, :, places])
     assert not np.array_equal(other.interval_factors, plain.interval_factors)
     assert learnt(fit(brief, seed=7))["released.first.w"] != learnt(plain)["released.first.w"]
+    # the published training stops by presses that are not those of radii either
+    stopped, other = (fit(each, method="published") for each in (brief, without_sense(brief, 32 - RADII)))
+    assert learnt(other, of_radii[1:]) == learnt(stopped, of_radii[1:])
+    assert not np.array_equal(other.interval_factors, stopped.interval_factors)
 
 
 def test_cross_validated_localizer_learns_nothing_from_other_presses(brief: Recording) -> None:

@@ -130,6 +130,16 @@ def test_gcode_has_nothing_that_a_firmware_misreads():
     assert max(len(line) for line in lines if line[0] in "GM") < 80
 
 
+@pytest.mark.parametrize(
+    ("fibres", "start"), [((2, 0), "on the right, nearest"), ((0, 2), "on the right, at the near side")]
+)
+def test_gcode_of_one_family_says_where_fibre_1_starts(fibres, start):
+    text = program(Plan(Morphology.straight(fibres)))
+    assert f"; fibre 1 starts {start}\n" in text
+    ends = np.vstack([way.corners[[0, -1], :2] for _, way in run_gcode(text).placed_fibres()])
+    assert ends[0] == pytest.approx((ends[:, 0].max(), ends[:, 1].min()))
+
+
 def test_fibre_settings_set_depth_and_speed():
     pad = Morphology.random(1, 3, seed=2)
 

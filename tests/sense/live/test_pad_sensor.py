@@ -87,6 +87,9 @@ def test_sensor_reads_what_the_pipeline_says(boards, sensor: PadSensor, few: Rec
     assert boards[0].is_closed
     sensor.connect()  # again, to a pad that has not been pressed
     assert [sensor.read()[name] for name in ("pressed", "valid", "x_mm", "r90_mm")] == [0, 0, 0, 0]
+    boards[1].error = LOST  # the pad is followed still
+    with pytest.raises(RigFault, match="the board is gone"):
+        read_for(sensor, 20.0)
 
 
 @pytest.mark.parametrize("rests", [False, True])

@@ -185,8 +185,10 @@ def test_session_restarts_a_confused_detector(hands, monkeypatch: pytest.MonkeyP
     assert max(distances_mm(recording, np.array(hand.strokes_of(recording)))) < 4 * SCATTER_MM
 
 
-def test_session_tells_what_to_do_and_keeps_what_was_done(hands, golden) -> None:
+def test_session_tells_what_to_do_and_keeps_what_was_done(hands, golden, monkeypatch: pytest.MonkeyPatch) -> None:
     """Half of the presses go wrong; the second that counts is taken back, and the fourth place is skipped."""
+    undone, undo = Mock(), PressValidator.undo
+    monkeypatch.setattr(PressValidator, "undo", lambda validator: undone(undo(validator)))
     hand = hands(presses=5, mishaps=0.5, seed=3, plan="grid")
     schedule = {2: ["back"], 3: ["skip"]}
 
@@ -195,6 +197,7 @@ def test_session_tells_what_to_do_and_keeps_what_was_done(hands, golden) -> None
         return schedule.pop(view["done"], []) if view["phase"] == "wait" else []
 
     recording = hand.record(commands=commands)
+    undone.assert_called_once()  # others are not measured by the response of what was taken back
     shown, prompts = ["    ".join(view_lines(view)[:3:2]) for view in hand.views], list[str]()
     prompts = [line for before, line in zip(["", *shown], shown, strict=False) if line != before]
     golden("rig/hand.txt", "\n".join([*view_lines(hand.views[60]), "", *prompts]))
