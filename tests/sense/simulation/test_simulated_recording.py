@@ -1,4 +1,4 @@
-"""Simulated recordings: their form, the responses of plans and twins, and settings that are measured in them."""
+"""Simulated recordings and strokes: their form, the responses of plans and twins, and settings measured in them."""
 
 from dataclasses import replace
 from typing import Any
@@ -6,7 +6,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from padforge import InputError
 from padforge.design import Contact, Morphology, Twin
 from padforge.design.contact import relative_stretch
 from padforge.design.settings import PadSettings
@@ -18,8 +17,9 @@ from padforge.sense.simulation.simulated_recording import (
     model_like_twin,
     model_twin,
 )
+from padforge.sense.simulation.strokes import simulate_strokes
 from tests.helpers.golden import Golden, json_text
-from tests.helpers.rigs import ideal_rig, quiet_rig
+from tests.helpers.rigs import KEEP_OUT, ideal_rig, quiet_rig
 
 GRID = Morphology.straight(4)
 PAD = Morphology.straight(2)
@@ -102,8 +102,8 @@ def test_model_twin_follows_the_plan_transform() -> None:
     straight = plain.responses(positions, depths).held
     assert mirrored.responses(positions * [-1, 1], depths).held == pytest.approx(straight)
     assert np.abs(mirrored.responses(positions, depths).held - straight).max() > 0.01
-    keep_out = ((2.0, -6.0), (9.0, -6.0), (9.0, 6.0), (2.0, 6.0))  # of the plan, so on the other side if mirrored
-    free = model_twin(twin_of(PlanTransform(mirrored=True)), ideal_rig(), PadSettings(keep_out_mm=(keep_out,))).free
+    size = PadSettings(keep_out_mm=(KEEP_OUT,))  # of the plan, so on the other side if mirrored
+    free = model_twin(twin_of(PlanTransform(mirrored=True)), ideal_rig(), size).free
     assert free(np.array([[5.0, 0.0], [-5.0, 0.0]])).tolist() == [True, False]
     twin = replace(twin_of(), sensed_mm=(20.0, 10.0))
     for turn_deg, sides in ((0, (20, 10)), (90, (10, 20)), (180, (20, 10))):
@@ -161,15 +161,6 @@ def test_a_pad_like_a_twin_has_the_median_of_its_gains_and_noise() -> None:
     assert (measured.scatter, measured.scatter_common) == (0.1, 0.2)
 
 
-def test_simulate_refuses_wrong_arguments() -> None:
-    dead = replace(twin_of(), channels=tuple(TwinChannel(c, None, 0.0, 0.0, 0.0) for c in range(2)))
-    for pad, like in ((dead, None), (PAD, dead)):
-        with pytest.raises(InputError, match="twin: none of its channels reads a fibre"):
-            simulate(pad, RigSettings(presses=3), like=like)
-    with pytest.raises(InputError, match="plan is adaptive"):
-        simulate(PAD, RigSettings(plan="adaptive"))
-
-
 def test_measure_rig_settings_recovers_those_of_a_simulation() -> None:
     values = (3.0, 25.0, 6.0)
     names = ("noise_mv", "drift_mv", "hysteresis_s")
@@ -177,12 +168,51 @@ def test_measure_rig_settings_recovers_those_of_a_simulation() -> None:
     measured = measure_rig_settings(simulate(PAD, RigSettings(presses=1500, memory=0.0, **rig)))
     for name, value, rel in zip(names, values, (0.05, 0.3, 0.35), strict=True):
         assert measured[name] == pytest.approx(value, rel=rel), name
-
-
-def test_measure_rig_settings_ignores_incomplete_channels_and_few_presses() -> None:
+    # incomplete channels and few presses tell nothing
     assert measure_rig_settings(simulate(PAD, RigSettings(presses=90))) == {}
     recording = simulate(PAD, RigSettings(presses=200))
     readings = np.column_stack([recording.readings, np.full(len(recording.readings), 1.5), recording.readings[:, 0]])
     readings[1000, 5] = np.nan
     assert measure_rig_settings(replace(recording, readings=readings)) == measure_rig_settings(recording)
     assert measure_rig_settings(replace(recording, readings=readings[:, 4:])) == {}
+
+
+WINDING, QUIET = Morphology.random(3, knots=5, seed=0), quiet_rig(presses=8)
+
+
+def test_a_stroke_reads_as_a_press_where_the_finger_is() -> None:
+    """On the pad of a simulated recording, whose fibres rest alike."""
+    strokes = simulate_strokes(WINDING, QUIET, Contact(), 20.0, 3, np.random.default_rng(0))
+    recording = strokes.recording
+    np.testing.assert_array_equal(recording.readings[:19], simulate(WINDING, QUIET).readings[:19])
+    held = recording.up_command[0] - recording.down_command[0]
+    for stroke in range(3):
+        for reading in (held // 2, held - 1):
+            x, y = strokes.positions_mm[stroke, reading]
+            volts = recording.readings[recording.down_command[stroke] + reading]
+            resting = simulate_strokes(WINDING, QUIET, Contact(), 0.0, 1, _FixedStart((x, y)))  # type: ignore[arg-type]
+            expected = resting.recording.readings[resting.recording.down_command[0] + reading]
+            assert np.allclose(volts, expected, atol=1.7e-3)  # two steps of the converter
+
+
+class _FixedStart:
+    """A generator that starts the only stroke at a position."""
+
+    def __init__(self, position: tuple[float, float]) -> None:
+        self._position = position
+
+    def uniform(self, low: object, high: object, size: object) -> np.ndarray:
+        return np.array([self._position]) if isinstance(size, tuple) else np.zeros(8)
+
+
+@pytest.mark.parametrize("speed", [0.0, 10.0, 50.0])
+def test_strokes_go_straight_at_their_speed_and_stay_on_the_pad(speed: float) -> None:
+    rig = RigSettings(presses=8)
+    strokes = simulate_strokes(WINDING, rig, Contact(), speed, 20, np.random.default_rng(1))
+    steps = np.diff(strokes.positions_mm, axis=1)
+    assert np.allclose(steps, steps[:, :1])
+    speeds = np.hypot(*steps[:, 0].T) * rig.rate_hz
+    assert (speeds <= speed * (1 + 1e-9)).all()
+    assert np.median(speeds) == pytest.approx(speed) or speed > 20
+    assert np.abs(strokes.positions_mm).max() <= 1.5 * WINDING.unit_mm  # from the middle of what is sensed
+    np.testing.assert_array_equal(strokes.recording.presses_mm, strokes.positions_mm[:, -1])  # where they end
