@@ -267,6 +267,7 @@ def test_sequence_rejects_by_time(sequence: PressSequence, down_s: float, up_s: 
 
 def test_sequence_takes_back_or_skips_the_press_under_way(sequence: PressSequence) -> None:
     sequence.touch(110.0)
+    assert [sequence.phase(time_s) for time_s in (110.9, 111.0)] == ["hold", "lift"]
     assert not sequence.undo(110.5)
     assert sequence.phase(110.6) == "lift"
     assert sequence.release(111.0) == "it was taken back"
@@ -274,6 +275,8 @@ def test_sequence_takes_back_or_skips_the_press_under_way(sequence: PressSequenc
     sequence.skip(120.5)
     assert sequence.release(121.0) == "its place was skipped"
     assert sequence.target == (3.0, 4.0)
+    sequence.skip(130.0)  # after the last one none is asked for
+    assert press(sequence, 140.0, 141.0) == "it came before it was asked for"
 
 
 def readings(early: np.ndarray, late: np.ndarray) -> np.ndarray:

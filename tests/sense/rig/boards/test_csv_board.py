@@ -126,18 +126,19 @@ short = with_constants((csv_board, {"_START_S": 0.1, "LISTEN_S": 0.7}))
 
 
 class PrintingBoard(SerialDevice):
-    """It prints lines at RATE_HZ, with their number in place of %d, after bytes of a start; of some only the end."""
+    """It prints lines, with their number in place of %d, after bytes of a start; of one in `damaged` only the end."""
 
-    def __init__(self, line: bytes, whole: int = 10**9) -> None:
+    def __init__(self, line: bytes, rate_hz: float = RATE_HZ, damaged: int = 10**9) -> None:
         super().__init__("board", seed=0)
-        self._line, self._whole, self._start_s, self._n_lines = line, whole, clock.now(), 0
+        self._line, self._rate_hz, self._damaged = line, rate_hz, damaged
+        self._start_s, self._n_lines = clock.now(), 0
         self._out += b"\xff\x80boot\r\nready\r\n"
 
     def _step(self, data: bytes) -> None:
-        while clock.now() - self._start_s > self._n_lines / RATE_HZ:
+        while clock.now() - self._start_s > self._n_lines / self._rate_hz:
             self._n_lines += 1
             line = self._line.replace(b"%d", str(5000 * self._n_lines).encode())
-            self._out += (line if self._n_lines % self._whole else line[-5:]) + b"\r\n"
+            self._out += (line if self._n_lines % self._damaged else line[-5:]) + b"\r\n"
 
 
 @pytest.mark.parametrize(
@@ -171,13 +172,13 @@ def test_csv_board_finds_columns_and_rate() -> None:
 
 
 def test_csv_board_counts_damaged_lines() -> None:
-    """Also those that arrive alone, between two looks at the port."""
+    """They arrive alone, between two looks at the port."""
     with (
-        PrintingBoard(b"%d,502,500", whole=3) as printing,
-        closing(CsvBoard(printing.port, 115200, RATE_HZ)) as board,
+        PrintingBoard(b"%d,502,500", 50.0, damaged=3) as printing,
+        closing(CsvBoard(printing.port, 115200, 50.0)) as board,
     ):
         board.connect()
-        clock.sleep(0.5)
+        clock.sleep(1.0)
         samples = board.read()
     assert np.allclose(samples.volts, [502, 500])
     assert samples.missing.sum() == pytest.approx(len(samples.times_s) / 2, abs=2)
