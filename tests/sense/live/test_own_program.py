@@ -29,7 +29,7 @@ from padforge.sense.localizer.model import LocalizerModel
 from tests.docs.pages import BLOCK, ROOT
 from tests.helpers.presses import changed
 from tests.sense.conftest import first_presses
-from tests.sense.recording.test_frames import repeated
+from tests.sense.recording.test_recording import repeated
 
 PAGE = (ROOT / "docs" / "howto-program.md").read_text(encoding="utf-8")
 PROGRAMS = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
