@@ -60,7 +60,6 @@ def test_recording_line_counts_what_is_unknown_and_missing() -> None:
     assert options.recording_line(slow, Path("out")) == line
 
 
-PICTURES = [f"error_{name}.png" for name in ("map", "by_loss", "by_moment")]
 BARE = [word for part in ("health", "figures", "moments") for word in ("--without", part)]
 
 
@@ -94,7 +93,7 @@ def test_calibrate_replaces_a_model_in_use_only_by_force_and_leaves_parts_out(fe
     Path("fibre_loss.json").write_text(json.dumps({"provenance": {"inputs": {"localizer": provenance}}}))
     assert few("calibrate", "rec", *BARE, "--seed", "5")[0] == 0  # the same again
     assert few("calibrate", "rec", *BARE)[0] == 2
-    for name in (*HEALTH_FILES, *PICTURES):  # of an earlier calibration, which had all parts
+    for name in (*HEALTH_FILES, *(f"error_{part}.png" for part in ("map", "by_loss", "by_moment"))):  # of all parts
         Path(name).touch()
     code, out, _ = few("calibrate", "rec", *BARE, "--force", "--json")
     assert (code, json.loads(out)["by_moment"]) == (0, [])

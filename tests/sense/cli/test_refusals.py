@@ -66,9 +66,9 @@ record --rig hand {straight} --dry-run          | --dry-run and --model need an 
 doctor --rig ur5 --spec 3.toml {five}           | [rig] channels: got 3 inputs, the pad has 10 fibres
 doctor --rig crane                              | --rig is 'crane', allowed are hand, printer, ur5
 doctor --rig simulated                          | --rig is 'simulated', allowed are hand, printer, ur5
-record {thin}                                   | presses 5 mm deep, allowed is less than 4 mm, by thin/fabrication.json
-record --rig ur5 {thin}                         | presses 5 mm deep, allowed is less than 4 mm, by thin/fabrication.json
-record --rig hand {thin}                        | presses 5 mm deep, allowed is less than 4 mm, by thin/fabrication.json
+record {thin/morphology}                        | presses 5 mm deep, allowed is less than 4 mm, by thin/fabrication.json
+record --rig ur5 {thin/morphology}              | presses 5 mm deep, allowed is less than 4 mm, by thin/fabrication.json
+record --rig hand {thin/morphology}             | presses 5 mm deep, allowed is less than 4 mm, by thin/fabrication.json
 record --rig crane                              | --rig is 'crane', allowed are simulated, hand, printer, ur5
 {live} --model model --rig crane                | --rig is 'crane', allowed are simulated, hand, printer, ur5
 calibrate rec --time-budget 0                   | Invalid value for '--time-budget': 0.0 is not in the range x>0
@@ -81,9 +81,8 @@ calibrate rec --time-budget nan                 | Invalid value for '--time-budg
 {live} --model model --replay rec --tcp 0 --rerun here | --rerun is 'here', expected an address like rerun+http://HOST:PORT
 {live} --model model --tcp 0 --token short      | token has 5 characters, allowed are 16 or more
 """
-SHORT = {name: f"--morphology {name}.json" for name in ("straight", "five")}
+SHORT = {name: f"--morphology {name}.json" for name in ("straight", "five", "thin/morphology")}
 SHORT |= {"live": "live --port 0", "unread": "--morphology straight.json --spec none.toml"}
-SHORT["thin"] = "--morphology thin/morphology.json"
 
 
 @pytest.fixture(scope="module")

@@ -2,7 +2,7 @@
 
 from dataclasses import replace
 from typing import Any
-from unittest.mock import patch
+from unittest.mock import Mock, call, patch
 
 import numpy as np
 import pytest
@@ -71,17 +71,12 @@ def test_combine_members_weighs_by_variance_and_adds_disagreement() -> None:
 def test_fit_network_takes_the_steps_of_cautious_adamw_and_returns_averages() -> None:
     """Also for weights whose gradients come in another order in memory, and for several of them."""
     goal, share = torch.arange(15.0).reshape(5, 3), torch.linspace(0, 1, 51)[1:].tolist()
+    w, v, told = torch.ones(3, 5, requires_grad=True), torch.full((2,), 9.0, requires_grad=True), Mock()
 
-    def loss(w: torch.Tensor) -> torch.Tensor:
-        return torch.einsum("ij,jk->ik", w.mT, torch.eye(3)).sub(goal).square().mean()
+    def loss() -> torch.Tensor:
+        return torch.einsum("ij,jk->ik", w.mT, torch.eye(3)).sub(goal).square().mean() + v.square().sum()
 
-    w, v = torch.ones(3, 5, requires_grad=True), torch.full((2,), 9.0, requires_grad=True)
-    parameters, reports = {"w": w, "v": v}, list[tuple[int, int, str]]()
-    fitted = optimizer.fit_network(
-        *(parameters, lambda: loss(w) + v.square().sum(), 50, 0.1),
-        weight_decay=0.1,
-        on_progress=lambda *report: reports.append(report),
-    )
+    fitted = optimizer.fit_network({"w": w, "v": v}, loss, 50, 0.1, weight_decay=0.1, on_progress=told)
     expected, (first, second) = np.concatenate([np.ones(15), np.full(2, 9.0)]), optimizer.BETAS
     mean, square, average, resting = np.zeros(17), np.zeros(17), expected.copy(), 0
     for step, each in enumerate(share, 1):
@@ -99,7 +94,7 @@ def test_fit_network_takes_the_steps_of_cautious_adamw_and_returns_averages() ->
     np.testing.assert_allclose(w.detach().numpy(), expected[:15].reshape(3, 5), rtol=1e-4)
     np.testing.assert_allclose(fitted["w"], average[:15].reshape(3, 5), rtol=1e-4)
     np.testing.assert_allclose(fitted["v"], average[15:], rtol=1e-4)
-    assert (len(reports), reports[-1]) == (50, (200, 200, ""))
+    assert (told.call_count, told.call_args) == (50, call(200, 200, ""))
     assert np.float64(5e-324) * 1.0 > 0  # denormal numbers are there again after a training
     assert [optimizer.one_cycle(part) for part in (0.0, 0.05, 0.1, 0.55, 1.0)] == pytest.approx([0, 0.5, 1, 0.5, 0])
 

@@ -173,10 +173,8 @@ def test_csv_board_finds_columns_and_rate() -> None:
 
 def test_csv_board_counts_damaged_lines() -> None:
     """They arrive alone, between two looks at the port."""
-    with (
-        PrintingBoard(b"%d,502,500", 50.0, damaged=3) as printing,
-        closing(CsvBoard(printing.port, 115200, 50.0)) as board,
-    ):
+    slow = PrintingBoard(b"%d,502,500", 50.0, damaged=3)
+    with slow, closing(CsvBoard(slow.port, 115200, 50.0)) as board:
         board.connect()
         clock.sleep(1.0)
         samples = board.read()
