@@ -1,7 +1,20 @@
+"""Recordings of other values, and presses to train on, made of arrays."""
+
+from dataclasses import replace
+from typing import Any
+
 import numpy as np
 
+from padforge.sense import Recording
 from padforge.sense.localizer.moments import LATEST_WINDOWS, PRESS_WINDOWS
 from padforge.sense.localizer.scaler import TrainingPresses
+
+
+def changed(recording: Recording, name: str, where: Any, value: Any) -> Recording:
+    """The recording with another value, or values, somewhere in one of its arrays."""
+    array = np.array(getattr(recording, name))
+    array[where] = value
+    return replace(recording, **{name: array})
 
 
 def training_presses(

@@ -6,6 +6,10 @@ from padforge.common.settings import commented_toml
 from padforge.design.settings import PadSettings
 from padforge.sense.settings import IDEAL_RIG, RigSettings
 
+KEEP_OUT = ((2.0, -6.0), (9.0, -6.0), (9.0, 6.0), (2.0, 6.0))
+RECTANGLE = PadSettings(horizontals=3, verticals=2, pitch_mm=(8.0, 15.0), keep_out_mm=(KEEP_OUT,))
+"""Of a pad that is not square, with a hole."""
+
 
 def ideal_rig(**values: Any) -> RigSettings:
     return RigSettings(**IDEAL_RIG.model_dump() | values)

@@ -4,12 +4,14 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import replace
+from itertools import cycle
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 from unittest.mock import patch
 
+import filelock
 import numpy as np
 import pytest
 
@@ -170,7 +172,6 @@ def model(recording: Recording, localizer: LocalizerModel, tmp_path_factory: pyt
 
 @pytest.fixture
 def folder(recording: Recording, tmp_path: Path) -> Path:
-    """The run directory of a recording."""
     recording.save(tmp_path / "run", {"command": "test"})
     return tmp_path / "run"
 
@@ -236,32 +237,17 @@ class Robots:
             assert not [line for line in asked if any(word in line for word in FORBIDDEN)]
 
 
-def lock_address(address: str) -> IO[str] | None:
-    """The lock on an address; None where another process has it."""
-    import fcntl  # not on Windows, where tests of other parts run
-
-    lock = (Path(tempfile.gettempdir()) / f"padforge-ur-{address}.lock").open("w")
-    try:
-        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        lock.close()
-        return None
-    return lock
-
-
 @pytest.fixture(scope="module")
 def address() -> Iterator[str]:
     """An address whose ports are held by one module of one test process at a time."""
     end = time.monotonic() + WAIT_S
-    while True:
-        for address in ADDRESSES:
-            if lock := lock_address(address):
-                with lock:
-                    yield address
-                return
+    for address in cycle(ADDRESSES):
+        lock = filelock.FileLock(Path(tempfile.gettempdir()) / f"padforge-ur-{address}.lock", timeout=0.1)
+        with suppress(filelock.Timeout), lock:
+            yield address
+            return
         if time.monotonic() > end:
             pytest.fail(f"other processes have had the emulator's ports for {WAIT_S} s")
-        time.sleep(0.1)
 
 
 @pytest.fixture(scope="module")

@@ -136,7 +136,7 @@ def test_gcode_has_nothing_that_a_firmware_misreads():
 def test_gcode_of_one_family_says_where_fibre_1_starts(fibres, start):
     text = program(Plan(Morphology.straight(fibres)))
     assert f"; fibre 1 starts {start}\n" in text
-    ends = np.vstack([way.corners[[0, -1], :2] for _, way in run_gcode(text).placed_fibres()])
+    ends = np.vstack([way.corners[[0, -1], :2] for _, way in placed_fibres(run_gcode(text))])
     assert ends[0] == pytest.approx((ends[:, 0].max(), ends[:, 1].min()))
 
 

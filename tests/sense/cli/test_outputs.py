@@ -23,6 +23,7 @@ from padforge.sense.settings import RigSettings
 from padforge.sense.simulation.simulated_recording import simulate
 from tests.helpers.folders import files_in
 from tests.helpers.golden import Golden
+from tests.helpers.presses import changed
 from tests.sense.cli.conftest import Run
 from tests.sense.conftest import first_presses
 
@@ -43,7 +44,6 @@ class Session:
         return out
 
     def head(self, file: str, lines: int) -> None:
-        """Show the first lines of a file."""
         self.lines += [f"$ head -{lines} {file}", *Path(file).read_text().splitlines()[:lines], ""]
 
     @property
@@ -61,9 +61,7 @@ def test_session_of_few_presses(few: Run, golden: Golden, monkeypatch: pytest.Mo
     Path("torn/readings.bin").write_bytes(Path("rec/readings.bin").read_bytes()[:-100])
     first_presses(good, 4).save("short", {})
     replace(good, presses_mm=good.presses_mm / 1000).save("metres", {})
-    presses_mm = good.presses_mm.copy()
-    presses_mm[7] = 250, 3
-    replace(good, presses_mm=presses_mm).save("typo", {})
+    changed(good, "presses_mm", 7, (250, 3)).save("typo", {})
     Morphology.straight(2).save(Path("plan.json"))
     session("calibrate rec --out new")
     session("calibrate metres --out m --without moments --without figures")
@@ -107,9 +105,7 @@ def test_session_of_faulty_fibres_and_of_another_pad(enough: Run, golden: Golden
     stuck = Recording(readings[first:], whole.times_s[first:], whole.presses_mm[240:], *edges)
     stuck.save("stuck", {})
     part = first_presses(whole, 120)
-    moved = np.array(part.readings)
-    moved[:, 1] += 0.33
-    replace(part, readings=moved).save("moved", {})
+    changed(part, "readings", np.s_[:, 1], part.readings[:, 1] + 0.33).save("moved", {})
     again = simulate(Morphology.straight(2), RigSettings(presses=30, seed=14))
     again.save("again", {})
     session("health --model model rec")
@@ -129,9 +125,7 @@ def test_session_of_faulty_fibres_and_of_another_pad(enough: Run, golden: Golden
     assert not set(places[:since]) & set(masked[:since])
 
 
-def test_session_of_a_fibre_that_was_dead_from_the_start(
-    few: Run, golden: Golden, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_session_of_a_fibre_that_was_dead_from_the_start(few: Run, golden: Golden, monkeypatch) -> None:
     """The fourth; the second one is stuck, and all respond less than at the calibration."""
     fault = FibreFault(press=7, since=5, fibres=(1,), kind="stuck", score=4.0)
     shifts = [DomainShift("gain", (0, 1, 2, 3), 0.714, (0.9, 1.1)), DomainShift("rest", (0,), 1.5, (1.75, 2.25))]

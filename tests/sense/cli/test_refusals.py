@@ -13,6 +13,8 @@ from padforge.benchmarks.twin import printed_pad
 from padforge.common.files import sha256
 from padforge.design import Morphology
 from padforge.design.twin import TwinChannel
+from padforge.fabricate import MouldSettings, build
+from padforge.fabricate.settings import DEFAULTS
 from padforge.sense import Recording
 from padforge.sense.live.outputs import LivePage
 from padforge.sense.settings import RigSettings
@@ -64,6 +66,9 @@ record --rig hand {straight} --dry-run          | --dry-run and --model need an 
 doctor --rig ur5 --spec 3.toml {five}           | [rig] channels: got 3 inputs, the pad has 10 fibres
 doctor --rig crane                              | --rig is 'crane', allowed are hand, printer, ur5
 doctor --rig simulated                          | --rig is 'simulated', allowed are hand, printer, ur5
+record {thin/morphology}                        | presses 5 mm deep, allowed is less than 4 mm, by thin/fabrication.json
+record --rig ur5 {thin/morphology}              | presses 5 mm deep, allowed is less than 4 mm, by thin/fabrication.json
+record --rig hand {thin/morphology}             | presses 5 mm deep, allowed is less than 4 mm, by thin/fabrication.json
 record --rig crane                              | --rig is 'crane', allowed are simulated, hand, printer, ur5
 {live} --model model --rig crane                | --rig is 'crane', allowed are simulated, hand, printer, ur5
 calibrate rec --time-budget 0                   | Invalid value for '--time-budget': 0.0 is not in the range x>0
@@ -76,7 +81,7 @@ calibrate rec --time-budget nan                 | Invalid value for '--time-budg
 {live} --model model --replay rec --tcp 0 --rerun here | --rerun is 'here', expected an address like rerun+http://HOST:PORT
 {live} --model model --tcp 0 --token short      | token has 5 characters, allowed are 16 or more
 """
-SHORT = {name: f"--morphology {name}.json" for name in ("straight", "five")}
+SHORT = {name: f"--morphology {name}.json" for name in ("straight", "five", "thin/morphology")}
 SHORT |= {"live": "live --port 0", "unread": "--morphology straight.json --spec none.toml"}
 
 
@@ -87,10 +92,11 @@ def workshop(few_presses: Path, tmp_path_factory: pytest.TempPathFactory) -> Pat
     (folder / "noise.mat").write_bytes(b"no matlab" * 100)
     (folder / "rec2.mcap").write_bytes(b"")
     (folder / "noise.csv").write_text("a,b\n1,2\n")
-    for name in ("empty", "mine", "designed"):
+    for name in ("empty", "mine", "designed", "thin"):
         (folder / name).mkdir()
-    for name, grid in (("straight", 2), ("five", 5), ("mine/morphology", 2)):
+    for name, grid in (("straight", 2), ("five", 5), ("mine/morphology", 2), ("thin/morphology", 2)):
         Morphology.straight(grid).save(folder / f"{name}.json")
+    build(Morphology.straight(2), folder / "thin", ["svg"], replace(DEFAULTS, mould=MouldSettings(silicone_mm=4.0)))
     (folder / "none.toml").write_text('[rig]\nport = "none"\n')
     (folder / "3.toml").write_text('[rig]\nport = "none"\nchannels = [4, 0, 7]\n')
     simulate(Morphology.straight(3), RigSettings(presses=30)).save(folder / "other", {})
@@ -110,9 +116,7 @@ def workshop(few_presses: Path, tmp_path_factory: pytest.TempPathFactory) -> Pat
 
 
 @pytest.mark.parametrize(("words", "said"), [row.split(" | ", 1) for row in ROWS.strip().splitlines()])
-def test_invalid_command_fails_in_one_line(
-    padforge_sense, workshop: Path, monkeypatch: pytest.MonkeyPatch, words: str, said: str
-) -> None:
+def test_invalid_command_fails_in_one_line(padforge_sense, workshop: Path, monkeypatch, words: str, said: str) -> None:
     monkeypatch.setattr("padforge.sense.localizer.training.RETRAINING_STEPS", 1)
     monkeypatch.setattr("padforge.sense.rig.boards.due.list_due_ports", list)
     monkeypatch.chdir(workshop)

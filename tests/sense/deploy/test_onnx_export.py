@@ -25,9 +25,7 @@ DIGEST = "a" * 64
 
 
 @pytest.fixture(scope="module")
-def exported(
-    localizer: LocalizerModel, brief: Recording, tmp_path_factory: pytest.TempPathFactory
-) -> tuple[Path, OnnxReport]:
+def exported(localizer: LocalizerModel, brief: Recording, tmp_path_factory) -> tuple[Path, OnnxReport]:
     """A graph of frames of a fast board, tested on presses of which the recording cuts off the last one."""
     path = tmp_path_factory.mktemp("onnx") / "localizer.onnx"
     return path, export_onnx(replace(localizer, rate_hz=1000.0), DIGEST, path, first_presses(brief, 5))
@@ -57,9 +55,7 @@ def check_graph(graph: onnxruntime.InferenceSession, inputs: dict[str, np.ndarra
         np.testing.assert_allclose(np.asarray(values), getattr(expected, name), rtol=1e-4)
 
 
-def test_graph_gives_the_predictions_with_masked_fibres_missing_readings_and_far_beyond_the_training(
-    graph, localizer, brief
-) -> None:
+def test_graph_predicts_with_masked_fibres_missing_readings_and_far_beyond_training(graph, localizer, brief) -> None:
     presses, fibres = localizer.scaled_features(brief), np.arange(4)
     for failed in ((), (2,), (0, 3), (0, 1, 2), (0, 1, 2, 3)):
         fibre_mask = presses.fibre_mask & ~np.isin(fibres, failed)

@@ -26,7 +26,6 @@ def eight() -> Recording:
 
 @pytest.fixture(scope="session")
 def bag(eight: Recording, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The bag of `eight`."""
     path = tmp_path_factory.mktemp("bag") / "eight.mcap"
     export_bag(eight, path)
     return path

@@ -1,9 +1,10 @@
-"""What every format holds of one small recording, and what `import --show` says of files, kept as a whole."""
+"""What every format holds of one small recording, what `import --show` says of files, and datasets of many files."""
 
 import json
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import h5py
 import numpy as np
@@ -12,10 +13,13 @@ import pytest
 import scipy.io
 from rosbags.rosbag2 import Reader
 
+from padforge.common.validation import InputError
 from padforge.sense import FibreFault, Localization, Recording, export_bag, export_csv, export_hdf5, export_lerobot
-from padforge.sense.formats.import_export import describe_file, import_file
+from padforge.sense.formats import lerobot
+from padforge.sense.formats.import_export import describe_file, export_file, import_file
 from padforge.sense.localizer.model import MeasureEstimate
 from tests.helpers.golden import Golden, json_text
+from tests.helpers.power_cut import ON_LINUX, Disk
 
 from .foreign import STORE, array, as_json, make, pose, write_bag
 
@@ -48,17 +52,12 @@ def localization() -> Localization:
     return Localization(*positions, np.ones(3), np.array([1.25, 2.25, 9.0]), {"depth_mm": depth})
 
 
-def test_csv(three: Recording, golden: Golden, tmp_path: Path) -> None:
+def test_csv_and_hdf5(three: Recording, golden: Golden, tmp_path: Path) -> None:
     export_csv(three, tmp_path / "three.csv")
     golden("formats/export.csv", (tmp_path / "three.csv").read_text())
-
-
-def test_hdf5(three: Recording, golden: Golden, tmp_path: Path) -> None:
     export_hdf5(three, tmp_path / "three.h5")
     with h5py.File(tmp_path / "three.h5") as file:
-        about = {
-            name: f"{data.dtype} {data.shape} {np.array(data).ravel()[:4].tolist()}" for name, data in file.items()
-        }
+        about = {name: f"{data.dtype} {data.shape} {data[()].ravel()[:4].tolist()}" for name, data in file.items()}
         golden("formats/hdf5.json", {"attributes": dict(file.attrs), "datasets": about})
 
 
@@ -86,12 +85,9 @@ def test_bag(three: Recording, localization: Localization, golden: Golden, tmp_p
 def compact(value: Any) -> str:
     """JSON in one line, without what is 0 or empty, and arrays of 36 as the values that are not 0."""
     if isinstance(value, dict):
-        parts = {name: compact(part) for name, part in value.items()}
-        return (
-            "{"
-            + ", ".join(f"{name}: {part}" for name, part in parts.items() if part not in ("0", "''", "[]", "{}"))
-            + "}"
-        )
+        texts = {name: compact(part) for name, part in value.items()}
+        parts = (f"{name}: {text}" for name, text in texts.items() if text not in ("0", "''", "[]", "{}"))
+        return f"{{{', '.join(parts)}}}"
     if isinstance(value, list) and len(value) == 36:
         return str({at: number for at, number in enumerate(value) if number})
     if isinstance(value, list):
@@ -141,3 +137,61 @@ def test_descriptions_and_sources_of_files(golden: Golden, tmp_path: Path) -> No
         numbers = float(recording.times_s[1]), recording.readings[1].tolist(), recording.down_command.tolist()
         lines += [f"-- {path.name}", *describe_file(path), f"{numbers}", f"{dict(recording.source)}"]
     golden("formats/show.txt", "\n".join(lines))
+
+
+@pytest.fixture(scope="module")
+def eight(eight: Recording) -> Recording:
+    """Eight presses of known depth, one at an unknown position, with missing readings."""
+    return replace(eight, depths_mm=np.where(np.isnan(eight.depths_mm), 1.5, eight.depths_mm))
+
+
+def read_dataset(folder: Path) -> tuple[dict[str, Any], list[dict[str, Any]]]:
+    """Return the info and the episodes of a dataset whose episodes are each a row group of their file."""
+    info = json.loads((folder / "meta" / "info.json").read_text())
+    episodes = pq.read_table(folder / "meta" / "episodes").to_pylist()
+    groups, opened = [], dict[Path, int]()
+    for number, episode in enumerate(episodes):
+        chunk, file = episode["data/chunk_index"], episode["data/file_index"]
+        path = folder / info["data_path"].format(chunk_index=chunk, file_index=file)
+        groups.append(pq.ParquetFile(path).read_row_group(opened.setdefault(path, 0)))
+        opened[path] += 1
+        assert set(groups[-1]["episode_index"].to_pylist()) == {number}
+        assert groups[-1]["frame_index"].to_pylist() == list(range(episode["length"]))
+    assert opened == {path: pq.ParquetFile(path).num_row_groups for path in (folder / "data").glob("*/*.parquet")}
+    columns = {name: np.concatenate([np.array(each[name].to_pylist()) for each in groups]) for name in info["features"]}
+    ends = np.cumsum([episode["length"] for episode in episodes])
+    assert [episode["dataset_to_index"] for episode in episodes] == ends.tolist()
+    assert columns["index"].tolist() == list(range(info["total_frames"])) == list(range(ends[-1]))
+    return info, episodes
+
+
+@ON_LINUX
+def test_export_lerobot_outlasts_a_power_cut(eight: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    disk, path = Disk(monkeypatch), tmp_path / "new" / "data"
+    export_file(eight, path, "lerobot")
+    files = [file for file in path.rglob("*") if file.is_file()]
+    assert all(disk.read(file) == file.read_bytes() for file in files)
+    assert all(disk.has_name(folder) for folder in (path.parent, path, *path.rglob("*")))
+
+
+@pytest.mark.parametrize(("slower", "fps"), [(1.0, 13), (10.0, 1.34), (0.05, 268)])
+@patch.multiple(lerobot, FILE_MB=100 * 50 / 2**20, CHUNK_FILES=2)
+def test_export_lerobot_rounds_rates_and_splits_files(eight: Recording, tmp_path, slower: float, fps: float) -> None:
+    changed = replace(eight, readings=eight.readings[:, :1], times_s=eight.times_s * slower)
+    export_lerobot(changed, tmp_path / "set")
+    info, episodes = read_dataset(tmp_path / "set")
+    assert info["fps"] == pytest.approx(fps, rel=0.02)
+    assert isinstance(info["fps"], int) == (slower < 2)
+    assert info["features"]["observation.state"]["shape"] == [1]
+    files = {(each["data/chunk_index"], each["data/file_index"]) for each in episodes}
+    assert files == {(0, 0), (0, 1), (1, 0), (1, 1)}
+
+
+def test_export_lerobot_writes_all_or_nothing(eight: Recording, tmp_path: Path) -> None:
+    full = patch.object(lerobot, "write_json", side_effect=OSError(28, "No space left on device"))
+    with full, pytest.raises(InputError, match=r"set: cannot be written \(No space left"):
+        export_lerobot(eight, tmp_path / "set")
+    assert not list(tmp_path.iterdir())
+    (tmp_path / "set").mkdir()
+    export_lerobot(eight, tmp_path / "set")  # an empty folder is filled
+    assert read_dataset(tmp_path / "set")[0]["total_frames"] == 7 * 40  # of known positions

@@ -13,7 +13,6 @@ import scipy.io
 
 from padforge.common.validation import InputError
 from padforge.sense import Recording, import_bag, import_csv
-from padforge.sense.formats.csv_recording import read_presses
 from padforge.sense.formats.import_export import import_file
 from padforge.sense.recording.doubts import find_doubts
 from tests.helpers.golden import Golden
@@ -269,9 +268,7 @@ def test_what_is_said_of_tables(golden: Golden, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("cut", [6, 9, 12, 13, 20, None])
 @pytest.mark.parametrize("unit", ["s", "ms"])
-def test_import_csv_reads_the_line_that_follows_a_torn_one_in_the_same_line(
-    tmp_path: Path, cut: int | None, unit: str
-) -> None:
+def test_import_csv_reads_the_line_that_follows_a_torn_one_in_its_line(tmp_path, cut: int | None, unit: str) -> None:
     lines = rows(lambda i: f"{TIMES[i]:.3f}" if unit == "s" else str(10000 + 50 * i))
     lines[70:72] = [lines[70][:cut] + lines[71]]
     (tmp_path / "lab.csv").write_text(table(lines=lines))
@@ -298,9 +295,6 @@ def test_presses_of_a_table_of_their_own(tmp_path: Path) -> None:
         assert recording.presses_mm.tolist() == SPOTS[begin].tolist()
         assert (recording.forces_n == 2.5).all()
         assert recording.source["note"] == "1 of 7 presses lie outside of the readings, and are left out"
-    (tmp_path / "presses.csv").write_text("x_mm,y_mm\n1,2\n")
-    with pytest.raises(InputError, match=r"expected down \(down_s\) and one of up \(up_s\) and duration"):
-        read_presses(tmp_path / "presses.csv")
 
 
 def test_recording_from_arrays(tmp_path: Path) -> None:
@@ -344,12 +338,8 @@ def opaque(path: Path, name: bytes, kind: bytes) -> Path:
 
 def published_variables(**changes: Any) -> dict[str, Any]:
     """Return the variables of a published file of three presses, with changes; None leaves one out."""
-    rng = np.random.default_rng(0)
-    content = {
-        "voltage": rng.uniform(1, 2, (120, 4)),
-        "pos": rng.uniform(-9, 9, (2, 3)),
-        "tim": np.arange(120.0)[None] / 13,
-    }
+    rng, tim = np.random.default_rng(0), np.arange(120.0)[None] / 13
+    content = {"voltage": rng.uniform(1, 2, (120, 4)), "pos": rng.uniform(-9, 9, (2, 3)), "tim": tim}
     return {name: value for name, value in (content | changes).items() if value is not None}
 
 
@@ -452,7 +442,7 @@ def test_fibres_are_in_the_order_of_their_numbers_and_it_is_said(tmp_path: Path,
     assert "fibre 12 = " in recording.source["note"]
 
 
-def test_import_bag_holds_late_poses_and_spreads_bursts(tmp_path: Path) -> None:
+def test_import_bag_holds_late_poses_spreads_bursts_and_reads_bags_of_ros_1(tmp_path: Path) -> None:
     messages = []
     for i in range(N):
         messages.append(("/skin", TIMES[i - i % 2], array("Float64MultiArray", VOLTS[i])))
@@ -462,6 +452,10 @@ def test_import_bag_holds_late_poses_and_spreads_bursts(tmp_path: Path) -> None:
     recording = import_bag(write_bag(tmp_path / "bag", messages), "fibres=/skin,positions=/pose")
     check(recording)
     np.testing.assert_allclose(recording.presses_mm[3], [-10, 10], atol=0.1)
+    check(import_bag(write_ros1_bag(tmp_path / "lab.bag", "/skin", TIMES + 1.7e9, VOLTS), "fibres=/skin"))
+
+
+FLAGS = ("/never", 0.2, False), ("/before", 0.0, True), ("/before", 0.01, False)
 
 
 def test_what_is_said_of_bags(golden: Golden, tmp_path: Path) -> None:
@@ -475,11 +469,9 @@ def test_what_is_said_of_bags(golden: Golden, tmp_path: Path) -> None:
         name: [("/f", i / 20, m) for i, m in enumerate(each)] for name, each in numbers.items()
     }
     messages["some"] += [
-        ("/cloud", 0.0, make("PointCloud", header(), [], channels)),
-        ("/words", 0.0, make("String", "a")),
+        *(("/cloud", 0.0, make("PointCloud", header(), [], channels)), ("/words", 0.0, make("String", "a"))),
+        *((topic, time, make("Bool", on)) for topic, time, on in FLAGS),
     ]
-    messages["some"] += [("/never", 0.2, make("Bool", False)), ("/before", 0.0, make("Bool", True))]
-    messages["some"] += [("/before", 0.01, make("Bool", False))]
     messages["poses"], messages["odometry"] = [], []
     for time, volts, spot in zip(TIMES, VOLTS, SPOTS / 1000, strict=True):
         messages["poses"].append(("/all", time, make("Pose", make("Point", *spot, 0.0), make("Quaternion", *volts))))
@@ -501,18 +493,3 @@ def test_what_is_said_of_bags(golden: Golden, tmp_path: Path) -> None:
         "lab": (LAB_COLUMNS, "fibres=/skin/?:0.01,press=/down,x=/at/x:mm,y=/at/y", "fibres=/camera"),
     }
     golden("formats/bags.txt", outcomes(tmp_path, "*.mcap", mappings))
-
-
-def test_import_bag_reads_bags_of_ros_1(tmp_path: Path) -> None:
-    bag = write_ros1_bag(tmp_path / "lab.bag", "/skin", TIMES + 1.7e9, VOLTS)
-    check(import_bag(bag, "fibres=/skin"))
-
-
-def test_import_mat_reads_the_published_recording(published: Path) -> None:
-    recording = import_file(published / "para5_long_first4500.mat")
-    content = scipy.io.loadmat(published / "para5_long_first4500.mat")
-    assert np.array_equal(recording.readings, content["voltage"])
-    assert np.array_equal(recording.presses_mm, content["pos"].T)
-    assert np.array_equal(recording.times_s, content["tim"].ravel())
-    assert recording.down_command[:3].tolist() == [20, 60, 100]
-    assert recording.up_command[:3].tolist() == [40, 80, 120]

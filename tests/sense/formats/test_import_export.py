@@ -1,37 +1,141 @@
-"""Import and export by extension, and arguments of all readers and writers."""
+"""Mappings of columns, arrays, import and export by extension, and files that a crash or a broken copy has damaged."""
 
+import sys
+from collections.abc import Mapping
 from dataclasses import replace
+from functools import partial
+from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
+import h5py
 import numpy as np
 import pytest
-from click.testing import CliRunner
+import scipy.io
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
+from padforge import sense
 from padforge.common.validation import InputError
-from padforge.sense import (
-    Localization,
-    Recorder,
-    Recording,
-    export_bag,
-    export_csv,
-    export_hdf5,
-    export_lerobot,
-    import_bag,
-    import_csv,
-    import_hdf5,
-    import_mat,
-    open_recording,
+from padforge.sense import Recorder, Recording, export_bag, export_hdf5, import_hdf5
+from padforge.sense.formats import ros_recording
+from padforge.sense.formats.assembly import ForeignArrays, assemble_recording
+from padforge.sense.formats.columns import ColumnEntry, match_columns, parse_columns
+from padforge.sense.formats.csv_recording import read_presses
+from padforge.sense.formats.import_export import arm_states, export_file, import_file
+from padforge.sense.recording.recording import PRESSES_DETECTED
+from tests.helpers.door import contents
+from tests.helpers.refusals import refusal_table
+
+from .foreign import LAB_COLUMNS, array, lab, write_bag
+
+
+def test_match_columns_orders_fibres_by_their_numbers() -> None:
+    def order(*names: str, mapping: str = "time=t,fibres=*") -> list[str]:
+        return [entry.name for entry, _ in match_columns(parse_columns(mapping), ["t", *names])[1:]]
+
+    assert order("fibre_0_v", "fibre_10_v", "fibre_1_v") == ["fibre_0_v", "fibre_1_v", "fibre_10_v"]
+    assert order("c02", "c10", "c1") == ["c1", "c02", "c10"]
+    assert order("left", "back", "2nd") == ["left", "back", "2nd"]  # a table has an order of its own
+    assert order("c2", "c1", mapping="time=t,fibres=c2,fibres=c1") == ["c2", "c1"]  # as stated
+
+
+TIMES = np.arange(12) / 10
+VOLTS = np.arange(24.0).reshape(12, 2)
+PRESSED = np.array([0, 0, 1, 1, 1, 0, 0, 1, 1, 0, 0, 0])
+POSITIONS = np.array([[1.0, 2], [-3, 4]])
+COMMANDS = {"down_command": np.array([2, 7]), "up_command": np.array([5, 9])}
+PROBE = POSITIONS[[0, 0, 0, 0, 0, 1, 1, 1, 1, 1, 1, 1]]
+"""Position of the probe at each reading."""
+NUMBERED = PRESSED * np.array([5] * 6 + [3] * 6)
+
+
+def assembled(arrays: Mapping[str, np.ndarray], **factors: float) -> Recording:
+    content = {"time": TIMES, "fibres": VOLTS} | dict(arrays)
+    entries = [(ColumnEntry(name, "?", factors.get(name)), content[name]) for name in content]
+    return assemble_recording(ForeignArrays(Path("f"), entries, {}))
+
+
+@pytest.mark.parametrize(
+    "arrays",
+    [
+        COMMANDS | {"positions": POSITIONS},
+        COMMANDS | {"x": POSITIONS[:, 0], "y": POSITIONS[None, :, 1]},
+        {"press": PRESSED.astype(bool)[:, None], "positions": PROBE},
+        {"press": np.where(PRESSED, NUMBERED, np.nan), "positions": PROBE},
+        {"press": np.where(PRESSED, NUMBERED, -1), "positions": POSITIONS.T.astype(np.float32)},
+        {"positions": np.where(PRESSED[:, None], PROBE, np.nan)},
+    ],
 )
-from padforge.sense.cli.main import sense
-from padforge.sense.formats.import_export import arm_states, export_file
+def test_assemble_recording_finds_presses_in_any_form(arrays: dict[str, np.ndarray]) -> None:
+    recording = assembled(arrays)
+    assert recording.down_command.tolist() == [2, 7]
+    assert recording.up_command.tolist() == [5, 9]
+    # Two positions of two presses may be (2, n) or (n, 2): rows are presses.
+    expected = POSITIONS.T if arrays.get("positions", PROBE).dtype == "f4" else POSITIONS
+    assert recording.presses_mm.tolist() == expected.tolist()
+
+
+def test_assemble_recording_detects_presses_in_the_readings(recording: Recording) -> None:
+    probe = np.full((len(recording.readings), 2), np.nan)
+    for position, down in zip(recording.presses_mm, recording.down_command, strict=True):
+        probe[down - 10 :] = position
+    probe[:10] = recording.presses_mm[0]
+    content = {"time": recording.times_s[:800], "fibres": recording.readings[:800]}
+    for positions in (recording.presses_mm[:20], probe[:800]):
+        detected = assembled(content | {"positions": positions})
+        assert np.array_equal(detected.presses_mm, recording.presses_mm[:20])
+        assert np.abs(detected.down_command - recording.down_command[:20]).max() <= 3
+        assert PRESSES_DETECTED.items() <= detected.source.items()
+    with pytest.raises(InputError, match="positions are 19, expected one for each of 20 presses or 800 readings"):
+        assembled(content | {"positions": recording.presses_mm[:19]})
+
+
+@pytest.mark.parametrize(
+    ("arrays", "message"),
+    [
+        ({"fibres": np.ones((11, 2))}, r"fibres have shape \(11, 2\), expected \(12, C\) or \(C, 12\), 12 as in time"),
+        ({"press": np.where(PRESSED, 1, np.where(TIMES > 1, -1, 0))}, "press is missing or negative in row 11 and 0"),
+        ({"press": 1 + PRESSED}, "press is nowhere 0, missing or negative"),
+        (COMMANDS | {"positions": np.ones((3, 2))}, "positions are 3, expected one for each of 2 presses or 12"),
+        ({}, "has no press"),
+    ],
+)
+def test_assemble_recording_refuses_arrays_that_do_not_fit(arrays: dict[str, np.ndarray], message: str) -> None:
+    with pytest.raises(InputError, match=f"f: {message}"):
+        assembled(arrays)
+
+
+def test_assemble_recording_bridges_gaps_of_positions(recording: Recording) -> None:
+    """A motion capture loses 5 % of the positions for one reading."""
+    positions = np.full((len(recording.times_s), 2), np.nan)
+    depths = np.full(len(positions), np.nan)
+    for position, down, up in zip(recording.presses_mm, recording.down_command, recording.up_command, strict=True):
+        positions[down:up], depths[down:up] = position, 3.0
+    lost = np.random.default_rng(0).random(len(positions)) < 0.05
+    lost[[*recording.down_command, *(recording.up_command - 1)]] = False
+    content = {"time": recording.times_s, "fibres": recording.readings}
+    gappy = {"positions": np.where(lost[:, None], np.nan, positions), "depth": np.where(lost, np.nan, depths)}
+    bridged = assembled(content | gappy)
+    assert np.array_equal(bridged.down_command, recording.down_command)
+    assert np.array_equal(bridged.up_command, recording.up_command)
+    assert np.array_equal(bridged.presses_mm, recording.presses_mm)
+    assert (bridged.depths_mm == 3).all()
+    n_lost = int((lost & ~np.isnan(positions[:, 0])).sum())
+    assert bridged.source["note"].startswith(f"{n_lost} readings within presses lack a position; gaps of up to 3")
+
+
+@pytest.mark.parametrize(("gap", "rest", "presses"), [(2, 6, 2), (3, 6, 3), (4, 12, 3)])
+def test_assemble_recording_keeps_rests_between_presses(gap: int, rest: int, presses: int) -> None:
+    """Two presses on one spot are two if the pad rests as long between others."""
+    x = np.array([*[np.nan] * 5, *[1.0] * 5, *[np.nan] * gap, *[1.0] * 5, *[np.nan] * rest, *[2.0] * 5, np.nan])
+    content = {"time": np.arange(len(x)) / 10, "fibres": np.ones((len(x), 1)), "x": x, "y": x}
+    assert len(assembled(content).down_command) == presses
 
 
 @pytest.mark.parametrize("are_measured", [True, False])
 @pytest.mark.parametrize("name", ["run", "run.csv", "run.h5", "run.mcap"])
-def test_recordings_with_missing_values_are_read_back_from_each_format(
-    eight: Recording, tmp_path: Path, name: str, are_measured: bool
-) -> None:
+def test_each_format_keeps_missing_values(eight: sense.Recording, tmp_path, name: str, are_measured: bool) -> None:
     """The same recording gives the same bytes, and tables have no column of what no press has."""
     if not are_measured:
         eight = replace(eight, depths_mm=np.empty(0), reached_mm=np.empty(0))
@@ -39,7 +143,7 @@ def test_recordings_with_missing_values_are_read_back_from_each_format(
     for path in paths:
         path.parent.mkdir()
         eight.save(path, {}) if name == "run" else export_file(eight, path)
-    imported = open_recording(paths[0])
+    imported = sense.open_recording(paths[0])
     assert imported == eight
     assert imported.digest == eight.digest
     assert imported.has_position.sum() == 7
@@ -51,58 +155,143 @@ def test_recordings_with_missing_values_are_read_back_from_each_format(
         assert imported.source == eight.source
 
 
-def unrelated_files() -> dict[str, bytes]:
-    """Return the content of files of other kinds, by name."""
-    return {
-        "image": b"\x89PNG\r\n\x1a\n" + np.random.default_rng(1).bytes(2000),
-        "empty": b"",
-        "text": b"dear all,\nplease find attached\n",
-        "people": b"name,age\nAda,36\n",
-    }
-
-
-@pytest.mark.parametrize("end", ["mat", "csv", "h5", "mcap", "db3"])
-def test_import_refuses_files_of_another_kind(tmp_path: Path, end: str) -> None:
-    for name, content in unrelated_files().items():
-        file = tmp_path / f"{name}.{end}"
-        file.write_bytes(content)
-        result = CliRunner().invoke(sense, ["import", str(file), "--out", str(tmp_path / "out")])
-        assert isinstance(result.exception, InputError), (name, result.exception)
-        message = str(result.exception)
-        assert (file.name in message, "\n" in message, len(message) < 300 + len(str(file))) == (True, False, True)
-        assert not (tmp_path / "out").exists()
-
-
-def test_readers_and_writers_refuse_folders_for_files(brief: Recording, tmp_path: Path) -> None:
-    for read, end in ((import_csv, "csv"), (import_mat, "mat"), (import_hdf5, "h5"), (import_bag, "mcap")):
-        (tmp_path / f"folder.{end}").mkdir()
-        for path in (tmp_path / f"folder.{end}", tmp_path / f"absent.{end}"):
-            with pytest.raises(InputError, match=rf"{path.name}.*: .*(folder|directory|[Nn]o such|cannot be read)"):
-                read(path)
-    (tmp_path / "file").touch()
-    for path in (tmp_path, tmp_path / "file" / "r.csv"):
-        with pytest.raises(InputError, match="cannot be written"):
-            export_csv(brief, path)
-
-
 def test_arm_states_of_a_run_directory(tmp_path: Path) -> None:
     states = np.arange(30.0).reshape(3, 10)
-    with Recorder(tmp_path / "run", 1, {}, {}) as recorder:
+    with sense.Recorder(tmp_path / "run", 1, {}, {}) as recorder:
         recorder.append([0.0, 1.0], [[1.0], [2.0]])
         recorder.append_states(states)
     np.testing.assert_array_equal(arm_states(tmp_path / "run"), states)
     assert arm_states(tmp_path / "run.csv") is None
 
 
-def test_readers_and_writers_refuse_other_arguments(brief: Recording, tmp_path: Path) -> None:
-    other: Any = 3
-    with pytest.raises(InputError, match=r"columns is 3, expected a str"):
-        import_csv("file", other)
-    for write in (export_csv, export_hdf5, export_bag, export_lerobot):
-        with pytest.raises(InputError, match=r"recording is 3, expected a Recording"):
-            write(other, tmp_path / "x")
-    ones = np.ones((40, 2))
-    touches = Localization(ones, ones, ones[:, 0], ones[:, 0])
-    with pytest.raises(InputError, match=r"predictions of a model can be written as \.mcap"):
-        export_file(brief, tmp_path / "r.csv", localization=touches)
-    assert list(tmp_path.iterdir()) == []
+READERS = {"csv": sense.import_csv, "mat": sense.import_mat, "h5": sense.import_hdf5, "mcap": sense.import_bag}
+WRITERS = (sense.export_csv, sense.export_hdf5, sense.export_bag, sense.export_lerobot)
+UNRELATED = {
+    "image": b"\x89PNG\r\n\x1a\n" + np.random.default_rng(1).bytes(2000),
+    "empty": b"",
+    "text": b"dear all,\nplease find attached\n",
+    "people": b"name,age\nAda,36\n",
+}
+
+
+def test_what_readers_and_writers_are_asked_in_vain(eight: sense.Recording, golden, tmp_path, monkeypatch) -> None:
+    """To read folders, nothing and files of another kind; to write where something is, other things, and too much."""
+    for end in (*READERS, "db3"):
+        (tmp_path / f"folder.{end}").mkdir()
+        for name, content in UNRELATED.items():
+            (tmp_path / f"{name}.{end}").write_bytes(content)
+    (tmp_path / "presses.csv").write_text("x_mm,y_mm\n1,2\n")
+    write_bag(tmp_path / "lab", lab()).unlink()
+    ones = array("Float64MultiArray", np.ones(50))
+    damaged = write_bag(tmp_path / "damaged", [("/f", i / 10, ones) for i in range(9)])
+    content, length = damaged.read_bytes(), damaged.read_bytes().index(np.ones(50).tobytes()) - 8
+    damaged.write_bytes(content[:length] + b"\xff\xff\xff\x7f" + content[length + 4 :])
+    known, other = replace(eight, depths_mm=np.ones(8)), cast("Any", 3)
+    touches = sense.Localization(np.ones((8, 2)), np.ones((8, 2)), np.ones(8), np.ones(8))
+    rows = {
+        **{
+            f"{name}.{end}": partial(read, tmp_path / f"{name}.{end}")
+            for end, read in READERS.items()
+            for name in ("folder", "absent")
+        },
+        **{f"{name}.{end}": partial(import_file, tmp_path / f"{name}.{end}") for end in READERS for name in UNRELATED},
+        **{f"{name}.db3": partial(import_file, tmp_path / f"{name}.db3") for name in ("folder", *UNRELATED)},
+        "a folder of other files": lambda: import_file(tmp_path),
+        "a bag without its file": lambda: import_file(tmp_path / "lab", LAB_COLUMNS),
+        "an array in a bag of a damaged length": lambda: sense.import_bag(damaged, "fibres=/f"),
+        "presses without times": lambda: read_presses(tmp_path / "presses.csv"),
+        "columns that are a number": lambda: sense.import_csv("file", other),
+        **{f"{write.__name__} of a number": partial(write, other, tmp_path / "x") for write in WRITERS},
+        "a table onto a folder": lambda: sense.export_csv(eight, tmp_path),
+        "a table below a file": lambda: sense.export_csv(eight, tmp_path / "presses.csv" / "r.csv"),
+        "a bag onto a folder": lambda: sense.export_bag(eight, tmp_path / "folder.mcap"),
+        "a dataset among other files": lambda: sense.export_lerobot(known, tmp_path),
+        "a dataset of no position": lambda: sense.export_lerobot(
+            replace(known, presses_mm=np.full((8, 2), np.nan)), tmp_path / "set"
+        ),
+        "predictions in a table": lambda: export_file(eight, tmp_path / "r.csv", localization=touches),
+    }
+    before, said = contents(tmp_path), refusal_table(rows)
+    monkeypatch.setitem(sys.modules, "pyarrow", None)
+    monkeypatch.setattr(ros_recording, "_typestore", partial(import_module, "rosbags.missing"))
+    missing = {
+        "a dataset without pyarrow": lambda: sense.export_lerobot(known, tmp_path / "set"),
+        "a bag without rosbags": lambda: sense.export_bag(eight, tmp_path / "r.mcap"),
+        "the bag of another without rosbags": lambda: sense.import_bag(tmp_path / "people.mcap"),
+    }
+    reasons = [rf"(?<={words} )\(.*\)" for words in ("be read", "damaged", "kind", "be written")]  # of others' words
+    golden("formats/refusals.txt", f"{said}\n{refusal_table(missing)}", forget=reasons)
+    assert contents(tmp_path) == before
+
+
+@pytest.mark.parametrize("name", ["r.mat", "r.h5", "r.mcap", "packed.mcap", "r.db3"])
+def test_import_file_of_files_without_their_end(eight: Recording, bag: Path, tmp_path: Path, name: str) -> None:
+    path = tmp_path / name
+    if name in ("packed.mcap", "r.db3"):
+        messages = [("/pad/readings", i / 10, array("Float64MultiArray", np.ones(500) + i)) for i in range(60)]
+        write_bag(tmp_path / "bag", messages, "sqlite3" if name == "r.db3" else "mcap", name != "r.db3").rename(path)
+    elif name == "r.mat":
+        scipy.io.savemat(path, {"voltage": eight.readings, "tim": eight.times_s[None], "pos": eight.presses_mm.T})
+    else:
+        {"r.h5": export_hdf5, "r.mcap": export_bag}[name](eight, path)
+    content = path.read_bytes()
+    for share in (0.2, 0.5, 0.9):
+        path.write_bytes(content[: int(share * len(content))])
+        with pytest.raises(InputError) as refusal:
+            import_file(path)
+        assert "\n" not in str(refusal.value)
+        assert name in str(refusal.value)
+
+
+@pytest.mark.parametrize("name", ["readings.bin", "journal.ndjson", "start.json"])
+@settings(max_examples=15)
+@given(share=st.floats(0, 1, exclude_max=True), piece=st.binary(min_size=1, max_size=8), is_cut=st.booleans())
+def test_open_and_resume_of_damaged_run_directories(
+    eight: Recording, tmp_path_factory: pytest.TempPathFactory, name: str, share: float, piece: bytes, is_cut: bool
+) -> None:
+    folder = tmp_path_factory.mktemp("run") / "run"
+    eight.save(folder, {})
+    content = (folder / name).read_bytes()
+    at = int(share**2 * len(content))
+    (folder / name).write_bytes(content[:at] + (b"" if is_cut else piece + content[at + len(piece) :]))
+    lines: list[str] = []
+    try:
+        recording = Recording.open(folder)
+    except InputError as error:
+        recording, lines = None, str(error).splitlines()
+    if recording is None:
+        assert len(lines) == 1
+        return
+    if name == "readings.bin":
+        np.testing.assert_array_equal(recording.readings, eight.readings[: len(recording.readings)])
+        assert set(recording.down_command.tolist()) <= set(eight.down_command.tolist())
+    with Recorder.resume(folder):
+        pass
+    assert Recording.open(folder) == recording
+
+
+MAPPING = "time=times_s,fibres=readings_v,positions=presses_mm,down_command=down_command,up_command=up_command"
+
+
+@pytest.mark.parametrize("kind", ["external link", "soft link", "virtual", "external storage"])
+def test_import_hdf5_reads_nothing_from_other_files(tmp_path: Path, eight: Recording, kind: str) -> None:
+    path, other = tmp_path / "r.h5", tmp_path / "other"
+    other.write_bytes(eight.readings.tobytes())
+    export_hdf5(eight, path)
+    with h5py.File(path, "a") as file:
+        del file["readings_v"]
+        if kind == "external link":
+            file["readings_v"] = h5py.ExternalLink(other, "/x")
+        elif kind == "soft link":
+            file["readings_v"] = h5py.SoftLink("/times_s")
+        elif kind == "virtual":
+            layout = h5py.VirtualLayout(eight.readings.shape, "f8", maxshape=(None, eight.fibres))
+            source = h5py.VirtualSource(other, "x", eight.readings.shape, maxshape=(None, eight.fibres))
+            layout[: h5py.h5s.UNLIMITED] = source[: h5py.h5s.UNLIMITED]
+            file.create_virtual_dataset("readings_v", layout)
+        else:
+            storage = [(str(other), 0, eight.readings.nbytes)]
+            file.create_dataset("readings_v", eight.readings.shape, "f8", external=storage)
+    for mapping in ("", MAPPING):
+        with pytest.raises(InputError, match=r"^.*r\.h5.*readings_v.*expected.*$"):  # in one line
+            import_hdf5(path, mapping)

@@ -12,10 +12,8 @@ from tests.sense.health.pads import PRESSES, fit, part_of
 @pytest.fixture(scope="session")
 def pad(once: Once) -> Recording:
     """The first PRESSES on a simulated pad of six fibres."""
-    rig = RigSettings(presses=900, seed=1, drift_mv=10)
-    recording = once(
-        "health-pad", lambda folder: simulate(Morphology.random(3, knots=3, seed=5), rig, PUBLISHED_CONTACT)
-    )
+    winding, rig = Morphology.random(3, knots=3, seed=5), RigSettings(presses=900, seed=1, drift_mv=10)
+    recording = once("health-pad", lambda folder: simulate(winding, rig, PUBLISHED_CONTACT))
     return part_of(recording, 0, PRESSES, int(recording.down_command[PRESSES]))
 
 

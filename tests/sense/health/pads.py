@@ -38,7 +38,6 @@ def part_of(pad: Recording, first: int, stop: int, end: int, readings: Array | N
 
 
 def detect(model: HealthModel, recording: Recording) -> list[FibreFault]:
-    """Faults in a recording."""
     detector = FaultDetector()
     detector.model_ = model
     return detector.predict(recording)

@@ -39,9 +39,7 @@ def update_later(
         *(("drifting", {"drifting"}, 60), ("reduced_gain", {"reduced_gain"}, 60), ("inverted", {"inverted"}, 10)),
     ],
 )
-def test_planted_faults_are_detected(
-    pad: Recording, model: HealthModel, fault: str, kinds: set[str], within: int
-) -> None:
+def test_planted_faults_are_found(pad: Recording, model: HealthModel, fault: str, kinds: set[str], within: int) -> None:
     faults = detect_later(model, plant(pad, fault), pad)
     first, bad_from = faults[0], BAD_FROM - TRAINED
     assert first.kind in kinds
@@ -107,9 +105,7 @@ def test_monitor_detects_the_same_press_by_press(pad: Recording, model: HealthMo
     assert (since.keys(), since["noisy"], since["missing"]) == ({"open", "noisy", "missing"}, BAD_FROM, BAD_FROM)
 
 
-def test_fibre_is_missing_after_twenty_successive_presses_without_a_quarter_of_50_readings(
-    pad: Recording, model: HealthModel
-) -> None:
+def test_fibre_is_missing_after_twenty_presses_that_lack_a_quarter(pad: Recording, model: HealthModel) -> None:
     def without(lost: int, *presses: int) -> list[tuple[int, int, tuple[int, ...]]]:
         readings = pad.readings.copy()
         for down in pad.down_command[BAD_FROM + np.array(presses)]:

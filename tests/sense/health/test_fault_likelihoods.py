@@ -1,23 +1,129 @@
-"""Log-likelihood ratios against SciPy's densities, cumulative sums, and the tail of their peaks."""
+"""Traces and the prediction of each fibre from the others; likelihood ratios against SciPy's densities, and sums."""
 
 import math
 
 import numpy as np
 import pytest
-from numpy.typing import ArrayLike
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import ArrayLike, NDArray
 from scipy.stats import t as student
+from torch.nn import functional
 
-from padforge.sense.health.fault_likelihoods import (
-    LIBRARY,
-    MEDIAN_T,
-    STEPS,
-    ExceedanceModel,
-    FaultLikelihoods,
-    cusum_update,
-    estimate_noise,
-    fit_step_filters,
-)
-from padforge.sense.health.trace_model import COMPONENTS, REST, TARGETS, TRACE
+from padforge.sense.health import fault_likelihoods, trace_model
+from padforge.sense.health.fault_likelihoods import LIBRARY, MEDIAN_T, STEPS, ExceedanceModel, FaultLikelihoods
+from padforge.sense.health.trace_model import COMPONENTS, INPUTS, LOG_STD, MEMBERS, RELEASED, REST, TARGETS, TRACE
+from padforge.sense.localizer import optimizer
+
+N_FIBRES = 2
+
+
+def test_project_follows_response_rest_and_history() -> None:
+    rng = np.random.default_rng(0)
+    traces = rng.normal(0, 1, (120, N_FIBRES, TRACE)) + np.linspace(0, 3, 120)[:, None, None]
+    traces[5, 1, 3] = np.nan
+    components = rng.normal(0, 1, (N_FIBRES, TRACE, COMPONENTS))
+    pca = trace_model.TracePCA(components, np.ones((N_FIBRES, INPUTS)), np.ones((N_FIBRES, TARGETS)))
+    history = trace_model.TraceHistory.initial(N_FIBRES)
+    levels, residue, count = [math.nan] * N_FIBRES, np.zeros((N_FIBRES, COMPONENTS)), [0] * N_FIBRES
+    for trace in traces:
+        inputs, targets = pca.project(trace, history)
+        for fibre in range(N_FIBRES):
+            if np.isnan(trace[fibre]).any():
+                assert np.isnan(inputs[fibre, : COMPONENTS + 1]).all()
+                assert np.isnan(targets[fibre]).all()
+                continue
+            rest = trace[fibre, :REST].mean()
+            response = (trace[fibre] - rest) @ components[fibre]
+            level = rest if math.isnan(levels[fibre]) else levels[fibre]
+            np.testing.assert_allclose(inputs[fibre], [*response, rest - level, *residue[fibre]], atol=1e-9)
+            np.testing.assert_allclose(targets[fibre], [*response, rest - level], atol=1e-9)
+            count[fibre] += 1
+            levels[fibre] = level + max(1 / 50, 1 / count[fibre]) * (rest - level)
+            residue[fibre] = 0.7 * (residue[fibre] + response)
+        np.testing.assert_allclose(history.level, levels, atol=1e-9)
+        np.testing.assert_array_equal(history.n_presses, count)
+
+
+def test_fit_transform_finds_principal_directions_and_scales() -> None:
+    rng = np.random.default_rng(1)
+    patterns = np.linalg.qr(rng.normal(0, 1, (TRACE - REST, 3)))[0].T
+    amplitudes = np.array([5.0, 2.0, 0.5]) * rng.normal(0, 1, (400, N_FIBRES, 3))
+    traces = np.zeros((400, N_FIBRES, TRACE))
+    traces[:, :, REST:] = np.einsum("qck,kw->qcw", amplitudes, patterns)
+    pca, inputs, targets = trace_model.TracePCA.fit_transform(traces)
+    for fibre in range(N_FIBRES):
+        for component, pattern in enumerate(patterns):
+            assert abs(pca.components[fibre, REST:, component] @ pattern) > 0.98
+        rms = np.sqrt(((traces[:, fibre] @ pca.components[fibre]) ** 2).mean(axis=0))
+        largest = max(rms.max(), pca.input_scale_v[fibre].max())
+        np.testing.assert_allclose(pca.input_scale_v[fibre, :3], np.sqrt(rms[:3] * largest), rtol=1e-6)
+        np.testing.assert_allclose(pca.target_scale_v[fibre, :3], rms[:3])
+    assert inputs.shape == (400, N_FIBRES, INPUTS)
+    np.testing.assert_allclose(np.sqrt((targets[:, :, :3] ** 2).mean(axis=0)), 1)
+
+
+def random_weights(fibres: int, rng: np.random.Generator) -> dict[str, NDArray[np.float32]]:
+    hidden, outputs = 7, 2 * TARGETS
+    shapes = {
+        "first.w": (MEMBERS, fibres, INPUTS, hidden),
+        "first.mask": (MEMBERS, fibres, hidden),
+        "first.b": (MEMBERS, hidden),
+        "hidden.w": (MEMBERS, hidden, hidden),
+        "hidden.b": (MEMBERS, hidden),
+        "last.w": (MEMBERS, fibres, hidden, outputs),
+        "last.b": (MEMBERS, fibres, outputs),
+    }
+    return {name: (0.5 * rng.standard_normal(shape)).astype(np.float32) for name, shape in shapes.items()}
+
+
+@settings(max_examples=10)
+@given(seed=st.integers(0, 2**32 - 1), fibres=st.integers(1, 5))
+def test_predict_fibres_ignores_the_fibre_itself_and_masked_ones(seed: int, fibres: int) -> None:
+    rng = np.random.default_rng(seed)
+    weights = random_weights(fibres, rng)
+    inputs = rng.standard_normal((3, fibres, INPUTS)).astype(np.float32)
+    fibre_mask = rng.random((3, fibres)) < 0.7
+    mean, std = trace_model.predict_fibres(weights, inputs, fibre_mask)
+    for press, fibre in np.ndindex(3, fibres):
+        means, variances = [], []
+        for e in range(MEMBERS):
+            h = weights["first.b"][e].astype(float)
+            for c in range(fibres):
+                if c != fibre and fibre_mask[press, c]:
+                    h = h + inputs[press, c] @ weights["first.w"][e, c] + weights["first.mask"][e, c]
+            h = h / (1 + np.exp(-h))
+            h = h @ weights["hidden.w"][e] + weights["hidden.b"][e]
+            h = h / (1 + np.exp(-h))
+            out = h @ weights["last.w"][e, fibre] + weights["last.b"][e, fibre]
+            means.append(out[:TARGETS])
+            variances.append(np.exp(2 * np.clip(out[TARGETS:], *LOG_STD)))
+        assert np.allclose(mean[press, fibre], np.mean(means, axis=0), atol=1e-4)
+        total = np.mean(variances, axis=0) + np.var(means, axis=0)
+        assert np.allclose(std[press, fibre], np.sqrt(total), rtol=1e-3, atol=1e-4)
+
+
+def test_traces_are_filled_within_the_press_and_nan_where_the_recording_ends() -> None:
+    readings = np.arange(100.0)[:, None] * [1.0, 2.0]
+    complete = trace_model.extract_trace(readings, down_command=30, up_command=55, first=0, end=100)
+    assert complete.shape == (2, TRACE)
+    assert complete[0].tolist() == [*range(20, 50), *range(55, 75)]
+    short = trace_model.extract_trace(readings, down_command=30, up_command=34, first=28, end=36)
+    assert short[0].tolist() == [28] * 9 + [29] + [30, 31, 32, 33] + [33] * 16 + [34, 35] + [35] * 18
+    # The next press begins before a reading of the release was taken.
+    unreleased = trace_model.extract_trace(readings, down_command=30, up_command=55, first=0, end=55)
+    assert unreleased[0, :-RELEASED].tolist() == [*range(20, 50)]
+    assert np.isnan(unreleased[:, -RELEASED:]).all()
+    down_command, up_command = np.array([10, 50]), np.array([30, 70])
+    for end in (70, 74, 90):
+        first, last = trace_model.extract_traces(readings[:end], down_command, up_command)[:, 0]
+        assert first[-RELEASED:].tolist() == [*range(30, 50)]
+        assert np.array_equal(last, [*range(40, 70), *range(70, end), *[np.nan] * (90 - end)], equal_nan=True)
+    # One that the next press cuts short is filled.
+    first, _ = trace_model.extract_traces(readings, down_command, np.array([45, 70]))[:, 0]
+    assert first[-RELEASED:].tolist() == [*range(45, 50), *[49] * 15]
+
 
 PRESSES, FIBRES = 5, 3
 OFFSETS = (2.0, -2.0, 4.0, -4.0, 12.0, -12.0)
@@ -72,7 +178,7 @@ def test_log_likelihood_ratios_are_those_of_densities_and_0_for_missing_readings
     gains = [log_density(y, gain * m, np.hypot(gain * s, model.noise_floor)).sum(axis=2) for gain in (0, 0.5, -1)]
     others = np.exp(log_density(y[:, None], model.library_mean, model.library_std).sum(axis=3)).mean(axis=1)
     inconsistent = np.log((others + np.exp(log_density(y, m, 4 * s).sum(axis=2))) / 2)
-    log_noise = np.log(estimate_noise(traces) / model.noise_v + 0.25) - model.log_noise_mean
+    log_noise = np.log(fault_likelihoods.estimate_noise(traces) / model.noise_v + 0.25) - model.log_noise_mean
     noisy = shift_llr(log_noise / model.log_noise_std, np.log(5) / model.log_noise_std)
     constant = np.where(np.ptp(traces, axis=2) == 0, -np.log(model.constant_share), -6.0)
     common = [constant, *(each - healthy for each in (*gains, inconsistent)), noisy]
@@ -111,7 +217,7 @@ def test_fit_calibrates_deviations_noise_and_rests() -> None:
     np.testing.assert_allclose(calibrated[:, :COMPONENTS], 0.2, rtol=0.15)
     assert model.rest_autocorr == pytest.approx([0.5], abs=0.1)
     assert model.innovation_std == pytest.approx([0.2 / calibrated[:, -1].mean()], rel=0.15)
-    noise = np.median([[estimate_noise(trace) for trace in press] for press in traces], axis=0)
+    noise = np.median([[fault_likelihoods.estimate_noise(trace) for trace in press] for press in traces], axis=0)
     np.testing.assert_allclose(model.noise_v, noise)
     np.testing.assert_allclose(model.noise_floor, np.repeat(noise[:, None] / 2, COMPONENTS, axis=1))
     np.testing.assert_allclose(model.log_noise_mean, math.log(1.25), atol=0.01)
@@ -123,7 +229,7 @@ def test_step_filters_are_matched_and_scaled_for_heavy_tails() -> None:
     """On white noise a filter gives 1 for a standard deviation, or its far quantile is that of Student's t."""
     rng = np.random.default_rng(2)
     traces = rng.standard_normal((4000, 1, TRACE))
-    (filters,) = fit_step_filters(traces, np.array([0.01]))
+    (filters,) = fault_likelihoods.fit_step_filters(traces, np.array([0.01]))
     outputs = (traces - traces[:, :, :REST].mean(axis=2, keepdims=True))[:, 0] @ filters.T
     np.testing.assert_allclose(outputs.std(axis=0), 1, rtol=0.05)
     for number, at in enumerate(STEPS):
@@ -131,7 +237,7 @@ def test_step_filters_are_matched_and_scaled_for_heavy_tails() -> None:
         step -= step[:REST].mean()
         assert abs(np.argmax(np.abs(filters @ step)) - number) <= 2
     heavy = traces * np.where(rng.random(4000) < 0.01, 30.0, 1.0)[:, None, None]
-    (filters,) = fit_step_filters(heavy, np.array([0.01]))
+    (filters,) = fault_likelihoods.fit_step_filters(heavy, np.array([0.01]))
     outputs = (heavy - heavy[:, :, :REST].mean(axis=2, keepdims=True))[:, 0] @ filters.T
     np.testing.assert_allclose(np.quantile(np.abs(outputs), 0.999, axis=0), student.ppf(0.9995, 5), rtol=1e-3)
     assert pytest.approx(student.ppf(0.75, 5), abs=1e-4) == MEDIAN_T
@@ -142,11 +248,13 @@ def test_noise_is_the_mean_step_of_quiet_readings_but_for_the_largest_quarter() 
     quiet = np.concatenate([np.arange(10), np.arange(20, 30), np.arange(40, 50)])
     trace = np.full(TRACE, 7.0)
     trace[quiet] = 0.01 * (quiet % 2)
-    assert estimate_noise(trace) == pytest.approx(0.01)
+    assert fault_likelihoods.estimate_noise(trace) == pytest.approx(0.01)
     trace[[5, 25, 45]] = 3.0  # 6 steps beside them, all of a quarter
-    assert estimate_noise(np.stack([trace, 2 * trace])[:, None]) == pytest.approx(np.array([[0.01], [0.02]]))
+    assert fault_likelihoods.estimate_noise(np.stack([trace, 2 * trace])[:, None]) == pytest.approx(
+        np.array([[0.01], [0.02]])
+    )
     trace[[3, 23]] = 3.0
-    assert estimate_noise(trace) > 0.1
+    assert fault_likelihoods.estimate_noise(trace) > 0.1
 
 
 def test_exceedance_fit_has_the_mean_excess_of_the_highest_tenth() -> None:
@@ -167,8 +275,49 @@ def test_cusum_is_the_best_sum_over_all_onsets() -> None:
     llr_continuing, llr_onset = np.random.default_rng(3).normal(-0.3, 1, (2, 40))
     height = np.zeros(())
     for press in range(40):
-        height = cusum_update(height, llr_continuing[press], llr_onset[press])
+        height = fault_likelihoods.cusum_update(height, llr_continuing[press], llr_onset[press])
         sums = [llr_onset[first] + llr_continuing[first + 1 : press + 1].sum() for first in range(press + 1)]
         # A fault that was present before the first press is as good as any onset.
         earlier = [llr_continuing[first : press + 1].sum() for first in range(press + 2)]
         assert height == pytest.approx(max(0.0, *sums, *earlier))
+
+
+def test_backpropagation_agrees_with_torch() -> None:
+    """Standard deviations are clipped for some targets, and one fibre or more of each press is dropped."""
+    rng, (members, batch, fibres, n_inputs, n_targets, hidden) = np.random.default_rng(0), (2, 5, 3, 4, 2, 6)
+
+    def normal(*shape: int) -> np.ndarray:
+        return rng.standard_normal(shape, np.float32)
+
+    n_outputs = 2 * n_targets
+    weights = {
+        "first.w": normal(members, fibres * n_inputs, hidden),
+        "first.mask": normal(members, fibres, hidden),
+        "first.b": normal(members, 1, hidden),
+        "hidden.w": normal(members, hidden, hidden),
+        "hidden.b": normal(members, 1, hidden),
+        "last.w": normal(members, hidden, fibres * n_outputs),
+        "last.b": 3 * normal(members, 1, fibres * n_outputs),
+    }
+    inputs, targets = normal(members, batch, fibres, n_inputs), normal(members, batch, fibres, n_targets)
+    dropped = (normal(members, batch, fibres).argsort(axis=2) < rng.integers(1, 3, (members, batch, 1))).astype("f4")
+    parameters = optimizer.Parameters(weights)
+    for _ in range(2):  # nothing remains of a batch
+        trace_model.backpropagate(parameters, inputs, targets, dropped)
+
+    w = {name: torch.from_numpy(weight).requires_grad_() for name, weight in weights.items()}
+    x, y, masked = map(torch.from_numpy, (inputs, targets, dropped))
+    h = torch.einsum("ebcn,ecnh->ebh", x * (1 - masked)[..., None], w["first.w"].view(members, fibres, -1, hidden))
+    h = functional.silu(h + torch.einsum("ebc,ech->ebh", 1 - masked, w["first.mask"]) + w["first.b"])
+    h = functional.silu(torch.baddbmm(w["hidden.b"], h, w["hidden.w"]))
+    mean, log_std = torch.baddbmm(w["last.b"], h, w["last.w"]).view(members, batch, fibres, -1).chunk(2, dim=3)
+    assert ((log_std < -4) | (log_std > 2)).any()
+    std = log_std.clamp(-4, 2).exp()
+    t = torch.distributions.StudentT(trace_model.T_DEGREES, mean, std)
+    constant = torch.distributions.StudentT(trace_model.T_DEGREES).log_prob(torch.zeros(()))
+    loss = (constant - t.log_prob(y) + (y - mean) ** 2 / 4) * masked[..., None]
+    (loss.sum(dim=(1, 2, 3)) / masked.sum(dim=(1, 2))).sum().backward()
+    for name, gradient in parameters.gradient.items():
+        expected = w[name].grad
+        assert expected is not None
+        np.testing.assert_allclose(gradient, expected, atol=1e-4 * float(expected.abs().max()))

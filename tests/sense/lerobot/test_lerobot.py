@@ -16,6 +16,7 @@ import pytest
 
 from padforge.sense import Localization, Recording
 from padforge.sense.formats.lerobot import export_lerobot
+from tests.helpers.presses import changed
 
 HERE = Path(__file__).parent
 PLUGIN = HERE.parents[2] / "plugins" / "lerobot_robot_padforge"
@@ -52,9 +53,7 @@ def lerobot(pytestconfig: pytest.Config, tmp_path_factory: pytest.TempPathFactor
     return run
 
 
-def test_lerobot_records_a_pad_beside_an_arm_and_opens_exported_datasets(
-    lerobot: Run, brief: Recording, model: Path, tmp_path: Path
-) -> None:
+def test_lerobot_records_a_pad_and_opens_exported_sets(lerobot: Run, brief: Recording, model: Path, tmp_path) -> None:
     recording, touches = annotated(brief)
     export_lerobot(recording, tmp_path / "exported", touches)
     names = "exported", "recorded"
@@ -78,12 +77,10 @@ def test_lerobot_records_a_pad_beside_an_arm_and_opens_exported_datasets(
 
 def annotated(brief: Recording) -> tuple[Recording, Localization]:
     """A recording with readings that are missing, and touches mirrored about the middle."""
-    readings = brief.readings.copy()
-    readings[50:60, 1] = np.nan
     presses = len(brief.presses_mm)
     forces, r90 = np.linspace(1, 5, presses), np.linspace(0.5, 2, presses)
     touches = Localization(-brief.presses_mm, np.ones((presses, 2)), r90, r90)
-    return replace(brief, readings=readings, forces_n=forces), touches
+    return replace(changed(brief, "readings", np.s_[50:60, 1], np.nan), forces_n=forces), touches
 
 
 def check_exported(read: dict[str, Any], recording: Recording, touches: Localization) -> None:

@@ -6,6 +6,7 @@ from functools import cache
 from itertools import product
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 import pytest
@@ -20,6 +21,7 @@ from padforge.sense.localizer.model import Localization, LocalizerModel
 from padforge.sense.signals.press_detection import PressEvent
 from tests.helpers.constants import with_constants
 from tests.helpers.golden import Golden, json_text
+from tests.helpers.presses import changed
 from tests.sense.conftest import QUICK, few_moments, first_presses
 from tests.sense.live.test_messages import EVENTS
 
@@ -82,13 +84,16 @@ def hasty(trained: Callable[[str], LocalizerModel]) -> LocalizerModel:
     return trained("ensemble")
 
 
-def replay(
-    recording: Recording, model: LocalizerModel, delays: tuple[int, int] = (2, 1), cuts: Sequence[int] = ()
-) -> tuple[Live, list[Any]]:
-    with pytest.MonkeyPatch.context() as monkeypatch:
-        monkeypatch.setattr("padforge.sense.live.pipeline.PressDetector", ScriptedDetector(recording, delays))
-        live = Live(model, rate_hz=recording.rate_hz)
-    events = []
+def scripted(recording: Recording, model: LocalizerModel, delays: Any = (2, 1), monitor: Any = None) -> Live:
+    """A live pad on which the presses of a recording are detected, and the monitor of whose fibres is given."""
+    health: Any = monitor and model  # a stand-in, of the same pad
+    detector = ScriptedDetector(recording, delays)
+    with patch.multiple(pipeline, PressDetector=detector, FaultMonitor=lambda health: monitor):
+        return Live(model, rate_hz=recording.rate_hz, health=health)
+
+
+def replay(recording: Recording, model: LocalizerModel, delays: Any = (2, 1), cuts: Any = ()) -> tuple[Live, list[Any]]:
+    live, events = scripted(recording, model, delays), []
     for times_s, readings in zip(np.split(recording.times_s, cuts), np.split(recording.readings, cuts), strict=True):
         events += live.update(times_s, readings)
     return live, events
@@ -185,9 +190,7 @@ def test_live_handles_presses_of_any_length_and_distance(recording, hasty, lengt
 def test_a_press_that_the_next_one_cuts_off_ends_where_that_began(recording, hasty) -> None:
     """Though it is known only some readings later."""
     part = first_presses(recording, 4)
-    down_command = part.down_command.copy()
-    down_command[2] = part.up_command[1] + 5
-    part = replace(part, down_command=down_command)
+    part = changed(part, "down_command", 2, part.up_command[1] + 5)
     live, events = replay(part, hasty, (3, 1))
     *_, before, last = (each for each in events if each.press == 1)
     assert (before.final, before.readings, last.final, last.since, last.readings) == (False, 8, True, "lift", 5)
@@ -225,14 +228,11 @@ def test_live_handles_a_press_that_is_held_for_hours(recording, hasty, monkeypat
     assert len({each.x_mm for each in estimates}) > n_extra / 2  # where the finger is now may change
 
 
-def test_live_masks_a_faulty_fibre_from_the_next_press_on(recording, hasty, monkeypatch) -> None:
+def test_live_masks_a_faulty_fibre_from_the_next_press_on(recording, hasty) -> None:
     part, monitor = first_presses(recording, 12), ScriptedMonitor()
-    down_command, up_command = part.down_command.copy(), part.up_command.copy()
-    down_command[8], up_command[8] = up_command[7] + 4, up_command[7] + 20  # soon after the one before
-    part = replace(part, down_command=down_command, up_command=up_command)
-    monkeypatch.setattr("padforge.sense.live.pipeline.FaultMonitor", lambda model: monitor)
-    monkeypatch.setattr("padforge.sense.live.pipeline.PressDetector", ScriptedDetector(part))
-    live = Live(hasty, rate_hz=part.rate_hz, health=hasty)  # a stand-in for health, of the same pad
+    for name, later in (("down_command", 4), ("up_command", 20)):  # press 8 comes soon after the one before
+        part = changed(part, name, 8, part.up_command[7] + later)
+    live = scripted(part, hasty, monitor=monitor)
     events = live.update(part.times_s, part.readings)
     fault = next(index for index, event in enumerate(events) if isinstance(event, FibreFault))
     estimates = [event for event in events if isinstance(event, Estimate)]
@@ -241,7 +241,7 @@ def test_live_masks_a_faulty_fibre_from_the_next_press_on(recording, hasty, monk
     assert (before.press, before.final, after.press) == (5, True, 6)
     assert all(each.failed == (() if each.press < 6 else (1,)) for each in estimates)
     later = [each for each in estimates if each.press >= 6]
-    next_down = np.append(down_command[1:], len(part.readings))[[each.press for each in later]]
+    next_down = np.append(part.down_command[1:], len(part.readings))[[each.press for each in later]]
     is_apart = moments(part, later) <= next_down  # that press 8 has begun is known two readings later
     known = [each for each, apart in zip(later, is_apart, strict=True) if apart]
     assert len(known) == len(later) - 2
@@ -256,9 +256,7 @@ def test_live_masks_a_faulty_fibre_from_the_next_press_on(recording, hasty, monk
 
 def test_live_without_readings_says_anywhere(recording, hasty) -> None:
     part, scaler = first_presses(recording, 3), hasty.scaler
-    readings = part.readings.copy()
-    readings[int(part.down_command[1]) - 12 :] = np.nan
-    live, events = replay(replace(part, readings=readings), hasty)
+    live, events = replay(changed(part, "readings", np.s_[int(part.down_command[1]) - 12 :], np.nan), hasty)
     for estimate in (each for each in events if each.press == 1):
         assert estimate.failed == (0, 1, 2, 3)
         assert (estimate.x_mm, estimate.y_mm) == pytest.approx(tuple(scaler.origin_mm))
@@ -269,10 +267,8 @@ def test_live_without_readings_says_anywhere(recording, hasty) -> None:
 def test_faults_wait_while_the_pad_is_taken_for_another(recording, hasty, monkeypatch) -> None:
     """They are reported once with the next press of this pad, from which their fibre is masked."""
     part, monitor, verdicts = first_presses(recording, 9), ScriptedMonitor(), iter([0, 0, 0, 0, 1, 1, 1, 0, 0])
-    monkeypatch.setattr("padforge.sense.live.pipeline.FaultMonitor", lambda model: monitor)
-    monkeypatch.setattr("padforge.sense.live.pipeline.is_other_pad", lambda *asked: bool(next(verdicts)))
-    monkeypatch.setattr("padforge.sense.live.pipeline.PressDetector", ScriptedDetector(part))
-    live = Live(hasty, rate_hz=part.rate_hz, health=hasty)
+    monkeypatch.setattr(pipeline, "is_other_pad", lambda *asked: bool(next(verdicts)))
+    live = scripted(part, hasty, monitor=monitor)
     events = live.update(part.times_s, part.readings)
     (fault,) = (index for index, event in enumerate(events) if isinstance(event, FibreFault))
     before = events[fault - 1]
@@ -280,11 +276,10 @@ def test_faults_wait_while_the_pad_is_taken_for_another(recording, hasty, monkey
     assert (before.press, before.final, len(live.faults)) == (7, True, 1)
 
 
-def test_view_has_presses_with_their_words_and_faults(recording, hasty, golden: Golden, monkeypatch) -> None:
+def test_view_has_presses_with_their_words_and_faults(recording, hasty, golden: Golden) -> None:
     """Of a pad whose second fibre has failed, in the press, and once it turns out to be another pad."""
     part, down = first_presses(recording, 2), int(recording.down_command[0]) + 15
-    monkeypatch.setattr("padforge.sense.live.pipeline.PressDetector", ScriptedDetector(part))
-    live = Live(hasty, rate_hz=part.rate_hz)
+    live = scripted(part, hasty)
     live.update(part.times_s[:down], part.readings[:down])
     live.presses.clear()
     live.presses.extend(event for event in EVENTS if isinstance(event, Estimate))
@@ -299,8 +294,7 @@ def test_view_has_presses_with_their_words_and_faults(recording, hasty, golden: 
 def test_track_has_the_places_that_a_finger_has_moved_to(recording, hasty, monkeypatch) -> None:
     """It moves by 1 mm a reading, known to 8 mm at first and then to 2 mm."""
     part = first_presses(recording, 2)
-    up_command = part.up_command.copy()
-    up_command[0] = part.down_command[1] - 2
+    part = changed(part, "up_command", 0, part.down_command[1] - 2)
     path = iter(range(1000))
 
     def localize(model, presses) -> Localization:
@@ -309,9 +303,7 @@ def test_track_has_the_places_that_a_finger_has_moved_to(recording, hasty, monke
         return Localization(np.array([[float(x), 0.0]]), np.ones((1, 2)), r90 / 2, r90)
 
     monkeypatch.setattr(LocalizerModel, "localize", localize)
-    part = replace(part, up_command=up_command)
-    monkeypatch.setattr("padforge.sense.live.pipeline.PressDetector", ScriptedDetector(part))
-    live, next_down = Live(hasty, rate_hz=part.rate_hz), int(part.down_command[1])
+    live, next_down = scripted(part, hasty), int(part.down_command[1])
     live.update(part.times_s[:next_down], part.readings[:next_down])
     track = live.view()["track"]
     assert 1 < len(track) <= MAX_TRACK

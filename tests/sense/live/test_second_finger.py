@@ -139,10 +139,8 @@ def test_single_and_deepening_presses_are_no_second_finger(example: LocalizerMod
         assert {estimate.finger for estimate in estimates} == {1}
 
 
-def test_a_lift_that_cannot_be_told_leaves_no_finger_localized(
-    example: LocalizerModel, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(pipeline, "MAX_ERROR_RATIO", 0.0)
+@patch.object(pipeline, "MAX_ERROR_RATIO", 0.0)
+def test_a_lift_that_cannot_be_told_leaves_no_finger_localized(example: LocalizerModel) -> None:
     for estimates in follow(example, pairs((LIFT, LAST), 3)):
         ends = [estimate for estimate in estimates if estimate.final]
         assert [end.finger for end in ends] == [2, 1]

@@ -164,9 +164,7 @@ def test_fit_stages_know_only_what_is_complete() -> None:
         spoilt[:, :, n_complete - 1] = 77.0
         assert not np.array_equal(found, stage.predict(spoilt, fibre_mask)[0])
     assert len(fit_stages(table, inputs, fibre_mask, places, 0)) == 1
-
-
-def test_stage_of_is_the_latest_that_is_complete() -> None:
+    # a press is answered by the latest that is complete
     assert [bayes_stage(count, N_TIMED) for count in range(N_TIMED + 1)] == [None] * 12 + [0, 1, 2, 3, 3, 4]
     assert bayes_stage(0, 0) == 0
 

@@ -1,4 +1,4 @@
-"""Evaluation of a localizer by errors that are known; radii of few presses, by what other pads have shown."""
+"""Errors of a localizer, also while a press is read; radii of few presses, by what other pads have shown."""
 
 from dataclasses import replace
 
@@ -6,17 +6,25 @@ import numpy as np
 import pytest
 from scipy.special import gammaincinv
 
-from padforge.sense import Recording
+from padforge.design import Contact, Morphology
+from padforge.sense import Evaluation, Recording, RigSettings
+from padforge.sense.localizer import network
 from padforge.sense.localizer.calibration import RELEASE, TOUCH, adapt_ratios
 from padforge.sense.localizer.evaluation import (
     PRIOR_PRESSES,
     RATIO_SHAPE,
     conformal,
+    distances,
     error_row,
     find_doubts,
     idle_share,
 )
+from padforge.sense.localizer.features import compute_features
 from padforge.sense.localizer.model import Localization, LocalizerModel, MeasureEstimate
+from padforge.sense.localizer.moments import MOMENTS
+from padforge.sense.signals.press_detection import detect_presses, first_readings
+from padforge.sense.simulation.strokes import simulate_strokes
+from tests.helpers.presses import changed
 
 PLACES = np.array([[0.0, 0.0], [10.0, 0.0], [0.0, 10.0], [10.0, 10.0]])
 
@@ -49,13 +57,19 @@ def test_error_row_summarizes_sets_and_known_measures() -> None:
     assert conformal([found], PLACES)[3] == 1
 
 
-def test_conformal_takes_a_quantile_one_rank_higher() -> None:
+def test_conformal_takes_a_quantile_one_rank_higher_and_a_prior_counts_as_so_many_presses() -> None:
     """Ninety-nine presses off by 0.01, 0.02 ... of their radius: the 50th and the 90th."""
     ranks = np.random.default_rng(0).permutation(np.arange(1, 100) / 100)
     spread, r50, r90 = conformal([make_localization(ranks)], np.zeros((99, 2)))
     assert spread == pytest.approx(np.sqrt(np.square(ranks).mean()))
     assert (r50, r90) == pytest.approx((0.50, 0.90))
     assert conformal([make_localization(ranks[:5])], np.zeros((5, 2)))[2] == pytest.approx(ranks[:5].max())
+    # as many presses as the prior counts for, all ten times as far off as it says
+    far = make_localization(np.full(PRIOR_PRESSES, 10.0))
+    spread, r50, r90 = conformal([far], np.zeros((PRIOR_PRESSES, 2)), None, 1.0)
+    assert r90 == pytest.approx(10.0)
+    assert 2.0 < r50 < 10.0
+    assert spread == pytest.approx(np.sqrt((100 + 1 + 1 / RATIO_SHAPE) / 2), rel=1e-3)
 
 
 @pytest.mark.parametrize("presses", [9, 40])
@@ -99,19 +113,8 @@ def test_radii_of_few_presses_differ_less_from_draw_to_draw(presses: int) -> Non
     assert np.std(shares[0.67]) < (0.6 if presses < 100 else 1.0) * np.std(shares[None])
 
 
-def test_prior_counts_as_so_many_presses() -> None:
-    """As many presses as the prior counts for, all ten times as far off as it says."""
-    far = make_localization(np.full(PRIOR_PRESSES, 10.0))
-    spread, r50, r90 = conformal([far], np.zeros((PRIOR_PRESSES, 2)), None, 1.0)
-    assert r90 == pytest.approx(10.0)
-    assert 2.0 < r50 < 10.0
-    assert spread == pytest.approx(np.sqrt((100 + 1 + 1 / RATIO_SHAPE) / 2), rel=1e-3)
-
-
 @pytest.mark.parametrize(("presses", "factor", "low", "high"), [(5000, 1.2, 1.18, 1.22), (10, 1.2, 1.0, 1.15)])
-def test_ratios_of_other_pads_are_adapted_to_presses_as_far_as_these_are_many(
-    presses: int, factor: float, low: float, high: float
-) -> None:
+def test_ratios_of_other_pads_are_adapted_to_many_presses(presses: int, factor: float, low: float, high: float) -> None:
     expected = np.array([[0.7, 0.6], [0.9, 0.8]])
     quantiles = gammaincinv(RATIO_SHAPE, (np.arange(presses) + 0.5) / presses) / RATIO_SHAPE
     found = [[[make_localization(factor * mean * quantiles)] for mean in of_moment] for of_moment in expected]
@@ -120,25 +123,70 @@ def test_ratios_of_other_pads_are_adapted_to_presses_as_far_as_these_are_many(
     assert ((adapted >= low * expected) & (adapted <= high * expected)).all()
     contradicting = [[[make_localization(3 * quantiles)] for _ in of_moment] for of_moment in expected]
     assert adapt_ratios(expected, contradicting, np.zeros((presses, 2))) is None
-
-
-def test_errors_grow_more_after_few_presses_at_the_end_of_a_press_and_with_all_fibres() -> None:
+    # they grow more after few presses, at the end of a press and with all fibres
     assert RELEASE.growth(300) > RELEASE.growth(3000) > 1
     assert RELEASE.growth(300) > TOUCH.growth(300)
     assert RELEASE.ratio(300, 3 / 8) < RELEASE.ratio(300, 0) == RELEASE.mean_ratio
 
 
-def test_far_presses_are_named_and_another_recording_is_doubted(
-    localizer: LocalizerModel, recording: Recording
-) -> None:
+def test_far_presses_and_another_recording_are_doubted(localizer: LocalizerModel, recording: Recording) -> None:
     localization = localizer.predict(recording)
     assert find_doubts(recording, localization, 0.9, 45) == []
-    presses_mm = recording.presses_mm.copy()
-    corner = int(np.argmin(presses_mm.sum(axis=1)))
-    presses_mm[corner] *= -1  # a sign was lost
-    presses_mm[3] = np.nan
-    (line,) = find_doubts(replace(recording, presses_mm=presses_mm), localization, 0.9, 45)
+    corner = int(np.argmin(recording.presses_mm.sum(axis=1)))
+    mistyped = changed(recording, "presses_mm", corner, -recording.presses_mm[corner])  # a sign was lost
+    (line,) = find_doubts(changed(mistyped, "presses_mm", 3, np.nan), localization, 0.9, 45)
     assert line.startswith(f"stated more than 4 r90 from where they are predicted: press {corner} at (")
     expected = ["2% of 300 presses lie within r90: is it the recording of this pad?"]
     assert find_doubts(recording, localization, 0.02, 300) == expected
     assert find_doubts(recording, localization, 0.02, 10) == []  # of so few it may be chance
+
+
+PAD = Morphology.random(2, knots=3, seed=5)  # of the recording
+
+
+def test_errors_fall_while_a_press_is_read(calibrated: tuple[LocalizerModel, Evaluation], recording: Recording) -> None:
+    """Rows are those of predictions until a moment, and the touch in focus is that of the median error."""
+    model, evaluation = calibrated
+    rows = evaluation.by_moment
+    intact = [row for row in rows if row["n_failed"] == 0]
+    means = [row["mean_mm"] for row in intact]
+    assert means[0] > means[3] > evaluation.errors[0]["mean_mm"]
+    assert abs(means[-1] / evaluation.errors[0]["mean_mm"] - 1) < 0.25
+    assert all(row["within_r90"] > 0.7 for row in rows)
+    test, up = list(model.test), recording.up_command
+    touched = first_readings(recording.readings, recording.times_s, recording.down_command, up)
+    for number in (2, 9, -1):
+        last = model.predict(recording, until=MOMENTS[number].until(touched, up)).positions_mm
+        errors_mm = distances(last, recording.presses_mm)[test]
+        assert means[number] == pytest.approx(errors_mm.mean(), rel=1e-5)  # of single precision
+    focus = evaluation.focus
+    radii = [moment["r90_mm"] for moment in focus["moments"]]
+    assert radii[0] > radii[-1]
+    assert focus["moments"][-1]["predicted_mm"] == pytest.approx(last[focus["press"]].tolist())
+    assert np.sort(errors_mm)[len(errors_mm) // 2] == pytest.approx(errors_mm[test.index(focus["press"])])
+
+
+def test_first_readings_are_those_of_the_detector_or_the_usual_ones(recording: Recording) -> None:
+    commands = recording.down_command, recording.up_command
+    touched = first_readings(recording.readings, recording.times_s, *commands)
+    assert ((touched >= recording.down_command - 2) & (touched <= recording.up_command)).all()
+    assert np.isin(touched, detect_presses(recording.readings, recording.times_s).touched).mean() > 0.8
+    usual = first_readings(np.zeros_like(recording.readings), recording.times_s, *commands)
+    before_s, after_s = (recording.times_s[each] - recording.times_s[commands[0]] for each in (usual - 1, usual))
+    assert before_s.max() < 0.16 <= after_s.min()
+
+
+def test_a_finger_that_slides_is_followed(localizer: LocalizerModel, monkeypatch: pytest.MonkeyPatch) -> None:
+    """By a network that was trained on presses alone; one that knows fingers at rest only stays behind."""
+    strokes = simulate_strokes(PAD, RigSettings(presses=300, seed=1), Contact(), 15.0, 60, np.random.default_rng(0))
+    recording, last = strokes.recording, strokes.positions_mm[:, -1]
+    down, up = recording.down_command - 2, recording.up_command
+
+    def error(least_slide: float) -> float:
+        monkeypatch.setattr(network, "SLIDE_THRESHOLD", least_slide)
+        features = localizer.scaler.transform(compute_features(recording.readings, down, up, up))
+        return float(distances(localizer.predict_features(features).positions_mm, last).mean())
+
+    usual = network.SLIDE_THRESHOLD
+    assert error(0.0) < 0.8 * error(np.inf)
+    assert error(usual) < error(np.inf)

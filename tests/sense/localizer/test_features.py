@@ -1,4 +1,4 @@
-"""Features of presses: where windows lie, that they stay within press, moment and fibre, and how they are scaled."""
+"""Features of presses: where windows lie, when they are complete, what they depend on, and how they are scaled."""
 
 from dataclasses import replace
 
@@ -7,13 +7,47 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from padforge.sense.localizer import moments
 from padforge.sense.localizer.features import N_HISTORY, PressFeatures, compute_features, interpolate_gaps
 from padforge.sense.localizer.model import LocalizerModel
-from padforge.sense.localizer.moments import LATEST_WINDOWS, N_TIMED, PRESS_WINDOWS, RELEASE_WINDOWS
+from padforge.sense.localizer.moments import N_PRESS_WINDOWS, N_TIMED, PHASES, PRESS_WINDOWS, RELEASE_WINDOWS
 from padforge.sense.localizer.scaler import MAX_INPUT, FeatureScaler, TargetScaler
 
+
+def completed(down: int, up: int, until: int) -> list[bool]:
+    """Window by window: all its readings are before `until`, those of the release after one of it at least."""
+    of_touch = [until > up or all(down + n < until for n in range(*window)) for window in PRESS_WINDOWS]
+    return of_touch + [until > up and all(up + n < until for n in range(*window)) for window in RELEASE_WINDOWS]
+
+
+@given(down=st.integers(0, 5000), length=st.integers(1, 60), until=st.integers(-5, 120))
+def test_complete_windows_counts_readings(down: int, length: int, until: int) -> None:
+    up = down + length
+    seen = moments.complete_windows(np.array([down]), np.array([up]), np.array([down + until]))
+    assert seen[0].tolist() == completed(down, up, down + until)
+    assert seen[0].tolist() == sorted(seen[0].tolist(), reverse=True)  # one after the other
+
+
+@given(count=st.integers(1, N_TIMED), length=st.integers(PRESS_WINDOWS[-1][1], 60))
+def test_complete_at_is_the_first_reading_with_so_many_windows(count: int, length: int) -> None:
+    down, up = np.array([0, 400]), np.array([length, 400 + length])
+    at = moments.complete_at(count, down, up)
+    assert moments.complete_windows(down, up, at).sum(axis=1).tolist() == [count] * 2
+    assert (moments.complete_windows(down, up, at - 1).sum(axis=1) < count).all()
+
+
+def test_answering_adds_the_bayesian_localizer_after_the_release() -> None:
+    networks = {name: {} for name in PHASES[N_TIMED]}
+    names = [moments.active_networks(networks, count, N_TIMED, True) for count in range(N_TIMED + 1)]
+    plain = [[], *[["touched"]] * (N_PRESS_WINDOWS - 1), ["settled"], *[["released"]] * len(RELEASE_WINDOWS)]
+    assert names == [each + [moments.RESIDUAL] * (count in moments.RESIDUAL_PHASE) for count, each in enumerate(plain)]
+    assert [moments.active_networks(networks, count, N_TIMED, False) for count in range(N_TIMED + 1)] == plain
+    assert moments.active_networks({"press": {}}, 0, 0, True) == ["press", moments.RESIDUAL]
+    assert moments.active_networks({"held": {}}, N_PRESS_WINDOWS, N_PRESS_WINDOWS, False) == ["held"]
+
+
 PRESSES, FIBRES, WINDOWS = 5, 3, 4
-N_WINDOWS = N_TIMED + len(LATEST_WINDOWS)
+N_WINDOWS = N_TIMED + len(moments.LATEST_WINDOWS)
 DOWN_COMMAND = 40 * np.arange(PRESSES) + 20
 UP_COMMAND = DOWN_COMMAND + 20
 
@@ -73,10 +107,10 @@ def test_compute_features_stays_within_press_and_fibre(is_published: bool) -> No
 @settings(max_examples=30)
 @given(until=st.integers(1, 60), press=st.integers(0, PRESSES - 1))
 def test_compute_features_ignores_readings_after_the_moment(until: int, press: int) -> None:
-    readings, moments = noise(), DOWN_COMMAND + until
-    before = compute_features(readings, DOWN_COMMAND, UP_COMMAND, moments)[press : press + 1]
-    readings[moments[press] :] = 99
-    after = compute_features(readings, DOWN_COMMAND, UP_COMMAND, moments)[press : press + 1]
+    readings, ends = noise(), DOWN_COMMAND + until
+    before = compute_features(readings, DOWN_COMMAND, UP_COMMAND, ends)[press : press + 1]
+    readings[ends[press] :] = 99
+    after = compute_features(readings, DOWN_COMMAND, UP_COMMAND, ends)[press : press + 1]
     for name, part in vars(before).items():
         np.testing.assert_array_equal(getattr(after, name), part)
 
@@ -88,13 +122,11 @@ def test_compute_features_ignores_readings_after_the_moment(until: int, press: i
     after=st.integers(0, 30),
     until=st.none() | st.integers(-9, 60),
 )
-def test_compute_features_takes_presses_of_any_length(
-    is_published: bool, gaps: list[int], after: int, until: int | None
-) -> None:
+def test_compute_features_of_any_length(is_published: bool, gaps: list[int], after: int, until: int | None) -> None:
     edges = np.cumsum(gaps[: len(gaps) // 2 * 2])
     readings = np.random.default_rng(0).uniform(1, 2, (edges[-1] + after, 2))
-    moments = None if until is None else edges[::2] + until
-    found = compute_features(readings, edges[::2], edges[1::2], moments, is_published)
+    ends = None if until is None else edges[::2] + until
+    found = compute_features(readings, edges[::2], edges[1::2], ends, is_published)
     shapes = [part.shape for part in (found.windows, found.history, found.complete)]
     q, sizes = len(edges) // 2, (3, 0, 0) if is_published else (N_WINDOWS, N_HISTORY, N_TIMED)
     assert shapes == [(q, 2, sizes[0]), (q, 2, sizes[1]), (q, sizes[2])]
@@ -119,14 +151,12 @@ def test_interpolate_gaps_fills_gaps_only() -> None:
     ("is_published", "until", "first", "end"),
     [(False, None, -10, 40), (False, 20, -10, 20), (False, 6, -10, 6), (True, None, -10, 40)],
 )
-def test_fibre_mask_needs_three_quarters_of_readings(
-    is_published: bool, until: int | None, first: int, end: int
-) -> None:
+def test_fibre_mask_needs_three_quarters(is_published: bool, until: int | None, first: int, end: int) -> None:
     """Press 2 is sent down at 100 and up at 120; the last readings that count are what is missing."""
 
     def computed(readings: np.ndarray) -> PressFeatures:
-        moments = None if until is None else DOWN_COMMAND + until
-        return compute_features(readings, DOWN_COMMAND, UP_COMMAND, moments, is_published)
+        ends = None if until is None else DOWN_COMMAND + until
+        return compute_features(readings, DOWN_COMMAND, UP_COMMAND, ends, is_published)
 
     most = (end - first) // 4
     for missing, there in ((most, True), (most + 1, False)):

@@ -24,6 +24,7 @@ from padforge.sense.settings import RigSettings
 from padforge.sense.simulation.example import PLAN
 from padforge.sense.simulation.simulated_recording import simulate
 from tests.helpers.once import Once
+from tests.helpers.presses import changed
 
 TRAINED, HELD_BACK, PRESSES = 1000, 100, 1300
 MIN_MM = 12.0  # between two fingers
@@ -84,15 +85,11 @@ def trained(once: Once, pad: Recording) -> Trained:
 
 def fail(pad: Recording, fibres: list[int]) -> Recording:
     """They do not respond."""
-    readings = np.array(pad.readings)
-    readings[:, fibres] = np.median(readings, axis=0)[fibres]
-    return replace(pad, readings=readings)
+    return changed(pad, "readings", np.s_[:, fibres], np.median(pad.readings, axis=0)[fibres])
 
 
 @pytest.mark.parametrize(("n_complete", "least"), [(N_PRESS_WINDOWS, 0.65), (N_TIMED, 0.85)])
-def test_two_fingers_are_unlike_a_press_and_single_ones_are_not(
-    trained: Trained, pad: Recording, n_complete: int, least: float
-) -> None:
+def test_two_fingers_are_unlike_a_single_press(trained: Trained, pad: Recording, n_complete: int, least: float) -> None:
     presses = trained.later(pad, n_complete)
     assert find_unlike(trained.tests, presses).mean() <= 0.03
     first, second = np.random.default_rng(0).integers(len(presses), size=(2, 400))
@@ -111,11 +108,8 @@ def test_stronger_presses_and_failed_fibres_are_no_second_finger(trained: Traine
     assert np.mean(failed) <= 0.1
     masked = replace(whole, fibre_mask=np.tile(np.arange(pad.fibres) != 2, (len(whole), 1)))
     assert find_unlike(trained.tests, masked).mean() <= 0.04
-
-
-def test_presses_before_the_first_stage_and_without_fibres_are_not_judged(trained: Trained, pad: Recording) -> None:
-    presses = trained.later(pad)
-    two = trained.superposed(presses, np.arange(100), np.arange(100, 200))
+    # presses before the first stage and without fibres are not judged
+    two = trained.superposed(whole, np.arange(100), np.arange(100, 200))
     assert find_unlike(trained.tests, two).any()
     for n_complete in (0, N_PRESS_WINDOWS - 1):
         early = np.tile(np.arange(N_TIMED) < n_complete, (100, 1))
@@ -157,8 +151,8 @@ def test_pads_that_drift_or_have_failed_fibres_are_no_other_pads(trained: Traine
     drifted = [rest_v + 0.1 * rng.standard_normal(pad.fibres) + gain * (pad.readings - rest_v) for gain in gains]
     inverted = np.where(np.arange(pad.fibres) == 3, 2 * rest_v - pad.readings, pad.readings)
     swapped = pad.readings[:, [0, 4, 2, 3, 1, 5]]
-    changed = (replace(pad, readings=readings) for readings in (*drifted, inverted, swapped))
-    for recording in (pad, fail(pad, [1]), fail(pad, [0, 4]), *changed):
+    others = (replace(pad, readings=readings) for readings in (*drifted, inverted, swapped))
+    for recording in (pad, fail(pad, [1]), fail(pad, [0, 4]), *others):
         presses = trained.later(recording)
         for first in range(0, len(presses) - MIN_PRESSES, 90):
             assert not trained.is_other_pad(presses[first : first + MIN_PRESSES])

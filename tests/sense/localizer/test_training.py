@@ -1,7 +1,8 @@
-"""Networks and their training: outputs and gradients agree with torch, masks are bounded, positions are augmented."""
+"""What a training draws, and the networks that it trains: outputs and gradients agree with torch, masks are bounded."""
 
 from dataclasses import replace
 from typing import Any
+from unittest.mock import Mock, call, patch
 
 import numpy as np
 import pytest
@@ -12,12 +13,22 @@ from torch.nn import functional
 
 from padforge.benchmarks import localizer as bench
 from padforge.common.progress import ignore_progress
-from padforge.sense.localizer import backpropagation, network, optimizer, training
+from padforge.sense.localizer import backpropagation, network, optimizer, press_sampler, training
 from padforge.sense.localizer.features import N_FEATURES
-from padforge.sense.localizer.moments import N_PRESS_WINDOWS, N_TIMED, PHASES, RESIDUAL_PHASE
+from padforge.sense.localizer.moments import (
+    LATEST_WINDOWS,
+    N_PRESS_WINDOWS,
+    N_TIMED,
+    PHASES,
+    PRESS_WINDOWS,
+    RESIDUAL_PHASE,
+    Phase,
+)
 from padforge.sense.localizer.press_sampler import PressSampler, sample_fibre_dropout
 from padforge.sense.localizer.response_model import grid_positions, interpolate_grid
+from padforge.sense.localizer.scaler import FeatureScaler, TrainingPresses
 from padforge.sense.settings import LocalizerSettings as Options
+from tests.helpers.constants import with_constants
 from tests.helpers.presses import training_presses
 
 
@@ -80,30 +91,8 @@ def test_combine_members_weighs_by_variance_and_adds_disagreement() -> None:
     assert std[0].tolist() == pytest.approx([np.sqrt(0.8 * 0.1056 + 0.2 * 0.7296), np.sqrt(0.8 * 0.08 + 0.2 * 0.32)])
 
 
-def test_fit_network_returns_the_average_of_the_last_weights() -> None:
-    """Of a quadratic with noisy gradients, the average is nearer to the minimum than single weights are."""
-    rng, reports = np.random.default_rng(0), list[int]()
-    parameters = optimizer.Parameters({"w": np.zeros(200, np.float32)})
-
-    def backpropagate() -> None:
-        parameters.gradient["w"][:] = (parameters.weights["w"] - 1 + 0.5 * rng.standard_normal(200)) / 100
-
-    weights = optimizer.fit_network(
-        parameters,
-        backpropagate,
-        1000,
-        0.2,
-        weight_decay=0.0,
-        on_progress=lambda done, total, what: reports.append(done),
-    )
-    average, last = (np.square(each - 1).mean() for each in (weights["w"], parameters.weights["w"]))
-    assert average < 0.7 * last < 0.05
-    assert reports == list(range(1, optimizer.REPORTS + 1))
-    assert [optimizer.one_cycle(share) for share in (0.0, 0.05, 0.1, 0.55, 1.0)] == pytest.approx([0, 0.5, 1, 0.5, 0])
-
-
-def test_fit_network_takes_the_steps_of_cautious_adamw() -> None:
-    goal, share = np.arange(15.0), np.linspace(0, 1, 51)[1:].tolist()
+def test_fit_network_takes_the_steps_of_cautious_adamw_and_returns_averages() -> None:
+    goal, share, reported = np.arange(15.0), np.linspace(0, 1, 51)[1:].tolist(), Mock()
     parameters = optimizer.Parameters({"w": np.ones((3, 5), np.float32), "v": np.full(2, 9.0, np.float32)})
     w, v = parameters.weights.values()
 
@@ -114,7 +103,7 @@ def test_fit_network_takes_the_steps_of_cautious_adamw() -> None:
         flat = gradient_at(np.concatenate([w.ravel(), v]))
         parameters.gradient["w"][:], parameters.gradient["v"][:] = flat[:15].reshape(3, 5), flat[15:]
 
-    fitted = optimizer.fit_network(parameters, backpropagate, 50, 0.1, weight_decay=0.1)
+    fitted = optimizer.fit_network(parameters, backpropagate, 50, 0.1, weight_decay=0.1, on_progress=reported)
     expected, (first, second) = np.concatenate([np.ones(15), np.full(2, 9.0)]), optimizer.BETAS
     mean, square, average, resting = np.zeros(17), np.zeros(17), expected.copy(), 0
     for step, each in enumerate(share, 1):
@@ -131,6 +120,8 @@ def test_fit_network_takes_the_steps_of_cautious_adamw() -> None:
     np.testing.assert_allclose(w, expected[:15].reshape(3, 5), rtol=1e-4)
     np.testing.assert_allclose(fitted["w"], average[:15].reshape(3, 5), rtol=1e-4)
     np.testing.assert_allclose(fitted["v"], average[15:], rtol=1e-4)
+    assert (reported.call_count, reported.call_args) == (50, call(200, 200, ""))
+    assert [optimizer.one_cycle(part) for part in (0.0, 0.05, 0.1, 0.55, 1.0)] == pytest.approx([0, 0.5, 1, 0.5, 0])
 
 
 @settings(max_examples=20)
@@ -240,12 +231,138 @@ def test_retrain_follows_another_response_from_where_networks_are(monkeypatch: p
 
 
 @pytest.mark.slow
-def test_every_way_trains_and_has_an_error(monkeypatch: pytest.MonkeyPatch, taken: Any) -> None:
-    small = {"PRESSES": 150, "TEST": 30, "EPOCHS": (3,), "ITERATIONS": (20,), "PASSES": (1,), "STEPS": (3,)}
-    for name, value in (small | {"HIDDEN": 6, "FEATURES": ("published", "windows")}).items():
-        monkeypatch.setattr(bench, name, value)
+@patch.multiple(bench, PRESSES=150, TEST=30, EPOCHS=(3,), ITERATIONS=(20,), PASSES=(1,), STEPS=(3,), HIDDEN=6)
+@patch.object(bench, "FEATURES", ("published", "windows"))
+def test_every_way_trains_and_has_an_error(taken: Any) -> None:
     bench.recorded.cache_clear()
     errors = {key[:3]: row["error"] for key, row in taken(bench.BENCH).items() if row}
     bench.recorded.cache_clear()
     assert len(errors) == 4 + 3  # LM learns from published inputs alone
     assert all(0 < error < 30 for error in errors.values())  # mm on a pad of 34
+
+
+PRESSES, FIBRES, SIDE, BATCH = 60, 2, 9, 400
+SPEED = 1 / (20 * 13.3)  # scaled, of 1 mm/s at 13.3 readings a second
+OF_NOW = slice(N_TIMED, N_TIMED + len(LATEST_WINDOWS))
+LAST = [N_PRESS_WINDOWS - 1] * len(LATEST_WINDOWS)  # windows of the latest readings of a press that has rested
+
+
+def make_presses(slopes: np.ndarray, level: float, noise: float) -> tuple[TrainingPresses, np.ndarray]:
+    """Presses of a finger that rests on a pad of linear response, and the table of that."""
+    rng = np.random.default_rng(0)
+    level_of = level * rng.standard_normal((FIBRES, N_FEATURES))
+    table = np.einsum("xyk,kcf->xycf", grid_positions(SIDE), slopes) + level_of
+    targets = rng.uniform(-0.5, 0.5, (PRESSES, 2))
+    inputs = interpolate_grid(table, targets)
+    inputs += noise * rng.standard_normal(inputs.shape)
+    for windows in (inputs, table):
+        windows[..., OF_NOW] = windows[..., LAST]
+    return training_presses(inputs, np.ones((PRESSES, FIBRES), bool), targets, N_TIMED, SPEED), table.astype(np.float32)
+
+
+def waves() -> np.ndarray:
+    """(2, C, F) slopes that differ from window to window."""
+    return np.random.default_rng(1).standard_normal((2, FIBRES, N_FEATURES))
+
+
+def draw(presses: TrainingPresses, table: np.ndarray, phase: Phase) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Rows of presses, their features (B, C, F) where they were, and the masks (B, K) of complete windows."""
+    sampler = PressSampler(presses, table, 0, np.random.default_rng(0), phase, ())
+    rows = sampler.sample_rows(BATCH)
+    x = sampler.inputs(rows, sampler.targets[rows], 0.0)[0]
+    assert x.shape[1] == sampler.n_inputs
+    features, mask, seen = np.split(x, [FIBRES * N_FEATURES, FIBRES * (N_FEATURES + 1)], axis=1)
+    assert (mask == 1).all()
+    return rows, features.reshape(BATCH, FIBRES, N_FEATURES), seen == 1
+
+
+noiseless = with_constants((press_sampler, {"LATEST_NOISE": 0.0}))
+
+
+@pytest.mark.parametrize("name", PHASES[N_TIMED])
+def test_moments_are_those_of_the_phase(name: str) -> None:
+    phase = PHASES[N_TIMED][name]
+    _, features, seen = draw(*make_presses(waves(), 1.0, 0.1), phase)
+    counts = seen.sum(axis=1)
+    assert (seen == (np.arange(N_TIMED) < counts[:, None])).all()
+    assert sorted(set(counts.tolist())) == [count for count in range(N_TIMED + 1) if count in phase]
+    share = [(counts == phase.first + k).mean() for k in range(len(phase.shares))]
+    assert share == pytest.approx(phase.shares, abs=4 * 0.5 / BATCH**0.5)
+    assert not features[:, :, :N_TIMED][~np.broadcast_to(seen[:, None], (BATCH, FIBRES, N_TIMED))].any()
+
+
+@pytest.mark.parametrize("count", [1, 8, N_PRESS_WINDOWS, N_PRESS_WINDOWS + 1, N_TIMED])
+def test_windows_yet_to_come_have_no_influence(count: int) -> None:
+    """Of the window that has begun, a reading may be the latest one."""
+    presses, table = make_presses(waves(), 1.0, 0.1)
+    spoilt = presses.inputs.copy()
+    spoilt[:, :, count + 1 : N_TIMED] = np.nan
+    _, before, _ = draw(presses, table, Phase(count, (1.0,)))
+    _, after, _ = draw(replace(presses, inputs=spoilt), table, Phase(count, (1.0,)))
+    assert np.array_equal(after, before)
+
+
+@pytest.mark.parametrize("count", [1, 5, N_PRESS_WINDOWS])
+def test_a_resting_finger_is_where_its_latest_windows_were(count: int) -> None:
+    presses, table = make_presses(waves(), 1.0, 0.1)
+    rng = np.random.default_rng(2)
+    factor, offset = rng.standard_normal((2, FIBRES, len(LATEST_WINDOWS), N_PRESS_WINDOWS)).astype(np.float32)
+    presses = replace(presses, latest_factor=factor, latest_offset=offset)
+    rows, features, _ = draw(presses, table, Phase(count, (1.0,)))
+    np.testing.assert_allclose(features[:, :, :count], presses.inputs[rows][:, :, :count], atol=1e-5)
+    scaled = factor * presses.inputs[rows][:, :, None, :N_PRESS_WINDOWS] + offset
+    latest = range(PRESS_WINDOWS[count - 1][1] - 1, PRESS_WINDOWS[min(count, N_PRESS_WINDOWS - 1)][1] - 1)
+    window_of = [
+        max(k for k, (first, _) in enumerate(PRESS_WINDOWS) if first <= max(reading, 1)) for reading in range(20)
+    ]
+    allowed = {(window_of[reading], window_of[reading - 1]) for reading in latest or [19]}
+    found = np.zeros(BATCH, bool)
+    for windows in allowed:
+        expected = np.stack([scaled[:, :, back, window] for back, window in enumerate(windows)], axis=2)
+        found |= np.isclose(features[:, :, OF_NOW], expected, atol=1e-4).all(axis=(1, 2))
+    assert found.all()
+
+
+@pytest.mark.parametrize("name", PHASES[N_TIMED])
+@pytest.mark.parametrize("kind", ["speed 0", "response alike everywhere"])
+def test_a_stroke_may_be_a_press_at_rest(monkeypatch: pytest.MonkeyPatch, name: str, kind: str) -> None:
+    """If it goes nowhere, or where the response is the same."""
+    if kind == "speed 0":
+        monkeypatch.setattr(press_sampler, "SPEEDS_MM_S", (1e-9, 2e-9))
+        presses, table = make_presses(waves(), 1.0, 0.1)
+    else:
+        presses, table = make_presses(0 * waves(), 1.0, 0.0)
+    phase = PHASES[N_TIMED][name]
+    found = [draw(presses, table, replace(phase, sliding=share))[1] for share in (0.0, 1.0)]
+    np.testing.assert_allclose(found[1], found[0], atol=1e-4)
+
+
+@pytest.mark.parametrize("count", [3, N_PRESS_WINDOWS, N_TIMED])
+def test_a_stroke_goes_at_its_speed(monkeypatch: pytest.MonkeyPatch, count: int) -> None:
+    """All windows respond alike to where the finger is, so they tell where it was; it ends at the target."""
+    monkeypatch.setattr(press_sampler, "SPEEDS_MM_S", (1.0, 2.0))
+    presses, table = make_presses(np.eye(2)[:, :, None] * np.ones(N_FEATURES), 0.0, 0.0)
+    rows, features, _ = draw(presses, table, Phase(count, (1.0,), sliding=1.0))
+    times = np.array([(first + end - 1) / 2 for first, end in PRESS_WINDOWS])[1:count]
+    step = np.diff(features[:, :, 1 : min(count, N_PRESS_WINDOWS)], axis=2) / np.diff(times[: N_PRESS_WINDOWS - 1])
+    np.testing.assert_allclose(step, np.broadcast_to(step[:, :, :1], step.shape), atol=1e-4)
+    speed = np.hypot(*step[:, :, 0].T) / SPEED
+    assert (speed > 0.99).all()
+    assert (speed < 2.01).all()
+    np.testing.assert_allclose(features[:, :, N_TIMED], presses.targets[rows], atol=1e-4)
+    latest = features[:, :, N_TIMED] - features[:, :, N_TIMED + 1]
+    np.testing.assert_allclose(latest, step[:, :, 0], atol=1e-4)
+
+
+def test_windows_of_a_press_become_windows_of_now() -> None:
+    """What has the same voltage in both, each scaled by its own mean and deviation."""
+    rng = np.random.default_rng(0)
+    mean_v, scale_v = rng.standard_normal((FIBRES, N_FEATURES)), rng.uniform(0.5, 2, (FIBRES, N_FEATURES))
+    history = np.zeros((FIBRES, 0, N_FEATURES)), np.zeros((FIBRES, 0))
+    scaler = FeatureScaler(mean_v, scale_v, *history, np.zeros(2), 20.0, np.ones(2))
+    volts = rng.standard_normal((FIBRES, N_PRESS_WINDOWS, 1))
+    down = scaler.scale(np.broadcast_to(volts, (FIBRES, N_PRESS_WINDOWS, N_FEATURES)).swapaxes(0, 1))  # (windows, C, F)
+    factor, offset = scaler.latest_window_map(N_TIMED)
+    for window, scaled in enumerate(down):
+        now = factor[:, :, window] * scaled[:, window, None] + offset[:, :, window]
+        np.testing.assert_allclose(now, scaled[:, OF_NOW], atol=1e-5)

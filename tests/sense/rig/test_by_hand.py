@@ -18,26 +18,13 @@ from padforge.design.settings import PadSettings
 from padforge.sense import Recording
 from padforge.sense.recording.run_directory import read_journal
 from padforge.sense.rig import by_hand
-from padforge.sense.rig.by_hand import (
-    MIN_PRESSES,
-    ROUND,
-    SETTLE_S,
-    UNTOUCHED,
-    PressSequence,
-    PressValidator,
-    pad_view,
-    plan_targets,
-    press_responses,
-    record_by_hand,
-    view_lines,
-)
+from padforge.sense.rig.by_hand import MIN_PRESSES, ROUND, SETTLE_S, UNTOUCHED, PressSequence, PressValidator
 from padforge.sense.rig.config import RigConfig
-from padforge.sense.rig.devices import RigFault
 from padforge.sense.settings import RigSettings
 from padforge.sense.signals.press_detection import PressDetector, PressEvent
 from tests.emulators.finger import SCATTER_MM, Finger
 from tests.helpers.page_names import names_in_view
-from tests.sense.rig.fakes import FingerBoard, Time
+from tests.sense.rig.fakes import FingerBoard, Time, fault_of
 
 
 def config_of(**settings: object) -> RigConfig:
@@ -45,7 +32,7 @@ def config_of(**settings: object) -> RigConfig:
 
 
 def test_plan_targets_orders_uniform_ones_in_short_rounds() -> None:
-    positions = plan_targets(config_of(presses=4 * ROUND, seed=3))
+    positions = by_hand.plan_targets(config_of(presses=4 * ROUND, seed=3))
     assert np.array_equal(positions, np.rint(positions))
     ways = np.linalg.norm(np.diff(positions, axis=0), axis=1)
     shuffled = np.random.default_rng(1).permutation(positions)
@@ -54,14 +41,12 @@ def test_plan_targets_orders_uniform_ones_in_short_rounds() -> None:
         assert (np.ptp(positions[first : first + ROUND], axis=0) > 0.6 * 45).all()
 
 
-def test_plan_targets_keeps_the_order_of_a_file(tmp_path: Path) -> None:
+def test_plan_targets_keeps_the_order_of_a_file_and_rounds_none_into_a_keep_out(tmp_path: Path) -> None:
     (tmp_path / "places.csv").write_text("x_mm,y_mm\n3.25,-1\n0,2\n3.25,-1\n")
-    assert plan_targets(config_of(plan=str(tmp_path / "places.csv"))).tolist() == [[3.25, -1], [0, 2], [3.25, -1]]
-
-
-def test_plan_targets_rounds_none_into_a_keep_out() -> None:
+    places = by_hand.plan_targets(config_of(plan=str(tmp_path / "places.csv")))
+    assert places.tolist() == [[3.25, -1], [0, 2], [3.25, -1]]
     hole = ((-4.1, -20.0), (4.1, -20.0), (4.1, 20.0), (-4.1, 20.0))
-    positions = plan_targets(replace(config_of(presses=400), pad_settings=PadSettings(keep_out_mm=(hole,))))
+    positions = by_hand.plan_targets(replace(config_of(presses=400), pad_settings=PadSettings(keep_out_mm=(hole,))))
     assert len(positions) == 400
     assert not ((np.abs(positions) < [4.1, 20.0]).all(axis=1)).any()
     assert (positions == np.rint(positions)).mean() > 0.9
@@ -70,7 +55,7 @@ def test_plan_targets_rounds_none_into_a_keep_out() -> None:
 def test_pad_view_shows_where_to_press(golden) -> None:
     """A pad of 24 x 21 mm."""
     pad = Morphology.straight((2, 1), pitch_mm=(12.0, 7.0))
-    view = pad_view(pad, "hand", mirrored=True)
+    view = by_hand.pad_view(pad, "hand", mirrored=True)
     golden("rig/hand_pad.json", view)
     np.testing.assert_allclose([path[0] for path in view["paths"]], pad.to_mm(pad.knots[:, 0]), atol=0.051)
 
@@ -88,7 +73,7 @@ class Hands:
         self.out, self.clock = folder / "hand", Time(least_s=0.025)
         self.finger = Finger(HAND_PAD, Contact(), rig, rig.board_rate_hz, mishaps=mishaps)
         self.config = RigConfig(HAND_PAD, Contact(), rig, self.out, "test")
-        self.targets = plan_targets(self.config)
+        self.targets = by_hand.plan_targets(self.config)
         self.messages: list[str] = []
         self.views: list[dict[str, Any]] = []
 
@@ -108,7 +93,9 @@ class Hands:
 
         with self.clock.of_all():
             board = FingerBoard(self.finger, self.clock, IDENTITY)
-            return record_by_hand(self.config, board, show, lambda: [*commands(), *self.finger.commands()], resume)
+            return by_hand.record_by_hand(
+                self.config, board, show, lambda: [*commands(), *self.finger.commands()], resume
+            )
 
     def strokes_of(self, recording: Recording) -> list[Any]:
         """The stroke of each press of a recording that was made at once."""
@@ -128,7 +115,6 @@ def accepted_mm(recording: Recording) -> np.ndarray:
 
 
 def distances_mm(recording: Recording, strokes: np.ndarray) -> list[float]:
-    """Distances of accepted presses from their targets."""
     made = zip(strokes[recording.has_position], accepted_mm(recording), strict=True)
     return [float(np.linalg.norm(stroke.position_mm - place)) for stroke, place in made]
 
@@ -152,7 +138,7 @@ def test_session_accepts_every_target_once_and_rejects_mishaps(hands) -> None:
     assert held_s.min() > 0.45
     last = [{"x_mm": x, "y_mm": y} for x, y in hand.targets[-12:].tolist()]
     assert hand.views[-1]["presses"] == last
-    assert names_in_view("hand.html") <= (pad_view(HAND_PAD, "hand") | hand.views[-1]).keys()
+    assert names_in_view("hand.html") <= (by_hand.pad_view(HAND_PAD, "hand") | hand.views[-1]).keys()
 
 
 class Inverted(PressDetector):
@@ -198,9 +184,9 @@ def test_session_tells_what_to_do_and_keeps_what_was_done(hands, golden, monkeyp
 
     recording = hand.record(commands=commands)
     undone.assert_called_once()  # others are not measured by the response of what was taken back
-    shown, prompts = ["    ".join(view_lines(view)[:3:2]) for view in hand.views], list[str]()
+    shown, prompts = ["    ".join(by_hand.view_lines(view)[:3:2]) for view in hand.views], list[str]()
     prompts = [line for before, line in zip(["", *shown], shown, strict=False) if line != before]
-    golden("rig/hand.txt", "\n".join([*view_lines(hand.views[60]), "", *prompts]))
+    golden("rig/hand.txt", "\n".join([*by_hand.view_lines(hand.views[60]), "", *prompts]))
     first = {view["phase"]: view for view in reversed(hand.views)}
     shown = [first[phase] for phase in ("settle", "press", "hold", "lift", "wait", "done")]
     golden("rig/hand_views.json", [*shown, next(view for view in hand.views if view["rejected"])])
@@ -245,16 +231,11 @@ def test_session_resumes(hands, monkeypatch, phase: str, killed: bool) -> None:
 
 
 def test_session_raises_a_full_disk(hands, monkeypatch: pytest.MonkeyPatch) -> None:
-    def full(self: object) -> None:
-        raise OSError(28, "No space left on device")
-
     def watch(view: dict) -> None:
         if view["done"] == 1:
-            monkeypatch.setattr(by_hand.Recorder, "sync", full)
+            monkeypatch.setattr(by_hand.Recorder, "sync", Mock(side_effect=OSError(28, "No space left on device")))
 
-    with pytest.raises(RigFault, match="cannot be written") as fault:
-        hands().record(watch=watch)
-    assert fault.value.cause == "disk"
+    fault_of(partial(hands().record, watch=watch), "disk", "cannot be written")
 
 
 BASELINE = np.array([2.0, 1.8, 1.9])
@@ -270,18 +251,6 @@ def sequence() -> PressSequence:
 def press(sequence: PressSequence, down_s: float, up_s: float) -> str:
     sequence.touch(down_s)
     return sequence.release(up_s)
-
-
-def test_sequence_holds_waits_and_ends(sequence: PressSequence) -> None:
-    assert sequence.touch(100.5) == (1.0, 2.0)
-    assert [sequence.phase(time_s) for time_s in (101.4, 101.5)] == ["hold", "lift"]
-    assert sequence.progress(101.0) == pytest.approx(0.5)
-    assert sequence.release(101.7) == ""
-    sequence.accept(101.8)
-    assert (sequence.accepted_mm, sequence.target) == ([(1.0, 2.0)], (3.0, 4.0))
-    assert [sequence.phase(time_s) for time_s in (102.6, 102.7)] == ["wait", "press"]
-    sequence.skip(103.0)
-    assert press(sequence, 110.0, 111.0) == "it came before it was asked for"
 
 
 @pytest.mark.parametrize(
@@ -301,6 +270,7 @@ def test_sequence_rejects_by_time(sequence: PressSequence, down_s: float, up_s: 
 
 def test_sequence_takes_back_or_skips_the_press_under_way(sequence: PressSequence) -> None:
     sequence.touch(110.0)
+    assert [sequence.phase(time_s) for time_s in (110.9, 111.0)] == ["hold", "lift"]
     assert not sequence.undo(110.5)
     assert sequence.phase(110.6) == "lift"
     assert sequence.release(111.0) == "it was taken back"
@@ -308,6 +278,8 @@ def test_sequence_takes_back_or_skips_the_press_under_way(sequence: PressSequenc
     sequence.skip(120.5)
     assert sequence.release(121.0) == "its place was skipped"
     assert sequence.target == (3.0, 4.0)
+    sequence.skip(130.0)  # after the last one none is asked for
+    assert press(sequence, 140.0, 141.0) == "it came before it was asked for"
 
 
 def readings(early: np.ndarray, late: np.ndarray) -> np.ndarray:
@@ -323,19 +295,16 @@ def validator() -> PressValidator:
     return validator
 
 
-def test_press_responses_are_differences_from_the_baseline() -> None:
-    np.testing.assert_allclose(press_responses(readings(PRESS, 2 * PRESS), 10, 30), [PRESS, 2 * PRESS])
+def test_validator_rejects_weak_and_moved_presses_by_responses_from_the_baseline(validator: PressValidator) -> None:
+    np.testing.assert_allclose(by_hand.press_responses(readings(PRESS, 2 * PRESS), 10, 30), [PRESS, 2 * PRESS])
     gaps = readings(PRESS, PRESS)
     gaps[12:18, 0] = np.nan
     gaps[:, 2] = np.nan
-    np.testing.assert_allclose(press_responses(gaps, 10, 30)[1], [0.1, -0.2, 0.0])
-    assert np.isfinite(press_responses(readings(PRESS, PRESS)[9:13], 1, 2)).all()  # the shortest there is
-
-
-def test_validator_rejects_weak_and_moved_presses(validator: PressValidator) -> None:
-    assert validator.rejection(press_responses(readings(PRESS, 1.3 * PRESS), 10, 30)) == ""
+    np.testing.assert_allclose(by_hand.press_responses(gaps, 10, 30)[1], [0.1, -0.2, 0.0])
+    assert np.isfinite(by_hand.press_responses(readings(PRESS, PRESS)[9:13], 1, 2)).all()  # the shortest there is
+    assert validator.rejection(by_hand.press_responses(readings(PRESS, 1.3 * PRESS), 10, 30)) == ""
     assert "weaker" in validator.rejection(np.array([0.1 * PRESS, 0.1 * PRESS]))
-    assert "changed" in validator.rejection(press_responses(readings(PRESS, PRESS[::-1]), 10, 30))
+    assert "changed" in validator.rejection(by_hand.press_responses(readings(PRESS, PRESS[::-1]), 10, 30))
 
 
 def test_validator_detects_that_nothing_touches(validator: PressValidator) -> None:
@@ -346,9 +315,7 @@ def test_validator_detects_that_nothing_touches(validator: PressValidator) -> No
     # Detected as a touch, but it began under a finger and ended at the baseline.
     assert validator.is_untouched(BASELINE + 0.2 * PRESS, pressed, held_s=0.5)
     assert not validator.is_untouched(pressed[::-1], pressed, held_s=0.5)
-
-
-def test_validator_follows_the_drift_of_the_baseline(validator: PressValidator) -> None:
+    # the baseline is followed as it drifts
     drift = 0.8 * UNTOUCHED * PRESS
     for step in range(1, 9):
         assert validator.is_touched(BASELINE + step * drift) is False
@@ -364,5 +331,5 @@ def test_presses_are_held_for_half_a_cycle_at_the_rate_of_the_board(monkeypatch:
     monkeypatch.setattr(by_hand, "HandSession", session)
     config = replace(config_of(presses=3, rate_hz=400.0, readings_per_press=40), out=tmp_path / "out")
     with pytest.raises(EOFError):
-        record_by_hand(config, board, lambda view: None, list)
+        by_hand.record_by_hand(config, board, lambda view: None, list)
     assert session.call_args.args[2] == 20 / 500

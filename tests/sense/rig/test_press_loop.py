@@ -1,7 +1,6 @@
 """The press loop in virtual time: every press is kept, whatever breaks, and the arm is stopped and lifted off first."""
 
 import contextlib
-import json
 import os
 import signal
 import threading
@@ -10,6 +9,7 @@ from contextlib import closing
 from functools import partial
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -25,6 +25,7 @@ from padforge.sense.rig.arms.ur5 import UR5
 from padforge.sense.rig.config import RigConfig
 from padforge.sense.rig.devices import BoardSamples, RigFault
 from padforge.sense.rig.press_loop import Averager, DiskThread, PressLoop, check_plan
+from tests.sense.rig import fakes
 from tests.sense.rig.fakes import PAD, RIG, FakeArm, FakeBoard, Time
 
 PLAN = PressPlan(np.array([[0, 0], [5, 3], [-5, 4], [2, -6], [0, 5], [3, 3]], float), np.full(6, 4.0))
@@ -59,22 +60,6 @@ def fault_of(path, arm, board, options, match, plan=PLAN):
 
 def n_done(path):
     return len(read_journal(path / "journal.ndjson"))
-
-
-def test_run_records_every_press(tmp_path):
-    run(tmp_path / "run", *rig())
-    recording = Recording.open(tmp_path / "run")
-    assert np.array_equal(recording.presses_mm, PLAN.positions_mm)
-    assert recording.rate_hz == pytest.approx(100, rel=0.01)
-    assert np.diff(recording.times_s).max() < 0.011
-    held = recording.up_command - recording.down_command
-    assert ((held >= 18) & (held <= 24)).all()
-    baseline = np.stack([recording.readings[b - 10 : b - 1].mean(axis=0) for b in recording.down_command])
-    pressed = np.stack([recording.readings[u - 6 : u - 1].mean(axis=0) for u in recording.up_command])
-    assert (np.abs(pressed - baseline).max(axis=1) > 0.02).all()
-    journal = [json.loads(line) for line in (tmp_path / "run" / "journal.ndjson").read_text().splitlines()]
-    reached = np.array([event["at_mm"] for event in journal if event["event"] == "done"])
-    assert reached == pytest.approx(np.column_stack([PLAN.positions_mm, PLAN.depths_mm]), abs=0.1)
 
 
 def test_press_begins_with_the_first_reading_after_the_command(tmp_path):
@@ -247,9 +232,7 @@ def test_run_loses_nothing_on_a_full_disk(tmp_path):
             raise OSError(28, "No space left on device")
 
     arm, board, _ = rig()
-    with pytest.raises(RigFault, match="No space left") as fault:
-        run_on_disk(tmp_path / "run", arm, board, fill)
-    assert fault.value.cause == "disk"
+    fakes.fault_of(lambda: run_on_disk(tmp_path / "run", arm, board, fill), "disk", "No space left")
     assert arm.stops >= 1
     assert n_done(tmp_path / "run") >= 2
 
@@ -277,9 +260,8 @@ def test_run_raises_a_disk_that_hangs(tmp_path):
             resume.set()
 
     arm.hook = hook
-    with pytest.raises(RigFault, match="the disk took more than 30 s") as fault:
-        run_on_disk(tmp_path / "run", arm, board, lambda recorder: resume.wait(20))
-    assert fault.value.cause == "disk"
+    hangs = partial(run_on_disk, tmp_path / "run", arm, board, lambda recorder: resume.wait(20))
+    fakes.fault_of(hangs, "disk", "the disk took more than 30 s")
     assert len(arm.moves) == 3
 
 
@@ -316,10 +298,7 @@ def test_averager_takes_means_however_samples_arrive(ratio, count, lost, data):
 
 
 def test_disk_thread_stops_after_a_failure() -> None:
-    def full() -> None:
-        raise OSError(28, "No space left on device")
-
-    done: list[int] = []
+    done, full = list[int](), Mock(side_effect=OSError(28, "No space left on device"))
     with DiskThread() as disk:
         disk.submit(done.append, 1)
         disk.submit(full)
@@ -401,9 +380,7 @@ def test_record_handles_a_second_ctrl_c_after_the_loop(tmp_path: Path, monkeypat
 
 
 @pytest.mark.slow
-def test_emulated_arm_retreats_from_too_much_force_however_slow_the_disk(
-    robots: Any, host: str, tmp_path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_emulated_arm_retreats_from_force_however_slow_the_disk(robots: Any, host: str, tmp_path, monkeypatch) -> None:
     """20 N/mm at 10 mm/s: a tenth of a second without a check costs 20 N, and the disk would take half a press."""
     robot = robots.get("e", pose=(0.0, -400.0, 60.0, 0.0, np.pi, 0.0), surface_mm=50, stiffness_n_mm=20.0)
     slow = {"press_mm_s": 10.0, "clearance_mm": 2.0}

@@ -219,6 +219,15 @@ def test_devices_are_refused_in_these_words(golden, monkeypatch: pytest.MonkeyPa
     golden("rig/refusals_of_devices.txt", refusal_table(rows))
 
 
+CHANGES: dict[str, Any] = {
+    **{"channels": (0, 1, 3, 2), "rate_hz": 5.0, "readings_per_press": 50, "board_rate_hz": 500.0},
+    **{"contact_mm": 12.0, "clearance_mm": 12.0, "travel_mm_s": 90.0, "press_mm_s": 30.0, "acceleration_mm_s2": 400.0},
+    **{"depth_mm": 4.0, "depths_mm": (1.0, 2.0), "pad_mm": (1.0, 2.0), "pad_angle_deg": 5.0},
+    **{"tool_rad": (0.1, 3.1, 0.0), "tcp_mm": (0.0, 0.0, 150.0), "mirrored": True},
+}
+"""Settings that change what a press is."""
+
+
 def test_recordings_are_not_resumed_in_these_words(golden, tmp_path: Path) -> None:
     run, hand, broken = (tmp_path / name for name in ("run", "hand", "broken"))
     options = RIG.model_copy(update={"channels": (0, 1, 2, 3)})
@@ -260,8 +269,7 @@ def test_recordings_are_not_resumed_in_these_words(golden, tmp_path: Path) -> No
         "no plan": resumed(broken),
         "by hand": resumed(hand),
         "another pad": resumed(pad=Morphology.random(2, 3, 1)),
-        "another depth": resumed(depth_mm=4.0),
-        "another angle": resumed(pad_angle_deg=5.0),
+        **{f"another {key}": resumed(**{key: value}) for key, value in CHANGES.items()},
         "another arm": opened("arm", serial="2019"),
         "another tool": opened("arm", tcp=[0.0, 0.0, 149.0, 0.0, 0.0, 0.0]),
         "another board": opened("board", serial="8"),

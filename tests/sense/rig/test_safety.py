@@ -4,6 +4,7 @@ import contextlib
 import math
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from itertools import chain, repeat
 from unittest import mock
 
@@ -12,26 +13,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from padforge.sense.rig import safety
 from padforge.sense.rig.devices import ArmState, Pose, RigFault
-from padforge.sense.rig.safety import (
-    FALL_END_S,
-    FALL_START_S,
-    MAX_RISE_N,
-    MAX_TILT_DEG,
-    RETREAT_MM,
-    RETREAT_MM_S,
-    Limits,
-    check_start_state,
-    check_state,
-    check_target,
-    check_tcp,
-    retreat,
-    tilt_deg,
-    turn_deg,
-    wait_until_still,
-)
+from padforge.sense.rig.safety import FALL_END_S, FALL_START_S, MAX_RISE_N, RETREAT_MM, RETREAT_MM_S, Limits
 from padforge.sense.settings import RigSettings
-from tests.sense.rig.fakes import RIG, FakeArm, Time
+from tests.sense.rig.fakes import RIG, FakeArm, Time, fault_of
 
 LIMITS = Limits(box_mm=((-100, 100), (-500, -300), (40, 120)), contact_mm=50.0, max_depth_mm=6.0, max_force_n=40.0)
 SAFE: Pose = (0.0, -400.0, 60.0, 0.0, math.pi, 0.0)
@@ -43,20 +29,20 @@ numbers = st.floats(allow_nan=True, allow_infinity=True)
 @given(st.lists(numbers, max_size=8), numbers.filter(lambda value: not 0 < value <= 250))
 def test_check_target_passes_only_within_every_limit(pose: list[float], speed: float) -> None:
     with contextlib.suppress(RigFault):
-        check_target(pose, 50, 500, LIMITS)  # pyright: ignore[reportArgumentType]
+        safety.check_target(pose, 50, 500, LIMITS)  # pyright: ignore[reportArgumentType]
         assert len(pose) == 6
         assert all(low <= value <= high for value, (low, high) in zip(pose[:3], LIMITS.box_mm, strict=True))
         assert 50 - pose[2] <= 6
-        assert tilt_deg(pose[3:], LIMITS.tool) <= MAX_TILT_DEG
+        assert safety.tilt_deg(pose[3:], LIMITS.tool) <= safety.MAX_TILT_DEG
     with pytest.raises(RigFault, match="speed"):
-        check_target(SAFE, speed, 500, LIMITS)
+        safety.check_target(SAFE, speed, 500, LIMITS)
 
 
 def test_check_target_passes_on_the_limits() -> None:
     """What lies beyond them is in the table of refusals."""
     for position in ((-100, Y, Z), (100, Y, Z), (X, -500, Z), (X, -300, Z), (X, Y, 44), (X, Y, 120)):
-        check_target((*position, *TOOL), 250, 1200, LIMITS)
-    check_target((X, Y, Z, 0.0, math.pi - math.radians(1.99), 0.0), 50, 500, LIMITS)
+        safety.check_target((*position, *TOOL), 250, 1200, LIMITS)
+    safety.check_target((X, Y, Z, 0.0, math.pi - math.radians(1.99), 0.0), 50, 500, LIMITS)
     replace(LIMITS, tool=(0.0, math.pi * 0.95, 0.0))
     with pytest.raises(ValueError, match="points the tool down"):
         replace(LIMITS, tool=(0.0, math.pi * 0.94, 0.0))
@@ -72,12 +58,12 @@ def test_limits_from_settings() -> None:
 @given(st.floats(-math.pi, math.pi), st.tuples(*[st.floats(-7, 7)] * 3), st.tuples(*[st.floats(-7, 7)] * 3))
 def test_tilt_deg_is_the_angle_between_axes(turn: float, a: tuple[float, ...], b: tuple[float, ...]) -> None:
     """A rotation about x by a takes the z axis to (0, -sin a, cos a); one about y to (sin b, 0, cos b)."""
-    assert tilt_deg(down(turn), LIMITS.tool) == pytest.approx(0, abs=1e-6)
-    assert 0 <= tilt_deg(a, b) <= 180
-    assert tilt_deg(a, b) == pytest.approx(tilt_deg(b, a), abs=1e-9)
+    assert safety.tilt_deg(down(turn), LIMITS.tool) == pytest.approx(0, abs=1e-6)
+    assert 0 <= safety.tilt_deg(a, b) <= 180
+    assert safety.tilt_deg(a, b) == pytest.approx(safety.tilt_deg(b, a), abs=1e-9)
     for x, y in ((0.3, 0.4), (2.0, -1.0), (math.pi, 3.0)):
         cosine = math.cos(x) * math.cos(y)
-        assert tilt_deg((x, 0, 0), (0, y, 0)) == pytest.approx(math.degrees(math.acos(cosine)))
+        assert safety.tilt_deg((x, 0, 0), (0, y, 0)) == pytest.approx(math.degrees(math.acos(cosine)))
 
 
 def down(turn: float) -> tuple[float, float, float]:
@@ -88,24 +74,24 @@ def down(turn: float) -> tuple[float, float, float]:
 @given(st.floats(-3.1, 3.1), st.floats(-3.1, 3.1))
 def test_turn_deg_is_the_angle_about_the_axis(a: float, b: float) -> None:
     turn = abs(math.remainder(a - b, 2 * math.pi))
-    assert turn_deg(down(a), down(b)) == pytest.approx(math.degrees(turn), abs=1e-4)
-    assert turn_deg((0.0, math.pi - 0.03, 0.0), LIMITS.tool) == pytest.approx(0, abs=1e-9)
+    assert safety.turn_deg(down(a), down(b)) == pytest.approx(math.degrees(turn), abs=1e-4)
+    assert safety.turn_deg((0.0, math.pi - 0.03, 0.0), LIMITS.tool) == pytest.approx(0, abs=1e-9)
 
 
 @pytest.mark.parametrize(("degrees", "is_refused"), [(44.9, False), (45.1, True), (-44.9, False), (-170.0, True)])
 def test_check_start_state_limits_the_turn(degrees: float, is_refused: bool) -> None:
     state = replace(STILL, force_n=0.0, pose=(*SAFE[:3], *down(math.radians(degrees))))
     with pytest.raises(RigFault, match="at most 45") if is_refused else contextlib.nullcontext():
-        check_start_state(state, LIMITS)
+        safety.check_start_state(state, LIMITS)
 
 
 def test_check_tcp_compares_with_the_controller() -> None:
     tcp_mm = 0.0, 0.0, 150.0
     for each in (tcp_mm, None):
-        check_tcp(each, {"model": "a printer, which has none"})
-    check_tcp(tcp_mm, {"tcp": [0.0, 0.05, 150.09, 0.0, 0.0, 0.0]})
+        safety.check_tcp(each, {"model": "a printer, which has none"})
+    safety.check_tcp(tcp_mm, {"tcp": [0.0, 0.05, 150.09, 0.0, 0.0, 0.0]})
     with pytest.raises(RigFault, match="tcp_mm"):
-        check_tcp(tcp_mm, {"tcp": [math.nan] * 6})
+        safety.check_tcp(tcp_mm, {"tcp": [math.nan] * 6})
 
 
 @pytest.mark.parametrize(
@@ -122,14 +108,14 @@ def test_check_state_accepts_the_limits_and_no_nan(change: dict[str, object], ca
     """What lies beyond them is in the table of refusals."""
     state = replace(STILL, **change)  # pyright: ignore[reportArgumentType]
     with pytest.raises(RigFault) if cause else contextlib.nullcontext() as caught:
-        check_state(state, LIMITS, 10.0, until_s=10.0)
+        safety.check_state(state, LIMITS, 10.0, until_s=10.0)
     assert caught is None or caught.value.cause == cause
 
 
 def test_checks_of_an_unwatched_force() -> None:
     for force_n in (1e6, None):
-        check_state(replace(STILL, force_n=force_n), replace(LIMITS, max_force_n=None), 10.0)
-        check_start_state(replace(STILL, force_n=force_n), replace(LIMITS, max_force_n=None))
+        safety.check_state(replace(STILL, force_n=force_n), replace(LIMITS, max_force_n=None), 10.0)
+        safety.check_start_state(replace(STILL, force_n=force_n), replace(LIMITS, max_force_n=None))
 
 
 def scripted_arm(*script: ArmState | BaseException) -> tuple[mock.Mock, Time]:
@@ -150,7 +136,7 @@ def test_wait_until_still_waits_for_the_tip_to_rest() -> None:
         replace(STILL, moving=True), replace(STILL, speed_mm_s=1.1), replace(STILL, speed_mm_s=1.0)
     )
     with clock.of_all():
-        assert wait_until_still(arm, LIMITS).speed_mm_s == 1
+        assert safety.wait_until_still(arm, LIMITS).speed_mm_s == 1
     assert not arm.stop.called
     assert clock() > 10
 
@@ -168,7 +154,7 @@ def test_wait_until_still_waits_for_the_tip_to_rest() -> None:
 def test_wait_until_still_stops_the_arm_before_it_raises(step: ArmState | BaseException, cause: str | None) -> None:
     arm, clock = scripted_arm(replace(STILL, moving=True), step)
     with clock.of_all(), pytest.raises(RigFault if cause else KeyboardInterrupt) as caught:
-        wait_until_still(arm, LIMITS)
+        safety.wait_until_still(arm, LIMITS)
     assert getattr(caught.value, "cause", None) == cause
     arm.stop.assert_called_once()
     assert clock() < 10 + LIMITS.deadline_s + 1
@@ -188,7 +174,7 @@ def arm_at(height_mm: float, force: Callable[[FakeArm], float]) -> FakeArm:
 
 def retreated(arm: FakeArm) -> FakeArm:
     with arm.time.of_all():
-        retreat(arm, RETREAT_LIMITS)
+        safety.retreat(arm, RETREAT_LIMITS)
     return arm
 
 
@@ -216,9 +202,7 @@ def test_retreat_lifts_the_tool_slowly_off_what_it_presses() -> None:
 )
 def test_retreat_stops_if_the_force_does_not_fall(force: Callable[[FakeArm], float], max_rise_mm: float) -> None:
     arm = arm_at(DEEP_MM, force)
-    with pytest.raises(RigFault) as caught:
-        retreated(arm)
-    assert caught.value.cause == "force"
+    fault_of(partial(retreated, arm), "force")
     assert arm.stops == 1
     assert arm.pose[2] < DEEP_MM + max_rise_mm
 

@@ -192,9 +192,8 @@ def fibre_loss() -> FibreLoss:
     methods = {}
     for name, more in (("one network", 0.0), ("retrained", 0.5)):
         means = [2.0 + more, *(3.0 + more + np.array([0.1, 0.4, 0.2, 0.3]))]
-        by_subset = [
-            {"failed": failed, "mean_mm": mean} for failed, mean in zip([[], [0], [1], [2], [3]], means, strict=True)
-        ]
+        sets = [], [0], [1], [2], [3]
+        by_subset = [{"failed": failed, "mean_mm": mean} for failed, mean in zip(sets, means, strict=True)]
         errors = [
             {"n_failed": n, "subsets": k, "mean_mm": mean + more, "std_mm": mean / 4, "max_mm": 2 * mean}
             for n, k, mean in ((0, 1, 2.0), (1, 4, 3.25))

@@ -1,12 +1,11 @@
 """The frame of all studies: pads by name, tasks in any order, all results or none."""
 
-import subprocess
-import sys
 import threading
 from collections.abc import Callable
 from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -38,8 +37,6 @@ from padforge.sense.studies.study import (
 from tests.helpers.door import called, refused
 
 PADS = {"square": Morphology.straight(2)}
-
-
 SMALLER = {
     "drift.MEMBERS": 2,
     "drift.EPOCHS": 2,
@@ -123,10 +120,7 @@ def test_run_leaves_nothing_if_the_figure_or_the_document_fails(tmp_path: Path) 
     [
         (["robustness", "nowhere.json"], "nowhere.json: no such file, and none of square, optimised, random-N"),
         (["robustness", "square", "square"], "another one is called square"),
-        (
-            ["robustness", "square", "--presses", "1000"],
-            "Invalid value for '--presses': got 1000, allowed is a square number",
-        ),
+        (["robustness", "square", "--presses", "1000"], "for '--presses': got 1000, allowed is a square number"),
         (["robustness", "square", "--failed", "6,9"], "fibre 9: no such fibre, allowed are 1 to 8"),
         (["scaling", "square", "--grids", "4,x"], "--grids is '4,x', expected numbers from 2 to 256"),
     ],
@@ -137,7 +131,6 @@ def test_invalid_study_command_fails_in_one_line(arguments: list[str], message: 
 
 @pytest.fixture
 def studies(monkeypatch: pytest.MonkeyPatch) -> list[Study]:
-    """Studies that commands would run."""
     studies: list[Study] = []
     monkeypatch.setattr("padforge.sense.studies.study.run", lambda study, *_, **__: studies.append(study) or {})
     monkeypatch.setattr("padforge.sense.studies.study.study_lines", lambda document: [])
@@ -145,18 +138,14 @@ def studies(monkeypatch: pytest.MonkeyPatch) -> list[Study]:
 
 
 @pytest.mark.parametrize("name", [*SMALLEST, "robustness", "sensitivity"])
-def test_seed_of_a_command_is_that_of_its_pads_and_of_its_study(
-    name: str, studies: list[Study], tmp_path: Path
-) -> None:
+def test_seed_of_a_command_is_that_of_its_pads_and_of_its_study(name: str, studies: list[Study], tmp_path) -> None:
     assert called("study", name, "random-2@2", "--seed", "3", "--out", "out", cwd=tmp_path).code == 0
     assert studies[0].settings["seed"] == 3
     assert studies[0].settings["pads"] == describe_pads({"random-2@2": Morphology.random(2, 2, 3)})
 
 
 @pytest.mark.parametrize("name", ["multicontact", "scaling"])
-def test_study_takes_contact_scatter_and_pads_from_the_settings(
-    name: str, studies: list[Study], tmp_path: Path
-) -> None:
+def test_study_takes_contact_scatter_and_pads_from_the_settings(name: str, studies: list[Study], tmp_path) -> None:
     """And is the paper's where they state no contact."""
     layer = "[contact]\ndepth_mm = 3\n[search]\nscatter = 0.1\n[pad]\ngrid = 3\npitch_mm = 8\n"
     for path, text in (("layer.toml", layer), ("paper.toml", "")):
@@ -171,24 +160,11 @@ def test_study_takes_contact_scatter_and_pads_from_the_settings(
     assert (paper_settings["scatter"], paper_settings["pads"]["square"]["grid"]) == (None, 4)
 
 
-@pytest.mark.slow
-def test_interrupt_ends_a_study_at_once(tmp_path: Path) -> None:
-    out = tmp_path / "out"
-    code = (
-        "import os, signal, sys, threading\n"
-        "from padforge.sense.studies import study\n"
-        "compute = study.compute_states\n"
-        "def interrupted(*arguments, **options):\n"
-        "    threading.Timer(0.5, os.kill, (os.getpid(), signal.SIGINT)).start()\n"
-        "    return compute(*arguments, **options)\n"
-        "study.compute_states = interrupted\n"
-        "from padforge.cli import main\n"
-        "main()\n"
-    )
-    command = [sys.executable, "-c", code, "study", "robustness", "square@6", "--presses", "1024", "--out", str(out)]
-    ended = subprocess.run(command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True, timeout=120)
-    assert (ended.returncode, ended.stderr.strip()) == (130, "padforge: interrupted; nothing is written")
-    assert not out.exists() or not list(out.iterdir())
+def test_interrupted_study_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("padforge.sense.studies.study.compute_states", Mock(side_effect=KeyboardInterrupt))
+    ended = called("study", "robustness", "square@2", "--presses", "16", "--out", "out", cwd=tmp_path)
+    assert (ended.code, ended.err.splitlines()[-1]) == (130, "padforge: interrupted; nothing is written")
+    assert not [path for path in tmp_path.rglob("*") if path.is_file()]
 
 
 def test_load_pads_by_file_by_name_or_by_a_search(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

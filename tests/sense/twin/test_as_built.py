@@ -1,4 +1,4 @@
-"""The parametric model of a pad: derivatives against differences, closed forms, transform and path."""
+"""The parametric model of a pad, the search for its wiring, and its fits to responses and parts of presses."""
 
 from dataclasses import replace
 from typing import Any
@@ -6,20 +6,22 @@ from typing import Any
 import numpy as np
 import pytest
 
+from padforge.design import Contact, Morphology, signals
+from padforge.design.layer import Base
 from padforge.design.twin import PlanTransform
-from padforge.sense.twin.as_built import (
-    N_CHANNEL,
-    N_OFFSET,
-    N_SHARED,
-    OFFSET,
-    AsBuiltPad,
-    PadPlan,
-    channel_indices,
-    channel_response,
-)
-from padforge.sense.twin.responses import Responses
+from padforge.sense import Recording, RigSettings, simulate
+from padforge.sense.simulation.built_pad import build_pad
+from padforge.sense.simulation.pad_model import SUPPLY_V, Cycle, resistance_changes
+from padforge.sense.twin import as_built
+from padforge.sense.twin.as_built import N_CHANNEL, N_OFFSET, N_SHARED, OFFSET, SENSITIVITY, AsBuiltPad, PadPlan
+from padforge.sense.twin.contact_fit import fit_contact
+from padforge.sense.twin.fitting import Priors, estimate_scatter, fit_as_built
+from padforge.sense.twin.press_parts import SeparatedPresses, part_kernels, separate_parts
+from padforge.sense.twin.responses import Responses, compute_responses, fit_gps, select_one_depth
+from padforge.sense.twin.wiring import Wiring, as_stated, find_wirings, images, planned_paths_mm
+from tests.sense.conftest import few_candidates
 
-from .conftest import PLAN
+from .conftest import PLAN, simulate_responses
 
 F, J, K, STEP = 60, 7, 6, 0.25
 POSITIONS_MM = np.random.default_rng(2).uniform(-10, 10, (40, 2))
@@ -40,20 +42,18 @@ def test_jacobian_agrees_with_differences(pad):
         ahead, behind = (replace(pad, values=pad.values + sign * step).predict(POSITIONS_MM) for sign in (1, -1))
         slope = (ahead - behind) / 2e-6
         for channel in range(3):
-            columns = np.concatenate([np.arange(N_SHARED), channel_indices(channel)])
+            columns = np.concatenate([np.arange(N_SHARED), as_built.channel_indices(channel)])
             derivative = jacobians[channel][:, columns == index].sum(axis=1)
             assert slope[:, channel] == pytest.approx(derivative, abs=1e-6)
 
 
-def test_with_values_scales_the_profile_to_one_and_keeps_predictions(pad):
+def test_other_values_scale_the_profile_to_one_keep_predictions_and_are_fitted(pad):
     values = pad.values.copy()
     values[4:N_SHARED] *= 3
     scaled = pad.with_values(values)
     assert np.abs(scaled.profile(np.linspace(0, scaled.max_distance, 101))[0]).max() == pytest.approx(1)
     assert scaled.predict(POSITIONS_MM) == pytest.approx(replace(pad, values=values).predict(POSITIONS_MM))
-
-
-def test_fit_gains_recovers_gains_and_rests(pad):
+    # gains and rests are recovered
     responses = Responses(POSITIONS_MM, pad.predict(POSITIONS_MM), np.ones((40, 3), bool))
     values = pad.values.copy()
     values[N_SHARED:].reshape(-1, N_CHANNEL)[:, :2] = [1.0, 0.0]
@@ -87,9 +87,11 @@ def test_channel_response_moves_with_the_fibre_grows_with_it_and_ends_with_the_p
     }
     moved = {**fibre, "lateral_offset": np.tile([[0.3], [-0.2]], J)}
     back = {**fibre, "lateral_offset": np.zeros((2, J)), "positions": fibre["positions"] - [0.3, -0.2]}
-    assert channel_response(**moved, step=STEP)[0] == pytest.approx(channel_response(**back, step=STEP)[0], abs=1e-12)
+    assert as_built.channel_response(**moved, step=STEP)[0] == pytest.approx(
+        as_built.channel_response(**back, step=STEP)[0], abs=1e-12
+    )
     far = {**back, "positions": np.array([[2.0, 0.4 + 0.5 + (K + 1) * STEP]])}
-    assert not any(np.any(part) for part in channel_response(**far, step=STEP))
+    assert not any(np.any(part) for part in as_built.channel_response(**far, step=STEP))
     # it grows with the length of a stretched fibre
     path = np.column_stack([(np.arange(F) + 0.5) / F, np.zeros(F)])
     elements = path, np.tile([1.0, 0.0], (F, 1)), np.full(F, 1 / F)
@@ -98,5 +100,278 @@ def test_channel_response_moves_with_the_fibre_grows_with_it_and_ends_with_the_p
     stretched = {**straight, "lateral_offset": np.vstack([0.1 * (np.arange(J) - 1) / (J - 3), np.zeros(J)])}
     plain = {**straight, "lateral_offset": np.zeros((2, J))}
     # within one step of the press all splines of weight 1 add up to 1, so the response is the length
-    assert channel_response(**plain, step=2.0)[0][0] == pytest.approx(1.0)
-    assert channel_response(**stretched, step=2.0)[0][0] == pytest.approx(1.1)
+    assert as_built.channel_response(**plain, step=2.0)[0][0] == pytest.approx(1.0)
+    assert as_built.channel_response(**stretched, step=2.0)[0][0] == pytest.approx(1.1)
+
+
+@pytest.mark.slow  # the quick tests of `identify` find wirings, too
+@few_candidates()
+def test_find_wirings_puts_the_true_one_first(printed, responses) -> None:
+    """Though readings are missing, and what stands in their place is nonsense."""
+    volts, valid = responses.volts.copy(), responses.valid.copy()
+    volts[::3, 0], valid[::3, 0] = 5.0, False
+    responses = Responses(responses.positions_mm, volts, valid)
+    best = find_wirings(PadPlan.from_morphology(PLAN), responses, np.random.default_rng(0))[0]
+    assert best.fibres == tuple(channel.fibre for channel in printed.channels if channel.fibre is not None)
+    assert best.transform.mirrored
+    assert np.hypot(*np.subtract(best.transform.shift_mm, printed.frame.shift_mm)) < 1.0
+    assert best.match > 0.9
+
+
+@pytest.mark.parametrize(
+    ("fibres", "pitch_mm", "count"), [(3, 11.25, 8), ((2, 3), (8.0, 12.0), 4), ((2, 2), (8.0, 9.0), 4)]
+)
+def test_images_of_a_wiring_respond_alike_on_straight_fibres(fibres, pitch_mm, count) -> None:
+    pad = Morphology.straight(fibres, pitch_mm)
+    start = Wiring(PlanTransform(True, -97.0, (3.0, 1.0), 1.1), 0.5, tuple(range(len(pad.knots)))[::-1], 0.5)
+    positions_mm = np.random.default_rng(0).uniform(-8, 8, (40, 2))
+    wirings = [start, *images(start, pad.layout)]
+    assert len({(wiring.transform.mirrored, wiring.fibres) for wiring in wirings}) == count
+    expected, *others = (
+        signals(pad, pad.to_grid(wiring.transform.to_plan(positions_mm)), Contact(model="profile"))[:, wiring.fibres]
+        for wiring in wirings
+    )
+    for other in others:
+        np.testing.assert_allclose(other, expected, atol=1e-9)
+    plan = PadPlan.from_morphology(pad, 5)
+    planned, *others = (planned_paths_mm(plan, wiring.transform, wiring.fibres) for wiring in wirings)
+    for other in others:  # each from one end or the other
+        same, reverse = np.abs(planned - other).max((1, 2)), np.abs(planned - other[:, ::-1]).max((1, 2))
+        np.testing.assert_allclose(np.minimum(same, reverse), 0, atol=1e-9)
+
+
+@pytest.mark.parametrize("mirrored", [False, True])
+@pytest.mark.parametrize("turn_deg", [-180, 90])
+def test_planned_paths_lie_under_the_arm_where_the_transform_takes_them_to_the_plan(mirrored, turn_deg) -> None:
+    plan, fibres = PadPlan.from_morphology(PLAN, 5), (2, 0)
+    expected = (plan.paths[[2, 0]] - np.array(plan.layout.extent) / 2) * plan.layout.unit_mm
+    paths_mm = planned_paths_mm(plan, PlanTransform(mirrored, turn_deg + 8.0, (3.0, 1.0), 1.1), fibres)
+    on_plan = [PlanTransform(mirrored, turn_deg).to_plan(path) for path in paths_mm]
+    np.testing.assert_allclose(on_plan, expected, atol=1e-9)
+
+
+def test_the_stated_wiring_reads_fibres_in_order_of_a_pad_in_the_middle_of_what_was_pressed(responses) -> None:
+    elsewhere = replace(responses, positions_mm=responses.positions_mm + np.array([200.0, -100.0]))
+    wiring = as_stated(np.array([0, 2, 3]), elsewhere, 11.25)
+    assert wiring.fibres == (0, 2, 3)
+    assert np.abs(wiring.transform.to_plan(elsewhere.positions_mm).mean(axis=0)).max() < 3
+    assert as_stated(np.array([1]), responses, 11.25).transform == PlanTransform()
+
+
+def test_response_is_the_held_level_minus_the_rest() -> None:
+    """Readings of 2 V at rest, of 5 V while the tip comes to rest, and of 3 V then."""
+    recording = simulate(Morphology.straight(2), RigSettings(presses=80, seed=0))
+    readings = np.full_like(recording.readings, 2.0)
+    for down, up in zip(recording.down_command, recording.up_command, strict=True):
+        readings[down : down + 4], readings[down + 4 : up] = 5.0, 3.0
+    responses = compute_responses(replace(recording, readings=readings), np.arange(80) < 60)
+    np.testing.assert_allclose(responses.volts, 1.0, atol=0.02)  # of which history takes a little
+
+
+def test_select_one_depth_keeps_the_most_common_and_all_of_unknown_depth() -> None:
+    recording = simulate(
+        Morphology.straight(2), RigSettings(presses=9, depths_mm=(0.5, 3.0, 5.0)), Contact(model="profile")
+    )
+    selected = select_one_depth(recording)
+    assert selected.presses_mm[selected.has_position].tolist() == recording.presses_mm[2::3].tolist()
+    unknown = replace(recording, depths_mm=np.full(9, np.nan))
+    assert select_one_depth(unknown) is unknown
+    assert select_one_depth(replace(recording, depths_mm=np.linspace(4.7, 5.3, 9))).has_position.all()
+
+
+def test_fit_gps_separate_noise_from_a_function_of_position_and_ignore_invalid_responses():
+    positions_mm = np.random.default_rng(0).uniform(-20, 20, (500, 2))
+    noise = np.random.default_rng(1).standard_normal((500, 2))
+    function = 3 * np.sin(positions_mm[:, 0] / 9) + np.cos(positions_mm[:, 1] / 7)
+    volts = np.column_stack([function + 0.2 * noise[:, 0], noise[:, 1]])
+    smooth, noisy = fit_gps(Responses(positions_mm, volts, np.ones((500, 2), bool)), 10)
+    assert (smooth.noise_v, noisy.noise_v) == pytest.approx((0.2, 1.0), rel=0.12)
+    assert smooth.log_bayes_factor > 100
+    assert noisy.log_bayes_factor < 5
+    assert smooth.predict(positions_mm / 10) == pytest.approx(function, abs=0.3)
+    valid = np.column_stack([np.arange(500) % 2 == 1, np.arange(500) < 9])
+    smooth, unknown = fit_gps(Responses(positions_mm, np.where(valid, volts, 1e6), valid), 10)
+    assert smooth.noise_v == pytest.approx(0.2, rel=0.15)
+    assert np.isnan(unknown.noise_v)
+    assert not unknown.predict(positions_mm / 10).any()
+
+
+PAD = Morphology.random(2, knots=3, seed=5)
+RIG = RigSettings(presses=500, seed=1, scatter=0.0, floor_mv=0.0, gain_wander=0.0, drift_mv=0.0, hysteresis_s=12.0)
+
+
+@pytest.fixture(scope="module")
+def recording() -> Recording:
+    return simulate(PAD, RIG)
+
+
+@pytest.fixture(scope="module")
+def split(recording: Recording) -> SeparatedPresses:
+    return separate_parts(recording, np.arange(500) % 7 != 0, hysteresis_s=20.0)
+
+
+def test_parts_memory_and_touch_are_those_that_were_simulated(recording: Recording, split: SeparatedPresses) -> None:
+    depths_mm = np.full(500, RIG.press_depths_mm)
+    changes = resistance_changes(build_pad(PAD, RIG), recording.presses_mm, depths_mm, Contact(), RIG)
+    rest_v = np.median(recording.readings[:10], axis=0)
+    slope_v = rest_v * (1 - rest_v / SUPPLY_V)  # by which a divider falls for a small change of resistance
+    for part, change, share in zip(split.parts, changes, (0.97, 0.65, 0.7, 0.92), strict=True):
+        expected = -slope_v * change
+        # onset and creep are told the least: presses are touched at other times than one knows
+        found = [np.corrcoef(part.volts[:, c], expected[:, c])[0, 1] for c in range(recording.fibres)]
+        assert np.mean(found) > share
+    slope = np.polyfit((-slope_v * changes.held).ravel(), split.parts.held.volts.ravel(), 1)[0]
+    assert slope == pytest.approx(1, abs=0.12)
+    assert split.rig["memory"] == pytest.approx(RIG.memory, abs=0.2)
+    assert split.rig["memory_mm"] == pytest.approx(RIG.memory_mm, rel=0.35)
+    assert split.rig["hysteresis_s"] == pytest.approx(RIG.hysteresis_s, rel=0.5)
+    assert split.rig["touch_s"] == pytest.approx(RIG.touch_s, abs=0.015)
+    # without what presses take away, neighbouring ones differ by half as much as they do with it
+    x, y = recording.presses_mm.T
+    order = np.argsort(np.round(x) * 1e3 + y)
+    with_it = np.array(
+        [
+            recording.readings[d + 8 : d + 20].mean(0) - recording.readings[d - 8 : d].mean(0)
+            for d in recording.down_command
+        ]
+    )
+    near = np.hypot(*np.diff(recording.presses_mm[order], axis=0).T) < 1.5
+    before, after = (np.diff(volts[order], axis=0)[near].std() for volts in (with_it, split.pressed.volts))
+    assert after < 0.8 * before
+
+
+def test_kernels_of_a_press() -> None:
+    """It is held by its last windows, creeps meanwhile, and leaves what remains inverted; what it takes adds to it."""
+    (held, onset, creep, after), replaced = part_kernels(Cycle(40, 13.3), RigSettings(hysteresis_s=1e4))
+    assert held[6:9] == pytest.approx(1, abs=0.05)
+    assert held[13:] == pytest.approx(0, abs=1e-9)
+    assert onset[1] > held[1]
+    assert np.all(np.diff(creep[2:9]) < 0)
+    assert after[:9] == pytest.approx(0, abs=1e-9)
+    assert after[12:] == pytest.approx(-1, abs=0.01)
+    assert replaced[6:9] == pytest.approx(1, abs=0.01)
+    assert replaced[12:] == pytest.approx(0.6, abs=0.01)
+
+
+FREE = Priors(lateral_offset_mm=1.0, log_sensitivity=0.2)
+
+
+@pytest.fixture(scope="module")
+def start(printed):
+    fibres = tuple(channel.fibre for channel in printed.channels if channel.fibre is not None)
+    return AsBuiltPad.from_plan(PadPlan.from_morphology(PLAN), fibres, printed.frame, 0.5)
+
+
+@pytest.fixture(scope="module")
+def on_plan(start, responses):
+    return fit_as_built(start, responses, Priors())
+
+
+@pytest.fixture(scope="module")
+def fitted(on_plan, responses):
+    return fit_as_built(on_plan.pad, responses, FREE)
+
+
+def test_fit_explains_fresh_presses_better_than_the_plan(printed, on_plan, fitted):
+    fresh = simulate_responses(printed, 300, seed=1)
+    explained, explained_on_plan = (
+        fresh.explained_variance(fit.pad.predict(fresh.positions_mm)) for fit in (fitted, on_plan)
+    )
+    assert not on_plan.pad.channel_values[:, OFFSET].any()
+    assert not on_plan.pad.channel_values[:, SENSITIVITY].any()
+    assert not on_plan.pad.profile(np.linspace(0, 1, 9))[1].any()
+    assert explained.min() > 0.97
+    assert explained.mean() > explained_on_plan.mean()
+
+
+def test_fit_recovers_lateral_offsets_unless_noise_is_inflated(printed, fitted, responses):
+    errors, offsets, plan = [], [], fitted.pad.plan
+    for channel, fibre in enumerate(fitted.pad.fibres):
+        true = plan.to_grid(printed.as_built_mm[fibre])[1:-1]
+        normal = plan.tangents[fibre] @ np.array([[0.0, 1.0], [-1.0, 0.0]])
+        inside = (np.abs(plan.paths[fibre] - 1.5) < 1).all(axis=1)
+        errors.append(((fitted.pad.path(channel)[0] - true) * normal).sum(axis=1)[inside])
+        offsets.append(((plan.paths[fibre] - true) * normal).sum(axis=1)[inside])
+    assert np.std(np.concatenate(errors)) < 0.7 * np.std(np.concatenate(offsets))
+    # inflated noise shrinks offsets and widens their standard deviation
+    inflated = fit_as_built(fitted.pad, responses, FREE, noise_inflation=20.0)
+    small, large = (np.square(fit.pad.channel_values[:, OFFSET]).sum() for fit in (inflated, fitted))
+    assert small < large
+    assert inflated.offset_std(0).mean() > fitted.offset_std(0).mean()
+
+
+@pytest.mark.parametrize(("share", "common", "floor"), [(0.0, 0.0, 0.01), (0.18, 0.36, 0.01), (0.18, 0.9, 0.002)])
+def test_estimate_scatter_recovers_share_common_and_floor(printed, fitted, share, common, floor) -> None:
+    noiseless = replace(printed, channels=tuple(replace(channel, noise_v=0.0) for channel in printed.channels))
+    exact = simulate_responses(noiseless, 900)
+    rng, full_scale = np.random.default_rng(4), np.abs(exact.volts).max()
+    independent, shared = rng.standard_normal(exact.volts.shape), rng.standard_normal((len(exact), 1))
+    gain = 1 + share * (np.sqrt(1 - common) * independent + np.sqrt(common) * shared)
+    volts = exact.volts * gain + floor * full_scale * rng.standard_normal(exact.volts.shape)
+    noise_v = (volts - exact.volts).std(axis=0)
+    scatter = estimate_scatter(fitted.pad, Responses(exact.positions_mm, volts, exact.valid), noise_v)
+    assert scatter.share == pytest.approx(share, abs=0.03)
+    # a floor far below what grows is hidden by it, but never mistaken for much
+    assert scatter.floor * noise_v.mean() == pytest.approx(floor * full_scale, rel=0.35, abs=0.25 * noise_v.mean())
+    if share:
+        assert scatter.common == pytest.approx(common, abs=0.15)
+
+
+def press(contact: Contact, transform: PlanTransform, presses: int) -> Responses:
+    positions_mm = np.random.default_rng(0).uniform(-14, 14, (presses, 2))
+    volts = 0.3 - 0.5 * signals(PLAN, PLAN.to_grid(transform.to_plan(positions_mm)), contact)
+    return Responses(positions_mm, volts, np.random.default_rng(1).uniform(size=volts.shape) < 0.95)
+
+
+@pytest.mark.parametrize("base", ["bonded", "slipping"])
+def test_fit_contact_recovers_scale_and_shares(base: Base) -> None:
+    stated = Contact(base=base)
+    pressed = Contact(base=base, scale=1.15, squeeze=0.7, stretch=1.3)
+    responses = press(pressed, PlanTransform(True, 3.0, (1.0, -0.5), 1.02), 100)
+    training, held_out = responses.select(np.arange(70)), responses.select(np.arange(70, 100))
+    pad = AsBuiltPad.from_plan(PadPlan.from_morphology(PLAN), (0, 1, 2, 3), PlanTransform(True), 0.5)
+    noise_v = 0.05 * np.sqrt(training.variance)
+    fit = fit_contact(pad, stated, training, held_out, noise_v)
+    assert fit.scale == pytest.approx(1.15, abs=0.03)
+    assert (fit.squeeze, fit.stretch) == pytest.approx((0.7, 1.3), abs=0.1)
+    assert fit.explained > 0.995
+    assert 0 < fit.scale_std < 0.1 > fit.shares_std > 0
+    gaussian = fit_contact(pad, Contact(model="profile"), training, held_out, noise_v)
+    assert gaussian.explained < fit.explained
+    assert gaussian.shares_std == 0
+
+
+def test_fit_contact_states_shares_of_the_sum_that_was_stated() -> None:
+    """Gains take up any other: twice the squeeze and stretch are twice the results, and as uncertain as a share.
+
+    A layer half as large is the same at twice the scale, which is twice as uncertain.
+    """
+    responses = press(Contact(squeeze=0.7, stretch=1.3), PlanTransform(), 24)
+    pad = AsBuiltPad.from_plan(PadPlan.from_morphology(PLAN), (0, 1, 2, 3), PlanTransform(), 0.5)
+    noise_v = 0.05 * np.sqrt(responses.variance)
+    single, double = (
+        fit_contact(pad, Contact(squeeze=share, stretch=share), responses, responses, noise_v) for share in (0.5, 1.0)
+    )
+    for name in ("squeeze", "stretch", "shares_std"):
+        assert getattr(double, name) == pytest.approx(2 * getattr(single, name), rel=1e-3)
+    assert (double.scale, double.scale_std) == pytest.approx((single.scale, single.scale_std), rel=1e-3)
+    sizes = {name: getattr(Contact(), name) / 2 for name in ("tool_radius_mm", "depth_mm", "thickness_mm")}
+    first_mm, second_mm = Contact().fibre_depths_mm
+    halved = Contact(**sizes, fibre_depths_mm=(first_mm / 2, second_mm / 2), scale=2.0)
+    small = fit_contact(pad, halved, responses, responses, noise_v)
+    assert small.scale == pytest.approx(2 * double.scale, rel=1e-3)
+    assert small.scale_std == pytest.approx(2 * double.scale_std, rel=0.05)
+
+
+def test_elements_of_a_pad_sum_to_its_lengths_and_follow_its_offsets() -> None:
+    plan = PadPlan.from_morphology(PLAN)
+    pad = AsBuiltPad.from_plan(plan, (2, 0), PlanTransform(), 0.5)
+    middles, lengths, tangents = pad.elements(0)
+    assert lengths == pytest.approx(plan.lengths[2])
+    assert tangents == pytest.approx(plan.tangents[2])
+    pad = pad.with_values(pad.values + 0.05 * np.random.default_rng(0).standard_normal(pad.values.size))
+    middles, weighted, tangents = pad.elements(0)
+    steps = np.gradient(middles, axis=0)[1:-1]
+    lengths = np.hypot(*steps.T)
+    assert tangents[1:-1] == pytest.approx(steps / lengths[:, None], abs=0.1)
+    assert weighted[1:-1] == pytest.approx(lengths * pad.path(0)[1][1:-1], rel=0.1)

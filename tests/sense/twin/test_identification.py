@@ -1,7 +1,8 @@
-"""Identification of pads whose truth is known, and recordings that do not suffice."""
+"""Identification of pads whose truth is known, what is doubted, and recordings that do not suffice."""
 
 from dataclasses import replace
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 import pytest
@@ -12,13 +13,18 @@ from padforge.benchmarks.twin import printed_pad
 from padforge.design import Morphology
 from padforge.design.settings import Contact, PadSettings
 from padforge.design.twin import Twin
-from padforge.sense import identify
+from padforge.sense import RigSettings, identify
+from padforge.sense.arrays import Array
 from padforge.sense.recording.recording import Recording
-from padforge.sense.settings import RigSettings
 from padforge.sense.simulation.simulated_recording import simulate
+from padforge.sense.twin.as_built import OFFSET, AsBuiltPad, PadPlan, channel_indices
+from padforge.sense.twin.doubts import find_doubts
 from padforge.sense.twin.identification import Identification, identify_pad
+from padforge.sense.twin.wiring import Wiring, images
+from tests.helpers.golden import Golden
+from tests.helpers.presses import changed
 from tests.helpers.rigs import ideal_rig
-from tests.sense.conftest import few_candidates
+from tests.sense.conftest import few_candidates, identify_simulated
 
 from .conftest import PLAN, few_compared
 
@@ -100,31 +106,27 @@ def test_identify_reports_alternatives_of_a_symmetric_pad_and_is_reproducible_wi
 @few_compared()
 def test_identify_gives_no_fibre_to_channels_without_readings(recording: Recording, printed: Twin) -> None:
     live = next(channel.channel for channel in printed.channels if channel.fibre is not None)
-    readings = recording.readings.copy()
-    readings[:, live] = np.nan
-    twin = identify(replace(recording, readings=readings), PLAN)
+    twin = identify(changed(recording, "readings", np.s_[:, live], np.nan), PLAN)
     assert twin.channels[live].fibre is None
     others, expected = ([c.fibre for c in pad.channels if c.channel != live] for pad in (twin, printed))
     assert others == expected
 
 
 def test_identify_rejects_recordings_that_do_not_suffice(recording: Recording) -> None:
+    plan = Morphology.straight((1, 3), (8.0, 12.0))
+    narrow = simulate(
+        plan, RigSettings(presses=80), pad_settings=PadSettings(**plan.layout.settings, sensed_mm=(10.0, 11.0))
+    )
     few = {"presses_mm": np.where(np.arange(300)[:, None] < 59, recording.presses_mm, np.nan)}
     noise = {"readings": np.random.default_rng(0).normal(2.0, 0.002, recording.readings.shape)}
-    for changes, pad, message in (
-        (few, PLAN, "59 presses of known position"),
-        (noise, PLAN, "no channel of the recording responds"),
-        ({}, Morphology.straight(1, pitch_mm=20.0), "3 channels .* to presses, the pad has 2 fibres"),
+    for unfit, pad, message in (
+        (replace(recording, **few), PLAN, "59 presses of known position"),
+        (replace(recording, **noise), PLAN, "no channel of the recording responds"),
+        (recording, Morphology.straight(1, pitch_mm=20.0), "3 channels .* to presses, the pad has 2 fibres"),
+        (narrow, plan, "allowed from 12 x 6 mm on"),  # over half of a rectangle each way
     ):
         with pytest.raises(InputError, match=message):
-            identify(replace(recording, **changes), pad)
-
-
-def test_identify_requires_presses_over_half_of_a_rectangle_each_way() -> None:
-    plan = Morphology.straight((1, 3), (8.0, 12.0))
-    narrow = PadSettings(**plan.layout.settings, sensed_mm=(10.0, 11.0))
-    with pytest.raises(InputError, match="allowed from 12 x 6 mm on"):
-        identify(simulate(plan, RigSettings(presses=80), pad_settings=narrow), plan)
+            identify(unfit, pad)
 
 
 @pytest.mark.slow
@@ -144,10 +146,8 @@ def test_identify_recognizes_a_rectangle_turned_by_a_quarter() -> None:
 @pytest.mark.slow
 @few_candidates()
 @few_compared()
-def test_twin_predicts_better_than_baselines(monkeypatch: pytest.MonkeyPatch, taken: Any) -> None:
-    small = {"PRESSES": (150,), "GRID": 2, "KNOTS": 3, "WORLDS": {"small": ("gaussian", 0.5, 1)}}
-    for name, value in small.items():
-        monkeypatch.setattr(bench, name, value)
+@patch.multiple(bench, PRESSES=(150,), GRID=2, KNOTS=3, WORLDS={"small": ("gaussian", 0.5, 1)})
+def test_twin_predicts_better_than_baselines(taken: Any) -> None:
     for cached in (bench.printed, bench.recorded):
         cached.cache_clear()
     results = {key[1]: row for key, row in taken(bench.BENCH).items()}
@@ -156,3 +156,50 @@ def test_twin_predicts_better_than_baselines(monkeypatch: pytest.MonkeyPatch, ta
     assert list(results) == ["twin", "plan", "place"]
     assert results["twin"]["right"] == 1.0
     assert results["twin"]["error"] < min(results["place"]["error"], results["plan"]["error"])
+
+
+def test_doubts_are_told_whole(identification: Identification, golden: Golden) -> None:
+    """Of a pad that lies as planned nothing; nor of straight fibres that images plan where they are."""
+    pad, plan = identification.fit.pad, Morphology.straight(2)
+    straight = replace(pad, plan=PadPlan.from_morphology(plan))
+    lain = Wiring(straight.transform, 0.5, pad.fibres, 0.9)
+    turned, offsets = images(lain, plan.layout), [channel_indices(channel)[OFFSET] for channel in range(4)]
+
+    def moved(places: Any, by: float, pad: AsBuiltPad = pad, **others: object) -> Identification:
+        values = pad.values.copy()
+        values[places] += by
+        return replace(identification, fit=replace(identification.fit, pad=replace(pad, values=values)), **others)
+
+    def explaining(explained: Array) -> Identification:
+        return replace(identification, explained=explained)
+
+    cases = {
+        "as planned": identification,
+        "one channel is explained badly": explaining(identification.explained - 0.7 * (np.arange(4) == 2)),
+        "all channels are": explaining(identification.explained - 0.2),
+        "a smooth function explains a little more": explaining(identification.explained_smooth - 0.02),
+        "a fibre 6.75 mm along x and y from its plan": moved(offsets[1], 0.6),
+        "a quarter turn": moved(0, np.pi / 2),
+        "askew": moved(0, np.radians(-101)),
+        "shrunk": moved(3, -0.3),
+        "straight fibres, images that fit": moved(0, 0.0, straight, alternatives=turned),
+        "straight fibres, two of them swapped": moved(
+            0, 0.0, straight, alternatives=[replace(lain, fibres=(0, 1, 3, 2))]
+        ),
+        "straight fibres 1.7 mm beside their plan": moved(np.concatenate(offsets), 0.15, straight, alternatives=turned),
+        "winding fibres, images that fit": replace(identification, alternatives=turned),
+    }
+    lines = ["\n    ".join([f"{name}:", *find_doubts(result)]) for name, result in cases.items()]
+    golden("sense/identification/doubts.txt", "\n".join(lines), rtol=2e-2)
+
+
+@pytest.mark.slow
+@few_candidates()
+@few_compared()
+def test_another_pad_is_doubted_and_the_recorded_one_is_not() -> None:
+    rig = RigSettings(presses=160, seed=1)
+    built = Morphology.random(2, knots=3, seed=1)
+    right, wrong = (identify_simulated(built, told, rig) for told in (built, Morphology.random(2, knots=4, seed=11)))
+    assert find_doubts(right) == []
+    assert right.fit.pad.fibres == (0, 1, 2, 3)
+    assert any("is it the recording of this pad?" in doubt for doubt in find_doubts(wrong))

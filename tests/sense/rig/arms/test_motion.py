@@ -7,16 +7,13 @@ from padforge.sense.rig.arms.motion import StraightMove, TrapezoidalProfile
 MOVE = StraightMove((0.0, 0.0, 0.0), (30.0, 40.0, 0.0), 10.0, 20.0)
 
 
-def test_profile_evaluates_distance_and_speed():
+def test_a_move_follows_its_profile_of_distance_and_speed():
     profile = TrapezoidalProfile(50.0, 10.0, 20.0)
     assert profile.duration_s == pytest.approx(50 / 10 + 10 / 20)
     assert profile.evaluate(0.25) == pytest.approx((0.625, 5.0))
     assert profile.evaluate(1.0) == pytest.approx((7.5, 10.0))
     assert profile.evaluate(profile.duration_s - 0.25) == pytest.approx((50 - 0.625, 5.0))
     assert profile.evaluate(99.0) == (50.0, 0.0)
-
-
-def test_move_position_follows_trapezoid():
     assert MOVE.position(-1.0) == MOVE.start
     assert MOVE.position(2.5) == pytest.approx((13.5, 18.0, 0.0))
     assert MOVE.position(99.0) == MOVE.end

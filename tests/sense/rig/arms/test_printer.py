@@ -158,9 +158,8 @@ def test_unconfirmed_stop_halts_printer_and_clipped_move_raises():
         assert printer.firmware.halted
         assert printer.true_positions(start_s + 0.6)[0] == pytest.approx(printer.true_positions(start_s + 5)[0])
     with connected() as (arm, printer):
-        with pytest.raises(RigFault, match=r"is about to go to 220\.00, .* but was sent to 230\.00") as fault:
-            arm.move(pose(260, 110, 40), 50.0, 3000.0)
-        assert fault.value.cause == "lost"
+        beyond = r"is about to go to 220\.00, .* but was sent to 230\.00"
+        fault_of(lambda: arm.move(pose(260, 110, 40), 50.0, 3000.0), "lost", beyond)
         assert printer.true_positions(clock.now() + 9)[0] == pytest.approx(AT, abs=0.5)
         fault_of(arm.state, "lost")
 
@@ -179,36 +178,22 @@ def test_move_that_was_given_up_is_never_made(asked_s: float):
 
 
 @pytest.mark.parametrize(
-    ("options", "settings", "match"),
+    ("position", "max_z_mm_s", "settings", "match"),
     [
-        ({"position": (0.0, 0.0, 0.0)}, {}, "has not been homed"),
-        ({"max_mm_s": (500.0, 500.0, 3.0)}, {}, r"way down of 5 mm takes 1\.7 s, allowed is less than 1\.5 s"),
-        (  # 13.3 readings a second of a board of 18 samples are 18
-            {"max_mm_s": (500.0, 500.0, 4.0)},
-            {"board_rate_hz": 18.0},
-            r"takes 1\.3 s, allowed is less than 1\.1 s",
-        ),
-        (
-            {"max_mm_s": (500.0, 500.0, 3.0)},
-            {"clearance_mm": 1.0, "depths_mm": (1.0, 4.0)},  # the deepest press counts
-            r"way down of 5 mm takes 1\.7 s",
-        ),
+        ((0.0, 0.0, 0.0), 100.0, {}, "has not been homed"),
+        (AT, 3.0, {}, r"way down of 5 mm takes 1\.7 s, allowed is less than 1\.5 s"),
+        # 13.3 readings a second of a board of 18 samples are 18
+        (AT, 4.0, {"board_rate_hz": 18.0}, r"takes 1\.3 s, allowed is less than 1\.1 s"),
+        # the deepest press counts
+        (AT, 3.0, {"clearance_mm": 1.0, "depths_mm": (1.0, 4.0)}, r"way down of 5 mm takes 1\.7 s"),
     ],
 )
-def test_connect_refuses_unusable_printer(options, settings, match):
-    with (
-        EmulatedPrinter(**{"position": AT, **QUICK, **options}) as printer,
-        closing(driven(printer, **settings)) as arm,
-    ):
+def test_connect_refuses_unusable_printer(position, max_z_mm_s, settings, match):
+    limits: dict[str, Any] = QUICK | {"max_mm_s": (500.0, 500.0, max_z_mm_s)}
+    with EmulatedPrinter(position, **limits) as printer, closing(driven(printer, **settings)) as arm:
         assert fault_of(arm.connect, "refused", match) < 5
         fault_of(arm.state, "lost", "connect first")
         assert len(printer.firmware.moves) == 1
-
-
-def test_move_refuses_without_the_place_of_the_probe():
-    with EmulatedPrinter(position=AT, **QUICK) as printer, closing(driven(printer, tcp_mm=None)) as arm:
-        arm.connect()
-        fault_of(lambda: arm.move(pose(110, 110, 38), 50.0, 3000.0), "refused", "tcp_mm is unknown")
 
 
 def test_connect_refuses_other_firmware(monkeypatch):
@@ -219,7 +204,7 @@ def test_connect_refuses_other_firmware(monkeypatch):
         fault_of(arm.connect, "refused", "only once it stands; allowed is Marlin 2")
 
 
-def test_printer_refuses_impossible_moves_and_second_program():
+def test_printer_refuses_impossible_moves_a_second_program_and_moves_of_an_unknown_tip():
     with connected() as (arm, printer), closing(driven(printer)) as second:
         for order, match in (
             ((110, 110, 40, 0.0, 3.0, 0.0), "a printer cannot turn it"),
@@ -235,6 +220,9 @@ def test_printer_refuses_impossible_moves_and_second_program():
         arm.close()
         arm.close()
         second.connect()
+    with EmulatedPrinter(position=AT, **QUICK) as printer, closing(driven(printer, tcp_mm=None)) as arm:
+        arm.connect()
+        fault_of(lambda: arm.move(pose(110, 110, 38), 50.0, 3000.0), "refused", "tcp_mm is unknown")
 
 
 def test_execute_runs_every_line_once_in_order_despite_noise():

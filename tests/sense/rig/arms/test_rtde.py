@@ -1,16 +1,18 @@
-"""What ur-rtde receives of the arm: states, states that are none, and times on the host's clock."""
+"""What ur-rtde receives of the arm, on the host's clock; and one program at a time that moves it."""
 
 import sys
 from types import SimpleNamespace
 from typing import Any
-from unittest.mock import MagicMock
+from unittest.mock import MagicMock, call
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from padforge.sense.rig.arms import rtde_worker
 from padforge.sense.rig.arms.rtde import HostClock, RtdeReader, major_version
+from padforge.sense.rig.arms.rtde_worker import CommandRejected, UrRtdeControl, lock_arm
 
 POSE, SPEED, FORCE = (-0.5, -0.3, 0.1, 0.1, 3.0, 0.5), (0.3, 0.0, 0.4, 9.0, 9.0, 9.0), (6.0, 8.0, -25.0, 9.0, 9.0, 9.0)
 
@@ -77,3 +79,59 @@ def test_major_version_of_polyscope() -> None:
     assert major_version("5.12.2.1101534 (Jan 01 2024)") == 5
     with pytest.raises(ValueError, match=r"'could not understand', expected a version such as 5\.12"):
         major_version("could not understand")
+
+
+ON_LINUX = pytest.mark.skipif(sys.platform != "linux", reason="names of local sockets are locks on Linux alone")
+
+
+@ON_LINUX
+def test_lock_admits_one_program_until_that_ends(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(rtde_worker, "SESSION_END_S", 0.05)
+    lock, another = lock_arm("192.0.2.1"), lock_arm("192.0.2.2")
+    with pytest.raises(CommandRejected) as refused:
+        lock_arm("192.0.2.1")
+    cause, message, _ = refused.value.args
+    assert (cause, message) == ("refused", "another program on this computer uses the arm 192.0.2.1")
+    lock.close()
+    lock_arm("192.0.2.1").close()
+    another.close()
+
+
+@pytest.fixture
+def control_library(monkeypatch: pytest.MonkeyPatch) -> MagicMock:
+    """Its interface to an arm that takes everything."""
+    interface = MagicMock()
+    monkeypatch.setitem(sys.modules, "rtde_control", SimpleNamespace(RTDEControlInterface=lambda host: interface))
+    monkeypatch.setattr(rtde_worker, "version", lambda name: "1.6.0")
+    return interface
+
+
+@ON_LINUX
+def test_stops_and_moves_are_asked_of_the_library(control_library: MagicMock) -> None:
+    control = UrRtdeControl("host")
+    assert control.identity == {"driver": "ur-rtde 1.6.0"}
+    pose = (0.1, 0.2, 0.3, 0.0, 3.0, 0.0)
+    assert control.move(pose, 0.05, 0.5)
+    assert control_library.moveL.call_args == call(list(pose), 0.05, 0.5, True)  # and returns at once
+    assert control.moving
+    control.stop()
+    assert control_library.stopL.call_args == call(5.0)  # m/s²: from 0.25 m/s at rest within 50 ms
+    assert not control.moving
+    control.kick()
+    assert control_library.setWatchdog.call_args == call(4.0)  # Hz: the arm stops 0.25 s after the last kick
+    control.end()
+    assert [each[0] for each in control_library.method_calls[-2:]] == ["stopL", "stopScript"]
+    control_library.setWatchdog.return_value = False
+    with pytest.raises(RuntimeError, match="watchdog"):
+        UrRtdeControl("host")
+
+
+@pytest.mark.parametrize("number", [3, 4], ids=["of the move before", "of this move"])
+@pytest.mark.parametrize("running", [False, True])
+@ON_LINUX
+def test_a_move_is_over_once_another_operation_ends(control_library: MagicMock, number: int, running: bool) -> None:
+    control, status = UrRtdeControl("host"), control_library.getAsyncOperationProgressEx.return_value
+    status.operationId.return_value, status.isAsyncOperationRunning.return_value = 3, False
+    control.move((0.0,) * 6, 0.05, 0.5)
+    status.operationId.return_value, status.isAsyncOperationRunning.return_value = number, running
+    assert control.has_arrived() == (number == 4 and not running)

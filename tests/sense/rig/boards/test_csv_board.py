@@ -1,32 +1,144 @@
-"""Boards that print lines of their own, on pseudo-terminals."""
+"""The sample clock against simulated truth, and boards that print lines of their own, on pseudo-terminals."""
 
 from contextlib import closing
-from typing import Any
+from dataclasses import dataclass
+from unittest.mock import patch
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.optimize import linprog
 
 from padforge.sense.rig import clock
 from padforge.sense.rig.boards import csv_board
+from padforge.sense.rig.boards.board_reader import SampleClock
 from padforge.sense.rig.boards.csv_board import CsvBoard, parse_numbers
 from padforge.sense.rig.devices import RigFault
 from tests.emulators.boards import SerialDevice
+from tests.helpers.constants import with_constants
+
+SETTLE_S = 0.5
+QUARTZ_SKEW = 500e-6  # relative difference of two quartz clocks
+
+
+@dataclass(frozen=True)
+class Link:
+    """Blocks of `block` samples at `rate_hz` for `seconds` from a board whose period is `skew` too long."""
+
+    rate_hz: float
+    block: int
+    seconds: float
+    skew: float
+    seed: int
+    jitter_s: float = 8e-3
+    stall_s: float = 50e-3
+
+    def blocks(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return the index of the last sample of each block, when it was measured, and when it arrived."""
+        rng = np.random.default_rng(self.seed)
+        last = (np.arange(int(self.seconds * self.rate_hz / self.block)) + 1) * self.block - 1
+        nominal = last / self.rate_hz
+        warming = 20e-6 * 300 * (1 - np.cos(nominal / 300))  # the quartz wanders by 20 ppm within half an hour
+        measured = 1e5 + nominal * (1 + self.skew) + warming
+        arrived = measured + rng.uniform(0, self.jitter_s, len(measured))
+        for begin in rng.uniform(measured[0], measured[-1], int(self.seconds / 3)):
+            held = (arrived >= begin) & (arrived < begin + self.stall_s)
+            arrived[held] = begin + self.stall_s
+        return last, measured, np.maximum.accumulate(arrived)
+
+
+def block_indices(last: int, samples: int) -> np.ndarray:
+    return np.arange(last - samples + 1, last + 1)
+
+
+def run(link: Link) -> tuple[np.ndarray, SampleClock]:
+    """Error of the time of each block's last sample; check that all times ascend."""
+    last, measured, arrived = link.blocks()
+    clock, before, errors = SampleClock(1 / link.rate_hz, QUARTZ_SKEW), -np.inf, []
+    n_done = 0
+    for i in range(len(last)):
+        clock.observe(int(last[i]), arrived[i])
+        if arrived[i] < arrived[0] + SETTLE_S:
+            continue
+        for j in range(n_done, i + 1):
+            times = clock.times(block_indices(int(last[j]), link.block))
+            assert times[0] > before
+            assert (np.diff(times) > 0).all()
+            before = times[-1]
+            errors.append(before - measured[j])
+        n_done = i + 1
+    return np.array(errors), clock
+
+
+@settings(max_examples=6)
+@given(
+    rate=st.sampled_from([(1000.0, 16), (100.0, 2), (40.0, 1)]),
+    skew=st.floats(-200e-6, 200e-6),
+    jitter_s=st.floats(0, 8e-3),
+    seed=st.integers(0, 1000),
+)
+def test_times_are_accurate_from_first_block(rate: tuple[float, int], skew: float, jitter_s: float, seed: int) -> None:
+    errors, _ = run(Link(*rate, 30.0, skew, seed, jitter_s))
+    assert np.abs(errors).max() < 5e-3
+    assert np.abs(errors[len(errors) // 2 :]).max() < 5e-4
+
+
+def test_times_keep_gaps_and_ascend_through_delay_step() -> None:
+    clock = SampleClock(1e-3, QUARTZ_SKEW)
+    with pytest.raises(ValueError, match="no block"):
+        clock.times(block_indices(0, 1))
+    clock.observe(15, 100.015)
+    early = clock.times(block_indices(15, 16))
+    clock.observe(1015, 101.015)
+    late = clock.times(block_indices(1015, 16))
+    assert late[0] - early[-1] == pytest.approx(0.985)
+    clock, before = SampleClock(1e-3, QUARTZ_SKEW), -np.inf
+    for first in range(0, 3200, 16):
+        clock.observe(first + 15, (first + 15) * 1e-3 + (0.3 if first < 320 else 0.0))
+        times = clock.times(block_indices(first + 15, 16))
+        assert times[0] > before
+        before = times[-1]
+    assert before == pytest.approx(3.199, abs=1e-3)
+
+
+@settings(max_examples=15)
+@given(st.integers(0, 2**32 - 1), st.integers(2, 12), st.sampled_from([1e-4, 1e-3, 1e-1]))
+def test_times_follow_highest_line_below_arrivals(seed: int, count: int, size: float) -> None:
+    """By linear programming: as high as can be at the mean of x, above no point, no steeper than a quartz is off."""
+    rng = np.random.default_rng(seed)
+    x, y = np.sort(rng.choice(100, count, replace=False)), size * rng.uniform(0, 1, count)
+    clock = SampleClock(1.0, QUARTZ_SKEW)
+    for second, delay_s in zip(x.tolist(), y.tolist(), strict=True):
+        clock.observe(second, second + delay_s)
+    clock.observe(101, 102.0)  # so late that it does not matter
+    at_101, at_201 = (float(clock.times(np.array([index]))[0]) for index in (101, 201))
+    slope = (at_201 - at_101) / 100 - 1
+    line = at_101 - 101 + slope * (x - 101)
+    best = linprog([-1, -x.mean()], np.column_stack([np.ones(count), x]), y, bounds=[(None, None), (-5e-4, 5e-4)])
+    assert abs(slope) <= 5e-4 + 1e-12
+    assert (line <= y + 1e-9).all()
+    assert line.mean() == pytest.approx(-best.fun, abs=1e-9)
+
 
 RATE_HZ = 200.0
+short = with_constants((csv_board, {"_START_S": 0.1, "LISTEN_S": 0.7}))
 
 
 class PrintingBoard(SerialDevice):
-    """It prints lines at RATE_HZ, with their number in place of %d, after bytes of a start."""
+    """It prints lines, with their number in place of %d, after bytes of a start; of one in `damaged` only the end."""
 
-    def __init__(self, line: bytes) -> None:
+    def __init__(self, line: bytes, rate_hz: float = RATE_HZ, damaged: int = 10**9) -> None:
         super().__init__("board", seed=0)
-        self._line, self._start_s, self._n_lines = line, clock.now(), 0
+        self._line, self._rate_hz, self._damaged = line, rate_hz, damaged
+        self._start_s, self._n_lines = clock.now(), 0
         self._out += b"\xff\x80boot\r\nready\r\n"
 
     def _step(self, data: bytes) -> None:
-        while clock.now() - self._start_s > self._n_lines / RATE_HZ:
+        while clock.now() - self._start_s > self._n_lines / self._rate_hz:
             self._n_lines += 1
-            self._out += self._line.replace(b"%d", str(5000 * self._n_lines).encode()) + b"\r\n"
+            line = self._line.replace(b"%d", str(5000 * self._n_lines).encode())
+            self._out += (line if self._n_lines % self._damaged else line[-5:]) + b"\r\n"
 
 
 @pytest.mark.parametrize(
@@ -43,9 +155,7 @@ def test_parse_numbers(line: bytes, numbers: list[float] | None) -> None:
     assert parse_numbers(line) == numbers
 
 
-def test_csv_board_finds_columns_and_rate(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(csv_board, "_START_S", 0.1)
-    monkeypatch.setattr(csv_board, "LISTEN_S", 0.7)
+def test_csv_board_finds_columns_and_rate() -> None:
     with PrintingBoard(b"%d,502,1.5,500") as printing:
         with closing(CsvBoard(printing.port, 115200, RATE_HZ, (2, 0), count_v=0.01)) as board:
             identity = board.connect()
@@ -61,29 +171,19 @@ def test_csv_board_finds_columns_and_rate(monkeypatch: pytest.MonkeyPatch) -> No
             CsvBoard(printing.port, 115200, 50).connect()
 
 
-class Port:
-    """A port at which texts arrive one by one, and then nothing."""
-
-    def __init__(self, *texts: bytes) -> None:
-        self._texts = list(texts)
-
-    def receive(self) -> tuple[float, bytes]:
-        return clock.now(), self._texts.pop(0) if self._texts else b""
-
-
-def test_csv_board_counts_damaged_lines_that_arrive_alone(monkeypatch: pytest.MonkeyPatch) -> None:
-    board = CsvBoard("port", 115200, RATE_HZ)
-    monkeypatch.setattr(board, "_tail", b"", raising=False)
-    monkeypatch.setattr(board, "_lines", [], raising=False)
-    monkeypatch.setattr(board, "_width", 2, raising=False)
-    port: Any = Port(b"1,2\n", b"1,\n", b"3", b",2\n1;x\n5,6\n", b"7,8\n")
-    blocks = [board._receive_blocks(port)[1] for _ in range(5)]  # noqa: SLF001
-    assert blocks == [[[[1, 2]]], [], [], [[[1], [3, 2], [], [5, 6]]], [[[7, 8]]]]
+def test_csv_board_counts_damaged_lines() -> None:
+    """They arrive alone, between two looks at the port."""
+    slow = PrintingBoard(b"%d,502,500", 50.0, damaged=3)
+    with slow, closing(CsvBoard(slow.port, 115200, 50.0)) as board:
+        board.connect()
+        clock.sleep(1.0)
+        samples = board.read()
+    assert np.allclose(samples.volts, [502, 500])
+    assert samples.missing.sum() == pytest.approx(len(samples.times_s) / 2, abs=2)
 
 
-def test_csv_board_asks_for_more_lines(monkeypatch: pytest.MonkeyPatch) -> None:
+@patch.multiple(csv_board, LISTEN_S=0.2, _MIN_LINES=100)
+def test_csv_board_asks_for_more_lines() -> None:
     """200 come a second, which is enough but for a minimum that is raised here."""
-    for name, value in {"_START_S": 0.1, "LISTEN_S": 0.2, "_MIN_LINES": 100}.items():
-        monkeypatch.setattr(csv_board, name, value)
     with PrintingBoard(b"502,501") as printing, pytest.raises(RigFault, match="numbers alone, 500 lines a second"):
         CsvBoard(printing.port, 115200, RATE_HZ).connect()

@@ -204,9 +204,7 @@ def test_read_raises_when_line_board_resets(garbled: float) -> None:
         (False, 1000, (3, 16), "channels: fibre 2 is on input 16, the board has 0 to 15"),
     ],
 )
-def test_connect_refuses_unsuitable_board(
-    silent: bool, rate_hz: float, inputs: tuple[int, ...], match: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_connect_refuses_unsuitable_board(silent: bool, rate_hz: float, inputs: tuple, match: str, monkeypatch) -> None:
     monkeypatch.setattr(line_board, "_ANSWER_S", 0.3)
     with emulated(silent=silent) as board:
         assert fault_of(make_driver(board, rate_hz, inputs).connect, "refused", match) < 5
