@@ -219,7 +219,7 @@ def test_what_readers_and_writers_are_asked_in_vain(eight: sense.Recording, gold
         "a bag without rosbags": lambda: sense.export_bag(eight, tmp_path / "r.mcap"),
         "the bag of another without rosbags": lambda: sense.import_bag(tmp_path / "people.mcap"),
     }
-    reasons = [rf"(?<={words} )\(.*\)" for words in ("be read", "damaged", "kind", "be written")]  # of others' words
+    reasons = [rf"(?<={words} )\(.*\)" for words in ("be read", "damaged", "file", "be written")]  # of others' words
     golden("formats/refusals.txt", f"{said}\n{refusal_table(missing)}", forget=reasons)
     assert contents(tmp_path) == before
 
