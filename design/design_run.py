@@ -128,8 +128,8 @@ def _read_request(
         overrides = {**overrides, "knots": overrides.get("knots") or (start.knots.shape[1] - 2 or None)}
     settings = spec.section(SearchSettings, **overrides)
     sections = pad, design_contact(spec, settings), settings, rules
-    needed = {"pymoo": settings.method == "genetic", "torch": twin is not None}  # a missing one is refused here
-    origin = files.provenance("padforge design", settings.seed, inputs, [name for name in needed if needed[name]])
+    packages = ["pymoo"] * (settings.method == "genetic")  # if it is missing, this is refused here
+    origin = files.provenance("padforge design", settings.seed, inputs, packages)
     origin["settings"] = {section.section(): section.model_dump(mode="json") for section in sections}
     return sections, start, origin
 

@@ -7,7 +7,7 @@ import pytest
 from padforge.design import Morphology
 from padforge.sense.recording.recording import Recording
 from tests.docs.pages import BLOCK, ROOT
-from tests.helpers.door import called, refused
+from tests.helpers.door import called
 
 PAGE = ROOT / "docs" / "howto-boards.md"
 SPEC = """
@@ -44,7 +44,8 @@ def test_device_example_records(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     Morphology.straight(2).save(tmp_path / "morphology.json")
     (tmp_path / "pad.toml").write_text(SPEC)
     command = "sense", "record", "--rig", "jumper", "--spec", "pad.toml", "--out", "run"
-    assert '"unwatched"' in refused(*command, cwd=tmp_path)
+    ended = called(*command, cwd=tmp_path)
+    assert (ended.code, '"unwatched"' in ended.err) == (2, True)
     (tmp_path / "pad.toml").write_text(SPEC + 'max_force_n = "unwatched"\n')
     ended = called(*command, cwd=tmp_path)
     assert ended.code == 0, ended
