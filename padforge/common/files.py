@@ -208,7 +208,8 @@ def atomic_files(folder: Path, without: Collection[str] = ()) -> Iterator[Path]:
                 if (folder / name).is_dir():
                     raise InputError(f"{folder / name}: is a folder, expected a file or nothing")
                 sync(stage / name)
-                make_folder((folder / name).parent)
+                with reraise_write_error((folder / name).parent):
+                    make_folder((folder / name).parent)
             for name in (*documents, *without):
                 (folder / name).unlink(missing_ok=True)
             _sync_all(folders)
@@ -304,7 +305,8 @@ def installed_version(package: str) -> str:
 
 def find_dependents(path: Path, remade: Collection[str] = ()) -> list[str]:
     """Return the names of the results in a file's folder made from it, also indirectly, except those `remade`."""
-    documents = {file.name: _read_dict(file) for file in path.parent.glob("[!.]*.json") if file != path}
+    found = (file for pattern in ("[!.]*.json", "health/*.json") for file in path.parent.glob(pattern) if file != path)
+    documents = {file.relative_to(path.parent).as_posix(): _read_dict(file) for file in found}
     documents |= {file.parent.name: _read_dict(file) for file in path.parent.glob("[!.]*/start.json") if file != path}
     sources, dependents = [path], set[str]()
     for source in sources:

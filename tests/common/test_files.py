@@ -129,7 +129,9 @@ def test_atomic_files_moves_and_removes_all_or_none(tmp_path):
     (tmp_path / "out" / "two").mkdir()
     with pytest.raises(InputError, match="two: is a folder, expected a file or nothing"):
         replaced(tmp_path / "out", "mine", "two")
-    assert (tmp_path / "out" / "mine").read_text() == "old"
+    with pytest.raises(InputError, match="mine: cannot be written"):  # a file where a folder should be
+        replaced(tmp_path / "out", "one", "mine/six")
+    assert texts(tmp_path / "out") == {"one": "new", "mine": "old", "in/four": "new"}
 
 
 @ON_LINUX
@@ -207,14 +209,16 @@ def test_find_dependents_follows_chains_and_ignores_other_files(tmp_path: Path) 
     document(tmp_path / "design.json", morphology_sha256=digest[PAD])
     document(tmp_path / "fabrication.json", digest)
     document(tmp_path / "recording" / "start.json", digest)
-    document(tmp_path / "localizer.json", {"recording": "of its readings"})
+    for name in ("localizer.json", "health/commanded.json"):
+        document(tmp_path / name, {"recording": "of its readings"})
     model: dict[str, Any] = json.loads((tmp_path / "localizer.json").read_text())["provenance"]
     document(tmp_path / "fibre_loss.json", {"recording": "of its readings", "localizer": model})
     document(tmp_path / "edited.json", digest, format="padforge-morphology/1")
     document(tmp_path / "contacts.json", {PAD: "of another pad"})
-    made = ["design.json", "fabrication.json", "fibre_loss.json", "localizer.json", "recording"]
+    learnt = ["fibre_loss.json", "health/commanded.json", "localizer.json"]
+    made = ["design.json", "fabrication.json", *learnt, "recording"]
     assert files.find_dependents(pad) == made
-    assert files.find_dependents(pad, remade=["design.json", "recording"]) == made[1:4]
+    assert files.find_dependents(pad, remade=["design.json", "recording"]) == made[1:5]
     assert files.find_dependents(tmp_path / "localizer.json") == ["fibre_loss.json"]
     for name in ("edited.json", "contacts.json"):
         assert files.find_dependents(tmp_path / name) == []
