@@ -15,7 +15,7 @@ from padforge.common.parallel import map_chunks
 from padforge.common.settings import or_default
 from padforge.common.validation import MAX_VALUES, InputError, check_array, check_float, check_int, check_type
 from padforge.design.kernels import element_signals, geometry
-from padforge.design.kernels.element_signals import FINE_PRECISION, LAYER_PRECISION, PROFILE_PRECISION
+from padforge.design.kernels.element_signals import FINE_PRECISION, LAYER_PRECISION
 from padforge.design.kernels.exact_signals import exact_signals
 from padforge.design.kernels.pchip import population_slopes
 from padforge.design.layer import REDUCED_MODULUS_KPA, LayerPress, solve_press
@@ -277,7 +277,7 @@ def press_shape(contact: Contact, unit_mm: float) -> PressShape:
 
 def search_precision(contact: Contact) -> float:
     """Return the precision of `signals` in a search; it is coarser for a layer, whose strains have a step."""
-    return LAYER_PRECISION if contact.model == "layer" else PROFILE_PRECISION
+    return LAYER_PRECISION if contact.model == "layer" else FINE_PRECISION
 
 
 @lru_cache(maxsize=128)

@@ -26,15 +26,15 @@ from padforge.design.kernels.pchip import extremes
 
 Array = NDArray[np.float64]
 
-PROFILE_PRECISION = 5e-5
-"""Maximum error of signals of a profile in a search, relative to the largest signal: far below that of measurements."""
 LAYER_PRECISION = 1.5e-2
 """RMS error of signals of a layer near a press in a search, relative to the largest signal. Over a whole pad it is a
 tenth to a quarter of that. The strain of a shallow fibre has a step at the edge of the contact; resolving it would take
 twice as long.
 """
 FINE_PRECISION = 1e-3
-"""The same in the evaluation of a pad."""
+"""The same in the evaluation of a pad, and the maximum error of signals of a profile."""
+TABLE_PRECISION = 1e-4
+"""Maximum error of tabulated weights, relative to the largest one. A table should fit in the cache of a core."""
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(8)  # lower orders do not resolve the bends of a span
 _NODES, _WEIGHTS = (1 + _NODES) / 2, _WEIGHTS / 2  # on [0, 1]
 _LAYER_NODES, _LAYER_WEIGHTS = np.polynomial.legendre.leggauss(5)
@@ -65,29 +65,44 @@ def weight_table(law: WeightLaw) -> Array:
     """Return w and v as piecewise cubics in equal steps of the squared distance, a Hermite interpolant of the profile.
 
     Rows of the profile have a higher degree and must be searched for; a row of this table is found by its index and
-    fits in one cache line. Weights of the two agree to about 1e-7 of the largest one.
+    fits in one cache line.
 
     Returns:
         Coefficients of w, then of v, by family and step, in powers of the fraction of a step; 0 after the end of the
-        profile; shape (2, steps + 1, 8).
+        profile; shape (families, steps + 1, 8), with one family if both have the same profile.
     """
-    steps = min(max(1 << 14, 2 * len(law.bins)), 1 << 17)  # two for the width of the narrowest row of the profile
-    table = np.zeros((2, steps + 1, 8))
-    for family, profile in enumerate(law.profile):
-        _tabulate(profile, law, table[family])
-    return table
+    profiles = law.profile[: _n_families(law)]
+    for exponent in range(8, 18):
+        tables = np.stack([_tabulate(profile, law, 1 << exponent) for profile in profiles])
+        if all(_is_precise(table, profile, law) for table, profile in zip(tables, profiles, strict=True)):
+            break
+    return tables
 
 
-def _tabulate(profile: Array, law: WeightLaw, out: Array) -> None:
-    """Write the cubics of one family into all rows except the last."""
-    steps = len(out) - 1
-    width, step = law.radius * law.radius / steps, np.arange(steps)
+def _n_families(law: WeightLaw) -> int:
+    """Return the number of families of fibres whose profiles differ, 1 or 2."""
+    return 1 + int((law.profile[0] != law.profile[1]).any())
+
+
+def _tabulate(profile: Array, law: WeightLaw, steps: int) -> Array:
+    """Return the cubics of one family; shape (steps + 1, 8)."""
+    out, width, step = np.zeros((steps + 1, 8)), law.radius * law.radius / steps, np.arange(steps)
     low, high = step * width, np.minimum(step + 1, steps * (1 - EPS)) * width
     for c, column in ((0, PLAIN), (4, DIRECTED)):
         (y0, d0), (y1, d1) = (_evaluate(profile, column, square) for square in (low, high))
         d0, d1 = width * d0, width * d1
         out[:-1, c], out[:-1, c + 1], out[:-1, c + 2] = y0, d0, 3 * (y1 - y0) - 2 * d0 - d1
         out[:-1, c + 3] = 2 * (y0 - y1) + d0 + d1
+    return out
+
+
+def _is_precise(table: Array, profile: Array, law: WeightLaw) -> bool:
+    """Return whether a table keeps the `TABLE_PRECISION` in the middle of its steps, where a cubic errs most."""
+    steps = len(table) - 1
+    middles = (np.arange(steps) + 0.5) * law.radius**2 / steps
+    exact = np.stack([_evaluate(profile, column, middles)[0] for column in (PLAIN, DIRECTED)])
+    found = table[:-1].reshape(steps, 2, 4) @ 0.5 ** np.arange(4)
+    return bool(np.abs(found.T - exact).max() <= TABLE_PRECISION * np.abs(exact).max())
 
 
 def _evaluate(profile: Array, column: int, squares: Array) -> tuple[Array, Array]:
@@ -108,9 +123,8 @@ def element_spacings(law: WeightLaw, precision: float) -> tuple[float, float]:
 
     The error relative to the largest signal is at most `precision`; for a layer this is the RMS error near the press.
     """
-    families = range(1 + int((law.profile[0] != law.profile[1]).any()))
     far = 0.5 * law.near * math.sqrt(precision / LAYER_PRECISION)  # the midpoint rule has an error of second order
-    return min(_fine_spacing(family, law, precision) for family in families), far
+    return min(_fine_spacing(family, law, precision) for family in range(_n_families(law))), far
 
 
 def _fine_spacing(family: int, law: WeightLaw, precision: float) -> float:
@@ -249,7 +263,7 @@ def element_signals(along: Any, across: Any, elements: Any, presses: Any, law: A
     rate = steps / end**2
     for f in range(fibres):
         t, v, axis = along[f], across[f], 0 if f < elements.horizontals else 1
-        rows = table[axis]
+        rows = table[min(axis, len(table) - 1)]
         bottom, top = extremes(v)
         for q in range(len(presses)):
             ct, cv, total = presses[q, axis], presses[q, 1 - axis], 0.0
@@ -298,7 +312,7 @@ def _differentiate_elements(
     rate = steps / end**2
     for f in range(fibres):
         t, v, axis = along[f], across[f], 0 if f < elements.horizontals else 1
-        rows = table[axis]
+        rows = table[min(axis, len(table) - 1)]
         bottom, top = extremes(v)
         for q in range(len(presses)):
             ct, cv, up = presses[q, axis], presses[q, 1 - axis], upstream[q, f]

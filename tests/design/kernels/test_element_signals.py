@@ -10,7 +10,7 @@ from scipy.interpolate import CubicSpline, PchipInterpolator
 
 from padforge.design import Contact, Morphology, signals, signals_quantized
 from padforge.design.contact import fibre_axes, profile_weights
-from padforge.design.kernels.element_signals import LAYER_PRECISION, PROFILE_PRECISION
+from padforge.design.kernels.element_signals import FINE_PRECISION, LAYER_PRECISION
 from padforge.design.kernels.geometry import DEGREE
 from padforge.design.settings import DEFAULT_PITCH_MM, PUBLISHED_CONTACT
 from padforge.design.signal_gradients import FibreCurves
@@ -97,7 +97,7 @@ def test_signals_of_a_search_are_within_their_precision(contact):
     if contact.model == "layer":
         assert np.sqrt((error**2).mean()) < LAYER_PRECISION * np.abs(fine).max()
     else:
-        assert np.abs(error).max() < PROFILE_PRECISION * np.abs(fine).max()
+        assert np.abs(error).max() < FINE_PRECISION * np.abs(fine).max()
 
 
 def dense_oracle(pad, press, contact, fibre):

@@ -69,7 +69,7 @@ def test_expected_error_ignores_presses_in_keep_outs():
     assert scattered[0] == pytest.approx(scattered[1])
     rows = np.flatnonzero(presses.free)
     expected = module.REGRESSION_WEIGHT * leave_one_out_error(answers, rows)
-    assert errors(answers, kept, SILENT, presses.free)[0] == pytest.approx(expected, rel=1e-5)
+    assert errors(answers, kept, SILENT, presses.free)[0] == pytest.approx(expected, rel=1e-4)
 
 
 def test_relative_error_is_a_power_mean_of_shares_of_straight_fibres():
@@ -88,7 +88,7 @@ def test_relative_error_is_a_power_mean_of_shares_of_straight_fibres():
 
 def test_expected_error_without_signals_is_that_of_the_prior():
     silent = np.zeros((2, SIDE**2))
-    assert bound(silent, Scatter(0.1)) == pytest.approx(np.sqrt(2 * 16 / 12))
+    assert bound(silent, Scatter(0.1)) == pytest.approx(np.sqrt(2 * 16 / 12), rel=1e-4)
     # about the mean distance of a place of a square of side 4 from its middle, 0.3826 sides
     regression = error(silent) - module.BOUND_WEIGHT * np.sqrt(2 * 16 / 12)
     assert regression == pytest.approx(module.REGRESSION_WEIGHT * 4 * 0.3826, rel=0.03)
