@@ -35,7 +35,7 @@ from padforge.sense.recording.frames import framed
 from padforge.sense.recording.recording import Recording
 from padforge.sense.settings import Method, Split
 
-FORMAT = "padforge-localizer/1"
+FORMAT = "padforge-localizer/2"
 NAME = "localizer"  # of its files, `localizer.json` and `localizer.safetensors`
 TABLE, BAYES, SINGLE_PRESS = "table", "bayes", "single_press"
 """Names, among the arrays, of the response table, the Bayesian localizers and the tests for single presses."""

@@ -12,13 +12,13 @@ release::
 
 Windows of the press and the release are complete one after the other, so that their number, 0 to N_TIMED, says how far
 a press is. K is the number of those windows that a localizer uses: N_TIMED, N_PRESS_WINDOWS, or 0. Each phase of a
-press has its own network (`PHASES`), since one network for all phases learns each of them less well::
+press has its own network (`PHASES`), since one network for both learns each of them less well::
 
     complete     phase            network
     0            -                none: the press may be anywhere
     1 .. 8       touch            "touched"
-    9            rest             "settled"; from here on "touched" instead, if the finger slid since `EARLY_WINDOWS`
-    10 .. 17     release          "released"; from 12 on together with the Bayesian localizer of the last of
+    9            rest             "pressed"; from here on "touched" instead, if the finger slid since `EARLY_WINDOWS`
+    10 .. 17     release          "pressed"; from 12 on together with the Bayesian localizer of the last of
                                   `BAYES_STAGES` that is complete, corrected by the network "residual"
 """
 
@@ -79,16 +79,15 @@ class Phase:
         return isinstance(n_complete, int) and self.first <= n_complete < self.first + len(self.shares)
 
 
-def _half_at_last(n: int) -> tuple[float, ...]:
-    """Return n shares: a half at the last number of complete windows, and the other half divided among the others."""
-    return (*(0.5 / (n - 1),) * (n - 1), 0.5)
+def _half_at_last(n: int, total: float = 1.0) -> tuple[float, ...]:
+    """Return n shares of a total: 0.5 at the last number of complete windows, the rest divided among the others."""
+    return (*((total - 0.5) / (n - 1),) * (n - 1), 0.5)
 
 
 PHASES: Mapping[int, Mapping[str, Phase]] = {
     N_TIMED: {
         "touched": Phase(1, (0.05, 0.12, 0.26, 0.15, 0.11, 0.09, 0.08, 0.07, 0.07), 1.4, sliding=0.3),
-        "settled": Phase(N_PRESS_WINDOWS, (1.0,), 1.3),
-        "released": Phase(N_PRESS_WINDOWS + 1, _half_at_last(len(RELEASE_WINDOWS)), 1.7),
+        "pressed": Phase(N_PRESS_WINDOWS, (0.2, *_half_at_last(len(RELEASE_WINDOWS), 0.8)), 2.0),
     },
     N_PRESS_WINDOWS: {"held": Phase(1, _half_at_last(N_PRESS_WINDOWS), sliding=0.2)},
     0: {"press": Phase(0, (1.0,))},

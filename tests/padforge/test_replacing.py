@@ -90,7 +90,7 @@ def test_refused_search_keeps_checkpoints(pad: Path) -> None:
 @pytest.mark.parametrize("told", [{}, {"recording_kind": "ur5"}])
 def test_run_does_not_replace_localizer_of_measured_presses(tmp_path: Path, told: dict[str, str]) -> None:
     (tmp_path / "pad").mkdir()
-    write_json(tmp_path / "pad" / "localizer.json", {"format": "padforge-localizer/1", "provenance": told})
+    write_json(tmp_path / "pad" / "localizer.json", {"format": "padforge-localizer/2", "provenance": told})
     said = refused("run", "--out", "pad", cwd=tmp_path)
     assert f"of kind {told.get('recording_kind')!r}, not a simulated one" in said
 

@@ -104,8 +104,8 @@ def test_calibrate_reports_divergence(brief: Recording, monkeypatch: pytest.Monk
 
     def diverged(*arguments: Any) -> Any:
         trained = train(*arguments)
-        settled = {part: weight * np.float32(np.nan) for part, weight in trained.networks["settled"].items()}
-        return trained._replace(networks={**trained.networks, "settled": settled})
+        pressed = {part: weight * np.float32(np.nan) for part, weight in trained.networks["pressed"].items()}
+        return trained._replace(networks={**trained.networks, "pressed": pressed})
 
     monkeypatch.setattr(training, "train_members", diverged)
     with pytest.raises(InputError, match=r"training diverged at \[localizer\] learning_rate 0.005, try a lower one"):

@@ -39,7 +39,7 @@ def test_complete_at_is_the_first_reading_with_so_many_windows(count: int, lengt
 def test_answering_adds_the_bayesian_localizer_after_the_release() -> None:
     networks = {name: {} for name in PHASES[N_TIMED]}
     names = [moments.active_networks(networks, count, N_TIMED, True) for count in range(N_TIMED + 1)]
-    plain = [[], *[["touched"]] * (N_PRESS_WINDOWS - 1), ["settled"], *[["released"]] * len(RELEASE_WINDOWS)]
+    plain = [[], *[["touched"]] * (N_PRESS_WINDOWS - 1), *[["pressed"]] * (1 + len(RELEASE_WINDOWS))]
     assert names == [each + [moments.RESIDUAL] * (count in moments.RESIDUAL_PHASE) for count, each in enumerate(plain)]
     assert [moments.active_networks(networks, count, N_TIMED, False) for count in range(N_TIMED + 1)] == plain
     assert moments.active_networks({"press": {}}, 0, 0, True) == ["press", moments.RESIDUAL]

@@ -187,7 +187,7 @@ def test_inputs_are_scaled_down_in_training_alone() -> None:
     table = np.zeros((3, 3, 4, N_FEATURES), np.float32)
     common = 5 * rng.standard_normal((200, 1, 1)) + 0.1 * rng.standard_normal((200, 4, N_FEATURES))
     presses = training_presses(common, np.ones((200, 4), bool), rng.uniform(-1, 1, (200, 2)), N_TIMED)
-    task = training.TrainingTask("released", PHASES[N_TIMED]["released"], Options(hidden=8, layers=1), 1)
+    task = training.TrainingTask("pressed", PHASES[N_TIMED]["pressed"], Options(hidden=8, layers=1), 1)
     trained = training.Training(presses, table, task, 0)
     x = np.concatenate([trained.sample_batch()[0] for _ in range(20)])
     scaled = trained.scale_down(x)
@@ -213,19 +213,19 @@ def test_retrain_follows_another_response_from_where_networks_are(monkeypatch: p
     inputs = interpolate_grid(table, positions)
     presses = training_presses(inputs, np.ones((60, 3), bool), positions, N_TIMED)
     options = Options(hidden=16, layers=1, members=2)
-    task = training.TrainingTask("released", PHASES[N_TIMED]["released"], options, 1)
+    task = training.TrainingTask("pressed", PHASES[N_TIMED]["pressed"], options, 1)
     members = [training.Training(presses, table, task, seed) for seed in (0, 1)]
     old = network.stack_members([each.weights(each.network.parameters.weights) for each in members])
     assert len(network.unstack_members(old)) == 2
     for name, part in network.stack_members(network.unstack_members(old)).items():
         np.testing.assert_array_equal(part, old[name])
     monkeypatch.setattr(training, "RETRAINING_STEPS", 60)
-    retrained, residual = training.retrain({"released": old}, {}, presses, table, 1, np.random.default_rng(3))
-    assert (list(retrained), residual) == (["released"], {})
+    retrained, residual = training.retrain({"pressed": old}, {}, presses, table, 1, np.random.default_rng(3))
+    assert (list(retrained), residual) == (["pressed"], {})
     mask = np.ones((60, 3), bool)
     x = network.network_inputs(inputs.astype(np.float32), mask, np.ones((60, N_TIMED), bool))
     before, after = (
-        np.abs(network.forward(each, x)[:, :, :2] - positions).mean() for each in (old, retrained["released"])
+        np.abs(network.forward(each, x)[:, :, :2] - positions).mean() for each in (old, retrained["pressed"])
     )
     assert after < 0.5 * before
 
