@@ -33,8 +33,8 @@ twice as long.
 """
 FINE_PRECISION = 1e-3
 """The same in the evaluation of a pad, and the maximum error of signals of a profile."""
-TABLE_PRECISION = 1e-4
-"""Maximum error of tabulated weights, relative to the largest one. A table should fit in the cache of a core."""
+TABLE_SHARE = 0.1
+"""Maximum error of tabulated weights, relative to the largest one, as a share of the precision of signals."""
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(8)  # lower orders do not resolve the bends of a span
 _NODES, _WEIGHTS = (1 + _NODES) / 2, _WEIGHTS / 2  # on [0, 1]
 _LAYER_NODES, _LAYER_WEIGHTS = np.polynomial.legendre.leggauss(5)
@@ -61,11 +61,11 @@ class Elements(NamedTuple):
     weight: Array  # quadrature weights, relative to the span; shape (E,)
 
 
-def weight_table(law: WeightLaw) -> Array:
+def weight_table(law: WeightLaw, precision: float) -> Array:
     """Return w and v as piecewise cubics in equal steps of the squared distance, a Hermite interpolant of the profile.
 
     Rows of the profile have a higher degree and must be searched for; a row of this table is found by its index and
-    fits in one cache line.
+    fits in one cache line. It has no more rows than the `precision` of signals takes, so that a core caches all of it.
 
     Returns:
         Coefficients of w, then of v, by family and step, in powers of the fraction of a step; 0 after the end of the
@@ -74,7 +74,7 @@ def weight_table(law: WeightLaw) -> Array:
     profiles = law.profile[: _n_families(law)]
     for exponent in range(8, 18):
         tables = np.stack([_tabulate(profile, law, 1 << exponent) for profile in profiles])
-        if all(_is_precise(table, profile, law) for table, profile in zip(tables, profiles, strict=True)):
+        if all(_is_precise(table, profile, law, precision) for table, profile in zip(tables, profiles, strict=True)):
             break
     return tables
 
@@ -96,13 +96,13 @@ def _tabulate(profile: Array, law: WeightLaw, steps: int) -> Array:
     return out
 
 
-def _is_precise(table: Array, profile: Array, law: WeightLaw) -> bool:
-    """Return whether a table keeps the `TABLE_PRECISION` in the middle of its steps, where a cubic errs most."""
+def _is_precise(table: Array, profile: Array, law: WeightLaw, precision: float) -> bool:
+    """Return whether a table keeps its share of a precision in the middle of its steps, where a cubic errs most."""
     steps = len(table) - 1
     middles = (np.arange(steps) + 0.5) * law.radius**2 / steps
     exact = np.stack([_evaluate(profile, column, middles)[0] for column in (PLAIN, DIRECTED)])
     found = table[:-1].reshape(steps, 2, 4) @ 0.5 ** np.arange(4)
-    return bool(np.abs(found.T - exact).max() <= TABLE_PRECISION * np.abs(exact).max())
+    return bool(np.abs(found.T - exact).max() <= TABLE_SHARE * precision * np.abs(exact).max())
 
 
 def _evaluate(profile: Array, column: int, squares: Array) -> tuple[Array, Array]:
