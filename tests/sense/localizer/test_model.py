@@ -246,32 +246,6 @@ def test_recalibrate_learns_another_pad_of_the_plan_and_a_new_fibre(localizer, r
     assert error(now, mended, LATER) < error(localizer, mended, LATER, (2,))
 
 
-def test_recalibrate_keeps_an_unchanged_pad(localizer: LocalizerModel, recording: Recording) -> None:
-    """But radii that are too small, which are widened."""
-    small = localizer.interval_factors / 2
-    old = replace(localizer, recalibrated_by=("of before",), interval_factors=small)
-    now, result = recalibrate(old, known_only(recording, NEW))
-    assert now.recalibrated_by == ("of before", known_only(recording, NEW).digest)
-    assert result.change != "corrected"
-    assert result.gain_mm >= 0  # what does not reduce the error is not kept
-    assert not result.new_fibres
-    np.testing.assert_allclose(now.interval_factors, small * result.widened)
-    assert (now.interval_factors > small).all()
-    assert error(now, recording, LATER) < 1.03 * error(localizer, recording, LATER)
-
-
-def test_refit_expects_of_later_presses_the_misfit_of_those_left_out(
-    localizer: LocalizerModel, recording: Recording, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Of a pad cast again: presses in the fit of its response misfit less, and all others would look like another's."""
-    monkeypatch.setattr(training, "RETRAINING_STEPS", 1)
-    other = simulate(Morphology.from_dict(recording.source["morphology"]), RigSettings(presses=150, seed=2))
-    few = localizer.raw_features(other)[NEW], other.presses_mm[NEW], {}
-    now, _ = recalibration.refit(localizer, *few, plan=None, seed=0, only_last=True)
-    misfits = single_press.find_misfits(now.single_press, now.scaled_features(other)[60:])
-    assert misfits.mean(axis=0)[0] < 0  # in standard deviations of those left out, which are a little too large
-
-
 def test_fit_correction_recovers_gains_and_pose(localizer: LocalizerModel, recording: Recording) -> None:
     scaling, gains, shift = localizer.scaler, np.array([1.2, 0.8, 1.1, 0.9]), np.array([0.06, -0.08])
     turn = 1.02 * np.array([[np.cos(0.05), -np.sin(0.05)], [np.sin(0.05), np.cos(0.05)]])
