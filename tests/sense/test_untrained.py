@@ -1,12 +1,9 @@
-"""What is learnt beside the training of networks, kept as a whole: networks stay as they are drawn.
-
-Weights that were trained differ from processor to processor; these numbers hardly do.
-"""
+"""What is learnt beside the training of networks, kept as a whole: networks stay as they are drawn."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
-from unittest.mock import patch
+from unittest.mock import Mock, patch
 
 import numpy as np
 import pytest
@@ -29,6 +26,7 @@ OPTIONS = LocalizerSettings(max_failures=1, test_share=0.2)
 @pytest.fixture(autouse=True)
 def untrained(monkeypatch: pytest.MonkeyPatch) -> None:
     def stay(parameters: Parameters, *_: Any, **__: Any) -> dict[str, np.ndarray]:
+        """Weights that are trained differ from processor to processor; what is computed beside them hardly does."""
         return parameters.by_name(parameters.flat.copy())
 
     monkeypatch.setattr(training, "fit_network", stay)
@@ -36,17 +34,17 @@ def untrained(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def numbers(value: Any) -> Any:
-    """JSON of five digits; of an array of more than 36 numbers its root mean square and its largest magnitude."""
+    """JSON of all digits; of an array of more than 36 numbers its root mean square and its largest magnitude."""
     if isinstance(value, Mapping):
         return {name: numbers(part) for name, part in value.items()}
     if hasattr(value, "__dataclass_fields__"):
         return numbers(vars(value))
     if isinstance(value, np.ndarray) and value.size > 36:
         rms, largest = np.sqrt(np.square(value, dtype=float).mean()), np.abs(value).max()
-        return f"{' x '.join(map(str, value.shape))}: {rms:.5g} to {largest:.5g}"
+        return f"{' x '.join(map(str, value.shape))}: {rms:.12g} to {largest:.12g}"
     if isinstance(value, np.ndarray | Sequence) and not isinstance(value, str):
         return [numbers(part) for part in value]
-    return float(f"{value:.5g}") if isinstance(value, float | np.floating) else value
+    return float(value) if isinstance(value, np.floating) else value
 
 
 @patch.multiple(calibration, SCALE_SUBSETS=2, MOMENT_SUBSETS=1)
@@ -59,9 +57,8 @@ def test_what_a_calibration_computes(recording: Recording, golden: Golden) -> No
             model, found = calibrate(known, OPTIONS, by_moment=name == "alone")
         kept |= {"by moment": found.by_moment[::2], "focus": found.focus} if found.by_moment else {}
         of_scales = {each: weights["last.b"] for each, weights in model.networks.items()}
-        kept[name] = {"factors": model.interval_factors[[1, 5, 9, 12, -1]], "scales": of_scales}
-    parts = {"table": model.table, "scaler": model.scaler, "single press": model.single_press, "bayes": model.bayes}
-    kept |= parts | {"errors": found.errors}
+        kept[name] = {"factors": model.interval_factors[[1, 5, 9, 12, -1]], "scales": of_scales, "errors": found.errors}
+    kept |= {"table": model.table, "scaler": model.scaler, "single press": model.single_press, "bayes": model.bayes}
     golden("sense/untrained/calibration.json", json_text(numbers(kept)), rtol=2e-3)
 
 
@@ -73,8 +70,11 @@ def test_what_a_recalibration_computes(
     """Of presses on the pad as it was, and as it is with other gains, in radii that are too small."""
     few, kept, small = first_presses(recording, 30), {}, bayesian_localizer.interval_factors[:, :2] / 2
     old = replace(bayesian_localizer, interval_factors=small, recalibrated_by=("of before",))
-    for name, gains in (("as it was", 1.0), ("other gains", np.array([0.8, 1.2, 1.1, 0.9]))):
-        now, result = recalibrate(old, replace(few, readings=few.readings * gains))
+    refit, other = recalibration.refit, np.array([0.8, 1.2, 1.1, 0.9])
+    none = Mock(side_effect=lambda old, *_, **__: (old, other < 0))
+    for name, gains, fitting in (("as it was", 1.0, refit), ("other gains", other, refit), ("no fit", other, none)):
+        with patch.object(recalibration, "refit", fitting):
+            now, result = recalibrate(old, replace(few, readings=few.readings * gains))
         document = result.to_dict() | {"provenance": {}, "recalibrated by": now.recalibrated_by}
         kept[name] = document | {"single press": now.single_press, "factors": now.interval_factors[-1]}
     golden("sense/untrained/recalibration.json", json_text(numbers(kept)), rtol=1e-2)

@@ -170,6 +170,14 @@ def responses(recording: Recording, readings: int = 40) -> np.ndarray:
     return cycles[:, half + 10 :].mean(axis=1) - cycles[:, half - 12 : half].mean(axis=1)
 
 
+def test_live_pad_responds_in_proportion_to_depth() -> None:
+    model = pad_model.LivePad(PAD, PUBLISHED_CONTACT, quiet_rig(), 1000.0, np.random.default_rng(0))
+    volts = model.volts(np.tile([-5.0, 7.0], (80, 1)), np.repeat([-5.0, 0.0, 2.5, 5.0], 20))
+    rest, above, half, full = volts[10::20]
+    np.testing.assert_array_equal(above, rest)
+    np.testing.assert_allclose(rest - half, (rest - full) / 2, atol=0.05 * np.ptp(rest - full))
+
+
 def test_simulate_presses_all_that_is_sensed_as_deep_as_the_contact() -> None:
     recording = simulate(GRID, RigSettings(presses=400))
     assert np.abs(recording.presses_mm).max() <= 22.5

@@ -138,14 +138,6 @@ def test_tool_and_depth_of_half_size_err_more_between_fibres(tmp_path: Path) -> 
     assert "Errors are in mm." in document["text"][0]
 
 
-def test_tools_and_depths_are_half_and_one_and_a_half_times_those_of_the_contact() -> None:
-    """Without depths beyond the thickness."""
-    contacts = Contact(tool_radius_mm=4.0, depth_mm=2.0), Contact(depth_mm=5.0)
-    small, deep = (sensitivity_study(SQUARE, contact=contact) for contact in contacts)
-    assert (small.settings["tool_radius_mm"], small.settings["depth_mm"]) == ([2, 4, 6], [1, 2, 3])
-    assert (len(small.tasks), deep.settings["depth_mm"]) == (9, [2.5, 5.0])
-
-
 def test_errors_are_those_of_where_the_finger_is_now(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of a finger at rest they stay; each is within r90, and beyond r50; at the end it is where it was lifted."""
 

@@ -43,6 +43,7 @@ PADS = {"square": Morphology.straight(2)}
 SMALLER = {
     "drift.MEMBERS": 2,
     "drift.EPOCHS": 2,
+    "drift.COMPENSATIONS": drift.COMPENSATIONS[:-1],  # the sign of principal components is that of a processor
     "drift.FILTERS": {each: drift.FILTERS[each] for each in (drift.RAW, drift.AS_PUBLISHED)},
     "indentation.FORCE_NOISES": (1.0,),
     "indentation.TOOLS": ("dome", "flat"),
