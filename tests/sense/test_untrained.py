@@ -72,7 +72,7 @@ def test_what_a_recalibration_computes(
     old = replace(bayesian_localizer, interval_factors=small, recalibrated_by=("of before",))
     refit, other = recalibration.refit, np.array([0.8, 1.2, 1.1, 0.9])
     none = Mock(side_effect=lambda old, *_, **__: (old, other < 0))
-    for name, gains, fitting in (("as it was", 1.0, refit), ("other gains", other, refit), ("no fit", other, none)):
+    for name, gains, fitting in (("as it was", 1.0, refit), ("other gains", other, refit), ("no fit", other**2, none)):
         with patch.object(recalibration, "refit", fitting):
             now, result = recalibrate(old, replace(few, readings=few.readings * gains))
         document = result.to_dict() | {"provenance": {}, "recalibrated by": now.recalibrated_by}
