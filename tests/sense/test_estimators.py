@@ -24,6 +24,8 @@ from padforge.sense.localizer.moments import PRESS_WINDOWS
 from padforge.sense.report import calibration
 from padforge.sense.settings import LocalizerSettings
 from padforge.sense.twin import identification as twin_identification
+from padforge.sense.twin.as_built import AsBuiltPad
+from padforge.sense.twin.fitting import AsBuiltFit, fit_as_built
 from padforge.sense.twin.identification import Identification
 from padforge.sense.twin.responses import Responses
 from tests.helpers.rigs import ideal_rig
@@ -97,12 +99,14 @@ RADII = 3  # last presses of a training of 32, which calibrate the uncertainty
 
 
 def without_sense(recording: Recording, first: int) -> Recording:
-    """Positions from a press on, and readings from the next one on, are nonsense: its touch ends the press before."""
+    """Positions and depths from a press on, readings from the next one on, are nonsense: its touch ends one before."""
     readings, places = np.array(recording.readings), np.array(recording.presses_mm)
     places[first:] = 40.0 - places[first:] / 3
+    depths_mm, forces_n = (np.array(each) for each in (recording.depths_mm, recording.forces_n))
+    depths_mm[first:], forces_n[first:] = 77.0, np.nan
     start = recording.down_command[first + 1]
     readings[start:] = np.random.default_rng(0).uniform(0, 3.3, readings[start:].shape)
-    return replace(recording, readings=readings, presses_mm=places)
+    return replace(recording, readings=readings, presses_mm=places, depths_mm=depths_mm, forces_n=forces_n)
 
 
 def learnt(model: LocalizerModel, changing: tuple[str, ...] = ()) -> dict[str, bytes]:
@@ -144,6 +148,19 @@ def test_calibration_learns_nothing_from_its_test_nor_networks_from_presses_of_r
     stopped, other = (fit(each, method="published") for each in (brief, without_sense(brief, 32 - RADII)))
     assert learnt(other, of_radii[1:]) == learnt(stopped, of_radii[1:])
     assert not np.array_equal(other.interval_factors, stopped.interval_factors)
+
+
+def test_calibration_learns_no_depth_from_its_test(deep_recording: Recording) -> None:
+    """Nor whether depth and force are learnt, which takes all of them; the errors are of the test."""
+    names = "presses_mm", "down_command", "up_command", "depths_mm", "forces_n"
+    known = replace(deep_recording, **{name: getattr(deep_recording, name)[:50] for name in names})
+    with few_moments():
+        (plain, errors), (spoilt, other) = (
+            calibrate(each, TINY, by_moment=False) for each in (known, without_sense(known, 40))
+        )
+    assert [measure.name for measure in plain.scaler.measures] == ["depth_mm", "force_n"]
+    assert learnt(spoilt) == learnt(plain)
+    assert errors.errors[0]["depth_mean_mm"] < 5 < other.errors[0]["depth_mean_mm"]
 
 
 def test_cross_validated_localizer_learns_nothing_from_other_presses(brief: Recording) -> None:
@@ -224,11 +241,22 @@ def test_twin_learns_nothing_from_presses_held_out(identification: Identificatio
         volts[~training] = 3.0
         return replace(responses, positions_mm=positions_mm, volts=volts)
 
+    fitted: list[Responses] = []
+
+    def remember(pad: AsBuiltPad, responses: Responses, *options: Any) -> AsBuiltFit:
+        fitted.append(responses)
+        return fit_as_built(pad, responses, *options)
+
     monkeypatch.setattr(twin_identification, "compute_responses", spoil)
+    monkeypatch.setattr(twin_identification, "fit_as_built", remember)
     with few_candidates():
         spoilt = identify_simulated(plan, plan, ideal_rig(presses=120, seed=1))
     assert np.array_equal(spoilt.fit.pad.values, plain.fit.pad.values)
     assert np.array_equal(spoilt.noise_v, plain.noise_v)
     assert spoilt.scatter == plain.scatter
+    # whether the response depends on the angle is told by a sixth of the presses, of which the fits before know nothing
+    sixth = spoilt.training.positions_mm[::6]
+    others = [each.positions_mm for each in fitted if len(each) == len(spoilt.training) - len(sixth)]
+    assert (len(others), np.isin(others, sixth).any()) == (3, False)
     assert (spoilt.held_out.volts == 3.0).all()
     assert not np.array_equal(spoilt.explained, plain.explained)

@@ -6,7 +6,8 @@ import pytest
 from padforge.design.morphology import Morphology
 from padforge.design.objectives import criterion as module
 from padforge.design.objectives.criterion import criterion, evaluation_windows, relative_error, window_presses
-from padforge.design.settings import Contact, PadSettings, Scatter
+from padforge.design.objectives.fibre_loss import failure_masks
+from padforge.design.settings import Contact, PadSettings, Scatter, SearchSettings
 from tests.design.objectives.pads import square
 
 SIDE, SIZE = 14, np.array([4.0, 4.0])
@@ -152,6 +153,23 @@ def test_evaluation_of_a_huge_pad_samples_windows_and_presses():
     presses = window_presses(size, windows[0], SIDE, np.random.default_rng(0))
     assert 0.9 * module.MAX_FAR < len(presses.far) <= module.MAX_FAR
     assert np.ptp(presses.far, axis=0).min() > 90
+
+
+def test_sets_that_are_alike_in_a_window_count_as_often_as_they_are(monkeypatch):
+    """Those that fail beyond it; errors stand for which fibres of the window work."""
+
+    def working(*arguments: np.ndarray, differentiate: bool) -> tuple[np.ndarray, bool]:
+        masks = arguments[4]
+        return masks @ np.arange(1.0, 1 + masks.shape[1]), differentiate
+
+    monkeypatch.setattr(module, "window_presses", lambda *where: window_presses(*where)._replace(far=np.empty((0, 2))))
+    monkeypatch.setattr(module, "criterion", working)
+    given = Morphology.straight(12), Contact(model="profile"), SearchSettings(max_failures=1), PadSettings(grid=12)
+    together, alone = module.criterion_errors(*given)[1], []
+    for mask in failure_masks(24, 1, module.MIN_SETS):
+        monkeypatch.setattr(module, "failure_masks", lambda *_, mask=mask: mask[None])
+        alone.append(module.criterion_errors(*given)[1])
+    assert together == pytest.approx(np.mean(alone))
 
 
 def test_full_scale_of_straight_fibres_is_by_their_length_alone():

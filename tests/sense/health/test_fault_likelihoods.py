@@ -12,70 +12,17 @@ from scipy.stats import t as student
 from torch.nn import functional
 
 from padforge.sense.health import fault_likelihoods, trace_model
-from padforge.sense.health.fault_likelihoods import LIBRARY, MEDIAN_T, STEPS, ExceedanceModel, FaultLikelihoods
-from padforge.sense.health.trace_model import COMPONENTS, INPUTS, LOG_STD, MEMBERS, RELEASED, REST, TARGETS, TRACE
+from padforge.sense.health.fault_likelihoods import LIBRARY, STEPS, FaultLikelihoods
+from padforge.sense.health.trace_model import COMPONENTS, INPUTS, LOG_STD, MEMBERS, RELEASED, TARGETS, TRACE
 from padforge.sense.localizer import optimizer
-
-N_FIBRES = 2
-
-
-def test_project_follows_response_rest_and_history() -> None:
-    rng = np.random.default_rng(0)
-    traces = rng.normal(0, 1, (120, N_FIBRES, TRACE)) + np.linspace(0, 3, 120)[:, None, None]
-    traces[5, 1, 3] = np.nan
-    components = rng.normal(0, 1, (N_FIBRES, TRACE, COMPONENTS))
-    pca = trace_model.TracePCA(components, np.ones((N_FIBRES, INPUTS)), np.ones((N_FIBRES, TARGETS)))
-    history = trace_model.TraceHistory.initial(N_FIBRES)
-    levels, residue, count = [math.nan] * N_FIBRES, np.zeros((N_FIBRES, COMPONENTS)), [0] * N_FIBRES
-    for trace in traces:
-        inputs, targets = pca.project(trace, history)
-        for fibre in range(N_FIBRES):
-            if np.isnan(trace[fibre]).any():
-                assert np.isnan(inputs[fibre, : COMPONENTS + 1]).all()
-                assert np.isnan(targets[fibre]).all()
-                continue
-            rest = trace[fibre, :REST].mean()
-            response = (trace[fibre] - rest) @ components[fibre]
-            level = rest if math.isnan(levels[fibre]) else levels[fibre]
-            np.testing.assert_allclose(inputs[fibre], [*response, rest - level, *residue[fibre]], atol=1e-9)
-            np.testing.assert_allclose(targets[fibre], [*response, rest - level], atol=1e-9)
-            count[fibre] += 1
-            levels[fibre] = level + max(1 / 50, 1 / count[fibre]) * (rest - level)
-            residue[fibre] = 0.7 * (residue[fibre] + response)
-        np.testing.assert_allclose(history.level, levels, atol=1e-9)
-        np.testing.assert_array_equal(history.n_presses, count)
-
-
-def test_fit_transform_finds_principal_directions_and_scales() -> None:
-    rng = np.random.default_rng(1)
-    patterns = np.linalg.qr(rng.normal(0, 1, (TRACE - REST, 3)))[0].T
-    amplitudes = np.array([5.0, 2.0, 0.5]) * rng.normal(0, 1, (400, N_FIBRES, 3))
-    traces = np.zeros((400, N_FIBRES, TRACE))
-    traces[:, :, REST:] = np.einsum("qck,kw->qcw", amplitudes, patterns)
-    pca, inputs, targets = trace_model.TracePCA.fit_transform(traces)
-    for fibre in range(N_FIBRES):
-        for component, pattern in enumerate(patterns):
-            assert abs(pca.components[fibre, REST:, component] @ pattern) > 0.98
-        rms = np.sqrt(((traces[:, fibre] @ pca.components[fibre]) ** 2).mean(axis=0))
-        largest = max(rms.max(), pca.input_scale_v[fibre].max())
-        np.testing.assert_allclose(pca.input_scale_v[fibre, :3], np.sqrt(rms[:3] * largest), rtol=1e-6)
-        np.testing.assert_allclose(pca.target_scale_v[fibre, :3], rms[:3])
-    assert inputs.shape == (400, N_FIBRES, INPUTS)
-    np.testing.assert_allclose(np.sqrt((targets[:, :, :3] ** 2).mean(axis=0)), 1)
 
 
 def random_weights(fibres: int, rng: np.random.Generator) -> dict[str, NDArray[np.float32]]:
     hidden, outputs = 7, 2 * TARGETS
-    shapes = {
-        "first.w": (MEMBERS, fibres, INPUTS, hidden),
-        "first.mask": (MEMBERS, fibres, hidden),
-        "first.b": (MEMBERS, hidden),
-        "hidden.w": (MEMBERS, hidden, hidden),
-        "hidden.b": (MEMBERS, hidden),
-        "last.w": (MEMBERS, fibres, hidden, outputs),
-        "last.b": (MEMBERS, fibres, outputs),
-    }
-    return {name: (0.5 * rng.standard_normal(shape)).astype(np.float32) for name, shape in shapes.items()}
+    shapes = {"first.w": (fibres, INPUTS, hidden), "first.mask": (fibres, hidden), "first.b": (hidden,)}
+    shapes |= {"hidden.w": (hidden, hidden), "hidden.b": (hidden,)}
+    shapes |= {"last.w": (fibres, hidden, outputs), "last.b": (fibres, outputs)}
+    return {name: 0.5 * rng.standard_normal((MEMBERS, *shape), np.float32) for name, shape in shapes.items()}
 
 
 @settings(max_examples=10)
@@ -200,75 +147,6 @@ def test_log_likelihood_ratios_are_those_of_densities_and_0_for_missing_readings
     assert not llr_continuing[2, 1].any()
     assert not llr_onset[2, 1].any()
     assert llr_continuing[2, 0].any()
-
-
-def test_fit_calibrates_deviations_noise_and_rests() -> None:
-    """Errors are twice as large as predicted; rests correlate by 0.5 with those before; traces are noise alone."""
-    rng = np.random.default_rng(5)
-    error = rng.standard_t(5, (1500, FIBRES, TARGETS))
-    for press in range(1, 1500):
-        error[press, :, -1] = 0.5 * error[press - 1, :, -1] + error[press, :, -1]
-    std = np.full(error.shape, 0.1)
-    mean = rng.normal(0, 1, std.shape)
-    traces = np.array([0.1, 0.2, 0.3])[:, None] * rng.standard_normal((1500, FIBRES, TRACE))
-    traces[:3, 1] = 0.5
-    model = FaultLikelihoods.fit(traces, mean + 0.2 * error, mean, std, np.full((FIBRES, TARGETS), 2.0), rng)
-    calibrated = np.hypot(0.1 * model.std_scale, model.std_floor)
-    np.testing.assert_allclose(calibrated[:, :COMPONENTS], 0.2, rtol=0.15)
-    assert model.rest_autocorr == pytest.approx([0.5], abs=0.1)
-    assert model.innovation_std == pytest.approx([0.2 / calibrated[:, -1].mean()], rel=0.15)
-    noise = np.median([[fault_likelihoods.estimate_noise(trace) for trace in press] for press in traces], axis=0)
-    np.testing.assert_allclose(model.noise_v, noise)
-    np.testing.assert_allclose(model.noise_floor, np.repeat(noise[:, None] / 2, COMPONENTS, axis=1))
-    np.testing.assert_allclose(model.log_noise_mean, math.log(1.25), atol=0.01)
-    np.testing.assert_allclose(model.constant_share, np.array([1, 4, 1]) / 1502)
-    assert model.library_mean.shape == model.library_std.shape == (LIBRARY, FIBRES, COMPONENTS)
-
-
-def test_step_filters_are_matched_and_scaled_for_heavy_tails() -> None:
-    """On white noise a filter gives 1 for a standard deviation, or its far quantile is that of Student's t."""
-    rng = np.random.default_rng(2)
-    traces = rng.standard_normal((4000, 1, TRACE))
-    (filters,) = fault_likelihoods.fit_step_filters(traces, np.array([0.01]))
-    outputs = (traces - traces[:, :, :REST].mean(axis=2, keepdims=True))[:, 0] @ filters.T
-    np.testing.assert_allclose(outputs.std(axis=0), 1, rtol=0.05)
-    for number, at in enumerate(STEPS):
-        step = (np.arange(TRACE) >= at).astype(float)
-        step -= step[:REST].mean()
-        assert abs(np.argmax(np.abs(filters @ step)) - number) <= 2
-    heavy = traces * np.where(rng.random(4000) < 0.01, 30.0, 1.0)[:, None, None]
-    (filters,) = fault_likelihoods.fit_step_filters(heavy, np.array([0.01]))
-    outputs = (heavy - heavy[:, :, :REST].mean(axis=2, keepdims=True))[:, 0] @ filters.T
-    np.testing.assert_allclose(np.quantile(np.abs(outputs), 0.999, axis=0), student.ppf(0.9995, 5), rtol=1e-3)
-    assert pytest.approx(student.ppf(0.75, 5), abs=1e-4) == MEDIAN_T
-
-
-def test_noise_is_the_mean_step_of_quiet_readings_but_for_the_largest_quarter() -> None:
-    """Of the rest, and of the last ten readings held and released: 27 steps, of which 20 count."""
-    quiet = np.concatenate([np.arange(10), np.arange(20, 30), np.arange(40, 50)])
-    trace = np.full(TRACE, 7.0)
-    trace[quiet] = 0.01 * (quiet % 2)
-    assert fault_likelihoods.estimate_noise(trace) == pytest.approx(0.01)
-    trace[[5, 25, 45]] = 3.0  # 6 steps beside them, all of a quarter
-    assert fault_likelihoods.estimate_noise(np.stack([trace, 2 * trace])[:, None]) == pytest.approx(
-        np.array([[0.01], [0.02]])
-    )
-    trace[[3, 23]] = 3.0
-    assert fault_likelihoods.estimate_noise(trace) > 0.1
-
-
-def test_exceedance_fit_has_the_mean_excess_of_the_highest_tenth() -> None:
-    """400 peaks of one press each with known heights; the level makes the highest no rarer than once."""
-    heights = np.random.default_rng(0).permutation(np.linspace(0.1, 40, 400))
-    llrs = np.full((1000, 1, 1), -100.0)
-    llrs[: 2 * 400 : 2, 0, 0] = heights
-    model = ExceedanceModel.fit([(llrs, llrs)])
-    top = np.sort(heights)
-    slope = (top[-40:] - top[-41]).mean()
-    assert model.slope[0, 0] == pytest.approx(slope)
-    levels = [top[-41] + slope * math.log(40 / 1000), top[-1] + slope * math.log(1 / 1000)]
-    assert model.level[0, 0] == pytest.approx(max(levels))
-    assert ExceedanceModel.fit([(-llrs * 0 - 1, -llrs * 0 - 1)]).slope[0, 0] == 1
 
 
 def test_cusum_is_the_best_sum_over_all_onsets() -> None:

@@ -3,7 +3,9 @@
 import json
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -11,18 +13,19 @@ import pytest
 from padforge.common.validation import InputError
 from padforge.sense import FaultDetector, HealthModel, Recording, calibrate
 from padforge.sense.arrays import MIN_SCALE_V
-from padforge.sense.health import domain_shift, health_model
+from padforge.sense.health import domain_shift
 from padforge.sense.health.domain_shift import detect_shifts, rest_levels
 from padforge.sense.health.fault_detector import HEALTH_FILES, has_health
-from padforge.sense.health.health_model import COMMANDED, HYPOTHESES, MIN_PRESSES, WARM_UP, find_dead_fibres
-from padforge.sense.health.trace_model import LEVEL_RATE, MEMBERS
+from padforge.sense.health.health_model import COMMANDED, HYPOTHESES, find_dead_fibres
 from padforge.sense.localizer.model import LocalizerModel
 from padforge.sense.localizer.model_files import files_of
+from padforge.sense.localizer.response_model import interpolate_grid
+from padforge.sense.localizer.scaler import ScaledFeatures
 from padforge.sense.settings import LocalizerSettings
 from tests.helpers.folders import files_in
 from tests.helpers.once import Once
 from tests.sense.conftest import few_moments
-from tests.sense.health.pads import PRESSES, TRAINED, detect_later, fit, part_of, plant
+from tests.sense.health.pads import PRESSES, TRAINED, detect_later, part_of, plant
 
 DOCUMENT = files_of(Path(), COMMANDED).document
 
@@ -52,19 +55,16 @@ def test_load_refuses_changed_documents_and_torn_files(model: HealthModel, tmp_p
     make_detector(model).save(tmp_path)
     whole = {name: (tmp_path / name).read_bytes() for name in HEALTH_FILES}
     document = json.loads(whole[DOCUMENT.as_posix()])
-    for change, message in (
-        ({"false_alarm_rate": 0.0}, "false_alarm_rate is 0.0"),
-        ({"weights_sha256": "0" * 64}, "not the weights"),
+    wrong = [(DOCUMENT, json.dumps(document | {"false_alarm_rate": 0.0}).encode(), "false_alarm_rate is 0.0")]
+    wrong += [(DOCUMENT, json.dumps(document | {"weights_sha256": "0" * 64}).encode(), "not the weights")]
+    for name, content, message in (
+        *wrong,
+        *((name, each[:-9], r"not the weights|JSON") for name, each in whole.items()),
     ):
-        (tmp_path / DOCUMENT).write_text(json.dumps(document | change))
-        with pytest.raises(InputError, match=message):
-            HealthModel.load(tmp_path)
-    (tmp_path / DOCUMENT).write_bytes(whole[DOCUMENT.as_posix()])
-    for name, content in whole.items():
-        (tmp_path / name).write_bytes(content[:-9])
-        with pytest.raises(InputError, match=r"not the weights|JSON"):
-            FaultDetector.load(tmp_path)
         (tmp_path / name).write_bytes(content)
+        with pytest.raises(InputError, match=message):
+            FaultDetector.load(tmp_path)
+        (tmp_path / name).write_bytes(whole[Path(name).as_posix()])
 
 
 def test_find_dead_fibres() -> None:
@@ -80,28 +80,6 @@ def test_find_dead_fibres() -> None:
     for fibre, size in ((7, 0.99), (8, 1.01)):
         readings[:, fibre] = 1.5 + size * MIN_SCALE_V * rng.permutation(np.linspace(0, 1, 1000))
     assert find_dead_fibres(readings).tolist() == [1, 2, 4, 5, 7]
-
-
-@pytest.mark.parametrize("presses", [MIN_PRESSES, 599])
-def test_presses_are_held_out_in_blocks_beyond_the_memory_of_levels(pad: Recording, presses: int, monkeypatch) -> None:
-    """Among presses that the networks are trained on, drift shows in their neighbours: residuals would be too small."""
-    trained: list[np.ndarray] = []
-
-    def stop_before_training(inputs: object, targets: object, rows: list[np.ndarray], rng: object) -> None:
-        trained.extend(rows)
-        raise InterruptedError
-
-    monkeypatch.setattr(health_model, "train_networks", stop_before_training)
-    with pytest.raises(InterruptedError):
-        fit(pad.readings, pad, presses)
-    held_out = np.ones((MEMBERS, presses), dtype=bool)
-    for member, rows in enumerate(trained):
-        held_out[member, rows] = False
-    held_out = held_out[:, WARM_UP:]
-    assert (held_out.sum(axis=0) == 1).all()
-    changes = np.flatnonzero(held_out[:, 1:].argmax(axis=0) != held_out[:, :-1].argmax(axis=0)) + 1 + WARM_UP
-    assert np.diff(changes, prepend=0, append=presses).min() >= 2 / LEVEL_RATE
-    assert np.ptp(held_out.sum(axis=1)) <= WARM_UP + 1
 
 
 @pytest.mark.parametrize("rate", [1e-5, 1e-2])
@@ -163,6 +141,29 @@ def test_other_rests_are_detected(model: HealthModel, localizer: LocalizerModel,
 def test_other_gains_are_detected(model: HealthModel, localizer: LocalizerModel, later: Recording, gain: float) -> None:
     assert detect(localizer, model, changed(later, [2], gain)) == [("gain", (2,))]
     assert detect(localizer, model, changed(later, list(range(6)), gain)) == [("gain", tuple(range(6)))]
+
+
+def test_usual_gains_are_as_wide_as_gains_without_single_presses_scatter(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of one fibre that responds twice as strongly as expected, to some presses more than to others."""
+    rng, presses, count = np.random.default_rng(0), 120, 400
+    table = rng.uniform(0.1, 1, (9, 9, 1, 4)) ** 3
+    positions = rng.uniform(-1, 1, (presses, 2))
+    expected = interpolate_grid(table, positions)
+    inputs = 2 * expected * rng.uniform(0.7, 1.3, (presses, 1, 1))
+    scaled = ScaledFeatures(inputs, np.ones((presses, 1), bool), np.ones((presses, 17), bool))
+    scaler = Mock(scale_v=1.0, mean_v=0.0, measures=(), scale_positions=lambda positions_mm: positions_mm)
+    found = SimpleNamespace(positions_mm=positions)
+    known: Any = SimpleNamespace(features="windows", fibres=1, scaler=scaler, table=table)
+    known.scaled_features, known.predict_features = lambda _: scaled, lambda *_: found
+    monkeypatch.setattr(domain_shift, "rest_levels", lambda _: np.zeros((presses, 1)))
+    health: Any = SimpleNamespace(living=np.arange(1), rest_range_v=np.zeros((2, 1)), presses=count)
+    (shift,) = detect_shifts(known, health, Mock(), scaled.fibre_mask)
+    energy, energy_expected = ((part**2).sum(axis=(1, 2)) for part in (inputs, expected))
+    ratio = energy.sum() / energy_expected.sum()
+    without = [np.delete(energy, press).sum() / np.delete(energy_expected, press).sum() for press in range(presses)]
+    error = np.linalg.norm(1 - np.array(without) / ratio) / 2  # of the logarithm of a gain, the root of a ratio
+    usual = np.exp(4 * np.array([-1, 1]) * np.sqrt(0.03**2 + 0.8**2 / count + error**2))
+    assert (shift.value, *shift.usual) == pytest.approx((np.sqrt(ratio), *usual))
 
 
 def test_same_pad_later_and_gains_of_few_presses_have_no_shift(

@@ -1,7 +1,6 @@
 """The Bayesian localizer finds what least squares find of linear responses."""
 
 from collections.abc import Callable
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,7 +8,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from padforge.sense.localizer.bayes import COARSENING, N_SUMMARY, PRIOR_WEIGHT, BayesianLocalizer, fit_stages
+from padforge.sense.localizer.bayes import N_SUMMARY, PRIOR_WEIGHT, BayesianLocalizer, fit_stages
 from padforge.sense.localizer.features import N_FEATURES
 from padforge.sense.localizer.moments import BAYES_STAGES, LATEST_WINDOWS, N_TIMED, bayes_stage
 from padforge.sense.localizer.response_model import grid_positions
@@ -92,25 +91,6 @@ def test_predict_spreads_over_positions_of_equal_response() -> None:
     assert found[0, 1] == pytest.approx(0.1, abs=0.05)
 
 
-def test_grid_positions_stand_for_their_cells() -> None:
-    """A fibre without noise that gives the position itself: what blurs it is where in its cell a press lies."""
-    nodes, table = np.linspace(-1, 1, (SIDE - 1) // COARSENING + 1), grid_positions(SIDE)[:, :, None]
-    rng = np.random.default_rng(0)
-    positions = rng.uniform(-1, 1, (PRESSES, 2))
-    bayes = BayesianLocalizer.fit(table, positions[:, None], np.ones((PRESSES, 1), dtype=bool), positions)
-    presses = rng.uniform(-0.8, 0.8, (50, 2))
-    _, summary = bayes.predict(presses[:, None], np.ones((50, 1), dtype=bool))
-    cell = nodes[1] - nodes[0]
-    # Beside it the scatter that is taken for usual where there is none is little.
-    likelihood = np.exp(-0.5 * (presses[:, :, None] - nodes) ** 2 / (cell**2 / 12))
-    share = likelihood / likelihood.sum(axis=2, keepdims=True)
-    mean = share @ nodes
-    np.testing.assert_allclose(summary[:, 4:6] / 2, mean, atol=0.02 * cell)
-    np.testing.assert_allclose(
-        np.exp(4 * (summary[:, 6:8] - 1)), np.maximum(share @ nodes**2 - mean**2, 1e-4), rtol=0.12
-    )
-
-
 @settings(max_examples=10)
 @given(seed=st.integers(0, 999), size=st.sampled_from([0.1, 1.0, 1e4]))
 def test_predict_ignores_masked_fibres_and_agrees_with_torch(fitted_waves: Fitted, seed: int, size: float) -> None:
@@ -167,21 +147,3 @@ def test_fit_stages_know_only_what_is_complete() -> None:
     # a press is answered by the latest that is complete
     assert [bayes_stage(count, N_TIMED) for count in range(N_TIMED + 1)] == [None] * 12 + [0, 1, 2, 3, 3, 4]
     assert bayes_stage(0, 0) == 0
-
-
-def test_fit_takes_discriminants_and_area_of_an_earlier_localizer(fitted_waves: Fitted) -> None:
-    """Of few presses of the same response, with their directions of scatter, positions are nearly as good."""
-    earlier, inputs, positions = fitted_waves
-    few, table = np.flatnonzero((np.abs(positions) < 0.8).all(axis=1))[:25], table_of(waves)
-    mask = np.ones((len(few), FIBRES), bool)
-    bayes = BayesianLocalizer.fit(table, inputs[few], mask, positions[few], earlier)
-    np.testing.assert_array_equal(bayes.projection, earlier.projection)
-    np.testing.assert_array_equal(bayes.bounds, earlier.bounds)
-    later, everywhere = np.ones((500, FIBRES), bool), slice(-500, None)
-    errors = [
-        np.hypot(*(each.predict(inputs[everywhere], later)[0] - positions[everywhere]).T).mean()
-        for each in (earlier, bayes)
-    ]
-    assert errors[1] < 1.2 * errors[0]
-    dead = replace(earlier, projection=earlier.projection * (np.arange(FIBRES) != 1)[:, None, None])
-    assert BayesianLocalizer.fit(table, inputs[few], mask, positions[few], dead).projection[1].any()

@@ -4,12 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.special import gammaincinv
 
 from padforge.design import Contact, Morphology
 from padforge.sense import Evaluation, Recording, RigSettings
 from padforge.sense.localizer import network
-from padforge.sense.localizer.calibration import RELEASE, TOUCH, adapt_ratios
 from padforge.sense.localizer.evaluation import (
     PRIOR_PRESSES,
     RATIO_SHAPE,
@@ -21,7 +19,6 @@ from padforge.sense.localizer.evaluation import (
 )
 from padforge.sense.localizer.features import compute_features
 from padforge.sense.localizer.model import Localization, LocalizerModel, MeasureEstimate
-from padforge.sense.localizer.moments import MOMENTS
 from padforge.sense.signals.press_detection import detect_presses, first_readings
 from padforge.sense.simulation.strokes import simulate_strokes
 from tests.helpers.presses import changed
@@ -100,35 +97,6 @@ def test_idle_share_is_that_of_changes_below_a_share_of_their_range() -> None:
     np.testing.assert_allclose(idle_share(recording), [2 / 5, 1 / 5])
 
 
-@pytest.mark.parametrize("presses", [15, 30, 1000])
-def test_radii_of_few_presses_differ_less_from_draw_to_draw(presses: int) -> None:
-    """Ratios as other pads have them, of the mean that is known: shares are right, and no lottery."""
-    rng, many = np.random.default_rng(presses), np.random.default_rng(0).gamma(RATIO_SHAPE, 0.67 / RATIO_SHAPE, 20_000)
-    shares: dict[float | None, list[float]] = {None: [], 0.67: []}
-    for _ in range(100):
-        found = [make_localization(rng.gamma(RATIO_SHAPE, 0.67 / RATIO_SHAPE, presses))]
-        for prior in shares:
-            shares[prior].append(float((many <= conformal(found, np.zeros((presses, 2)), None, prior)[2]).mean()))
-    assert np.mean(shares[0.67]) == pytest.approx(0.9, abs=0.01)
-    assert np.std(shares[0.67]) < (0.6 if presses < 100 else 1.0) * np.std(shares[None])
-
-
-@pytest.mark.parametrize(("presses", "factor", "low", "high"), [(5000, 1.2, 1.18, 1.22), (10, 1.2, 1.0, 1.15)])
-def test_ratios_of_other_pads_are_adapted_to_many_presses(presses: int, factor: float, low: float, high: float) -> None:
-    expected = np.array([[0.7, 0.6], [0.9, 0.8]])
-    quantiles = gammaincinv(RATIO_SHAPE, (np.arange(presses) + 0.5) / presses) / RATIO_SHAPE
-    found = [[[make_localization(factor * mean * quantiles)] for mean in of_moment] for of_moment in expected]
-    adapted = adapt_ratios(expected, found, np.zeros((presses, 2)))
-    assert adapted is not None
-    assert ((adapted >= low * expected) & (adapted <= high * expected)).all()
-    contradicting = [[[make_localization(3 * quantiles)] for _ in of_moment] for of_moment in expected]
-    assert adapt_ratios(expected, contradicting, np.zeros((presses, 2))) is None
-    # they grow more after few presses, at the end of a press and with all fibres
-    assert RELEASE.growth(300) > RELEASE.growth(3000) > 1
-    assert RELEASE.growth(300) > TOUCH.growth(300)
-    assert RELEASE.ratio(300, 3 / 8) < RELEASE.ratio(300, 0) == RELEASE.mean_ratio
-
-
 def test_far_presses_and_another_recording_are_doubted(localizer: LocalizerModel, recording: Recording) -> None:
     localization = localizer.predict(recording)
     assert find_doubts(recording, localization, 0.9, 45) == []
@@ -147,21 +115,17 @@ PAD = Morphology.random(2, knots=3, seed=5)  # of the recording
 def test_errors_fall_while_a_press_is_read(calibrated: tuple[LocalizerModel, Evaluation], recording: Recording) -> None:
     """Rows are those of predictions until a moment, and the touch in focus is that of the median error."""
     model, evaluation = calibrated
-    rows = evaluation.by_moment
-    intact = [row for row in rows if row["n_failed"] == 0]
-    means = [row["mean_mm"] for row in intact]
+    means = [row["mean_mm"] for row in evaluation.by_moment if row["n_failed"] == 0]
     assert means[0] > means[3] > evaluation.errors[0]["mean_mm"]
-    assert abs(means[-1] / evaluation.errors[0]["mean_mm"] - 1) < 0.25
-    assert all(row["within_r90"] > 0.7 for row in rows)
+    assert all(row["within_r90"] > 0.7 for row in evaluation.by_moment)
     test, up = list(model.test), recording.up_command
     touched = first_readings(recording.readings, recording.times_s, recording.down_command, up)
-    for number in (2, 9, -1):
-        last = model.predict(recording, until=MOMENTS[number].until(touched, up)).positions_mm
+    for number, until in ((2, np.minimum(touched + 3, up)), (9, up + 2), (-1, up + 15)):
+        last = model.predict(recording, until=until).positions_mm
         errors_mm = distances(last, recording.presses_mm)[test]
         assert means[number] == pytest.approx(errors_mm.mean(), rel=1e-5)  # of single precision
     focus = evaluation.focus
-    radii = [moment["r90_mm"] for moment in focus["moments"]]
-    assert radii[0] > radii[-1]
+    assert focus["moments"][0]["r90_mm"] > focus["moments"][-1]["r90_mm"]
     assert focus["moments"][-1]["predicted_mm"] == pytest.approx(last[focus["press"]].tolist())
     assert np.sort(errors_mm)[len(errors_mm) // 2] == pytest.approx(errors_mm[test.index(focus["press"])])
 

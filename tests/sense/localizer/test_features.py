@@ -76,20 +76,13 @@ def test_compute_features_takes_means_and_medians() -> None:
     np.testing.assert_allclose(found.windows[0, 0], np.array(down + up + now) + 5.5)
     np.testing.assert_allclose(found.history[0, 0], np.array(past + slow) + 5.5)
     assert found.complete.all()
+    # the latest readings before a moment; once the press has ended, the last of it
+    for until, now in ((1, [0, 0]), (2, [1, 0]), (9, [8, 7]), (20, [19, 18]), (29, [19, 18])):
+        latest = compute_features(ramp, down_command, up_command, down_command + until).windows[0, 0, N_TIMED:]
+        np.testing.assert_allclose(latest, np.array(now) + 5.5)
     published = compute_features(ramp, down_command, up_command, is_published=True)
     np.testing.assert_allclose(published.windows[0, 0], [4990, 5010, 5030])
     assert (published.history.shape, published.complete.shape) == ((1, 1, 0), (1, 0))
-
-
-@pytest.mark.parametrize(("until", "now"), [(1, [0, 0]), (2, [1, 0]), (9, [8, 7]), (20, [19, 18]), (29, [19, 18])])
-def test_compute_features_says_where_the_finger_is_now(until: int, now: list[int]) -> None:
-    """The latest readings before the moment; once the press has ended, the last of it. Of a ramp that counts itself."""
-    ramp = np.arange(5100.0)[:, None]
-    found = compute_features(ramp, np.array([5000]), np.array([5020]), np.array([5000 + until]))
-    np.testing.assert_allclose(found.windows[0, 0, N_TIMED:], np.array(now) + 5.5)
-    assert found.complete.sum() == sum(end <= until for _, end in PRESS_WINDOWS) + sum(
-        20 + end <= until for _, end in RELEASE_WINDOWS
-    )
 
 
 @pytest.mark.parametrize("is_published", [False, True])
@@ -186,14 +179,9 @@ def make_presses(presses: int = 300) -> tuple[PressFeatures, np.ndarray]:
 def test_scaler_standardizes_features_and_positions() -> None:
     inputs, places = make_presses()
     scaling, _ = FeatureScaler.fit(inputs, places)
-    for fibre in range(FIBRES):
-        own = inputs.windows[inputs.fibre_mask[:, fibre], fibre]
-        variance = own.var(axis=0)
-        np.testing.assert_allclose(scaling.mean_v[fibre], own.mean(axis=0))
-        np.testing.assert_allclose(scaling.scale_v[fibre], np.sqrt(np.sqrt(variance) * np.sqrt(variance.mean())))
-    scaled, expected = scaling.transform(inputs), (inputs.windows[1] - scaling.mean_v) / scaling.scale_v
-    np.testing.assert_allclose(scaled.inputs[1], expected, rtol=1e-5, atol=1e-6)
-    np.testing.assert_array_equal(scaled.fibre_mask, inputs.fibre_mask)
+    own = inputs.windows[inputs.fibre_mask[:, 2], 2]
+    np.testing.assert_allclose(scaling.mean_v[2], own.mean(axis=0))
+    np.testing.assert_allclose(scaling.scale_v[2], np.sqrt(own.std(axis=0) * np.sqrt(own.var(axis=0).mean())))
     for sign in (1, -1):  # what lies far off is held
         assert (scaling.scale(sign * np.full((1, FIBRES, WINDOWS), 1e9)) == sign * MAX_INPUT).all()
     places[:4] = [[-20, 0], [30, 10], [30, 0], [5, 5]]

@@ -261,18 +261,6 @@ def test_recalibrate_keeps_an_unchanged_pad(localizer: LocalizerModel, recording
     assert error(now, recording, LATER) < 1.03 * error(localizer, recording, LATER)
 
 
-def test_refit_expects_of_later_presses_the_misfit_of_those_left_out(
-    localizer: LocalizerModel, recording: Recording, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Of a pad cast again: presses in the fit of its response misfit less, and all others would look like another's."""
-    monkeypatch.setattr(training, "RETRAINING_STEPS", 1)
-    other = simulate(Morphology.from_dict(recording.source["morphology"]), RigSettings(presses=150, seed=2))
-    few = localizer.raw_features(other)[NEW], other.presses_mm[NEW], {}
-    now, _ = recalibration.refit(localizer, *few, plan=None, seed=0, only_last=True)
-    misfits = single_press.find_misfits(now.single_press, now.scaled_features(other)[60:])
-    assert misfits.mean(axis=0)[0] < 0  # in standard deviations of those left out, which are a little too large
-
-
 def test_fit_correction_recovers_gains_and_pose(localizer: LocalizerModel, recording: Recording) -> None:
     scaling, gains, shift = localizer.scaler, np.array([1.2, 0.8, 1.1, 0.9]), np.array([0.06, -0.08])
     turn = 1.02 * np.array([[np.cos(0.05), -np.sin(0.05)], [np.sin(0.05), np.cos(0.05)]])

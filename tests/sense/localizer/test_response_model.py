@@ -225,22 +225,6 @@ one_process = patch.multiple(response_process, SNR_NEW=(30.0,), KERNELS=((1.0, 0
 """A single process, so that fits without a press have the same one."""
 
 
-def test_fit_response_finds_the_weights_of_its_maps(positions: np.ndarray) -> None:
-    """Of twelve maps and noise of a fiftieth, forty presses leave a tenth of the response unexplained at most."""
-    rng, maps = np.random.default_rng(1), make_maps(12, seed=2)
-    truth = np.einsum("xycj,cjf->xycf", maps, rng.standard_normal((N_FIBRES, 12, N_WINDOWS)))
-    windows = interpolate_grid(truth, positions)
-    windows += 0.02 * windows.std() * rng.standard_normal(windows.shape)
-    valid = np.ones((N_PRESSES, N_FIBRES), bool)
-    fit = fit_response(positions, windows, valid, ResponsePrior(maps))
-    assert (fit.table - truth).std() < 0.1 * truth.std()
-    assert fit.is_new.all()
-    # Presses of twice the depth respond twice as much.
-    depth = np.linspace(0.5, 2, N_PRESSES)
-    deep = fit_response(positions, depth[:, None, None] * windows, valid, ResponsePrior(maps), depth)
-    assert (deep.table - truth).std() < 0.1 * truth.std()
-
-
 @one_process
 def test_fit_response_is_the_posterior_mean_and_its_leverages_leave_presses_out(positions: np.ndarray) -> None:
     rng, maps = np.random.default_rng(3), make_maps(2, seed=4)

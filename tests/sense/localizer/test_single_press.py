@@ -7,7 +7,7 @@ import pytest
 
 from padforge.design import Morphology
 from padforge.sense import Recording
-from padforge.sense.arrays import Array, Floats, Indices
+from padforge.sense.arrays import Indices
 from padforge.sense.localizer.features import MODULATED, compute_features
 from padforge.sense.localizer.model import UNIFORM, LocalizerModel
 from padforge.sense.localizer.moments import N_PRESS_WINDOWS, N_TIMED, complete_at
@@ -115,23 +115,6 @@ def test_stronger_presses_and_failed_fibres_are_no_second_finger(trained: Traine
         early = np.tile(np.arange(N_TIMED) < n_complete, (100, 1))
         assert not find_unlike(trained.tests, replace(two, complete=early)).any()
     assert not find_unlike(trained.tests, replace(two, fibre_mask=np.zeros_like(two.fibre_mask))).any()
-
-
-def test_expected_responses_fit_and_two_of_them_do_not(trained: Trained) -> None:
-    """Of one discriminant of features, the closed form is exact."""
-    test = trained.tests[-1]
-    near, far = 0, len(test.positions) - 1
-    ones = np.ones((3, test.expected.shape[1]), bool)
-
-    def inputs(discriminants: Array) -> Floats:
-        pinv = np.linalg.pinv(test.projection)  # (C, D, F)
-        return np.einsum("qcd,cdf->qcf", discriminants - test.offset, pinv).astype(np.float32)
-
-    single = inputs(np.stack([test.expected[near], 1.3 * test.expected[far], 0.4 * test.expected[near]]))
-    assert not test.is_unlike(single, ones).any()
-    assert (test.misfits(single, ones)[:, 0] < -3).all()
-    both = inputs(np.stack([test.expected[near] + test.expected[far]] * 3))
-    assert test.is_unlike(both, ones).all()
 
 
 def test_pads_cast_again_are_other_pads_unless_presses_are_few(trained: Trained, others: list[Recording]) -> None:

@@ -164,17 +164,11 @@ def test_train_members_trains_a_network_for_each_phase(n_timed: int, members: in
     table = rng.standard_normal((5, 5, 2, N_FEATURES)).astype(np.float32)
     positions = rng.uniform(-1, 1, (40, 2))
     presses = training_presses(np.zeros((40, 2, N_FEATURES)), np.ones((40, 2), bool), positions, n_timed)
-    options = Options(hidden=8, layers=1, epochs=3, batch=16, members=members)
-    totals: dict[str, set[int]] = {}
-
-    def show(done: int, total: int, what: str) -> None:
-        totals.setdefault(what, set()).add(total)
-
+    options, show = Options(hidden=8, layers=1, epochs=3, batch=16, members=members), Mock()
     trained = training.train_members(presses, table, options, rng, show)
     phases = PHASES[n_timed]
     lengths = [phase.length for phase in phases.values()] + [RESIDUAL_PHASE.length] * (members > 1)
-    assert totals.pop("") == {sum(round(3 * training.MIN_BATCHES * length) for length in lengths)}
-    assert list(totals) == ["Bayesian localizer"] * (members > 1)
+    assert show.call_args.args[1:] == (sum(round(3 * training.MIN_BATCHES * length) for length in lengths), "")
     assert list(trained.networks) == list(phases)
     for weights in trained.networks.values():
         assert weights["first.w"].shape == (max(1, members - 1), 2 * (N_FEATURES + 1) + n_timed, 8)

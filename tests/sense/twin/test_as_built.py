@@ -10,20 +10,20 @@ from padforge.design import Contact, Morphology, signals
 from padforge.design.layer import Base
 from padforge.design.twin import PlanTransform
 from padforge.sense import Recording, RigSettings, simulate
+from padforge.sense.localizer.features import PressFeatures
 from padforge.sense.simulation.built_pad import build_pad
 from padforge.sense.simulation.pad_model import SUPPLY_V, Cycle, resistance_changes
-from padforge.sense.twin import as_built
-from padforge.sense.twin.as_built import N_CHANNEL, N_OFFSET, N_SHARED, OFFSET, SENSITIVITY, AsBuiltPad, PadPlan
+from padforge.sense.twin import as_built, press_parts
+from padforge.sense.twin.as_built import N_SHARED, OFFSET, SENSITIVITY, AsBuiltPad, PadPlan
 from padforge.sense.twin.contact_fit import fit_contact
-from padforge.sense.twin.fitting import Priors, estimate_scatter, fit_as_built
+from padforge.sense.twin.fitting import Priors, estimate_scatter, fit_as_built, gain_wander
 from padforge.sense.twin.press_parts import SeparatedPresses, part_kernels, separate_parts
-from padforge.sense.twin.responses import Responses, compute_responses, fit_gps, select_one_depth
-from padforge.sense.twin.wiring import Wiring, as_stated, find_wirings, images, planned_paths_mm
-from tests.sense.conftest import few_candidates
+from padforge.sense.twin.responses import Responses, select_one_depth
+from padforge.sense.twin.wiring import Wiring, images, planned_paths_mm
+from tests.sense.conftest import first_presses
 
 from .conftest import PLAN, simulate_responses
 
-F, J, K, STEP = 60, 7, 6, 0.25
 POSITIONS_MM = np.random.default_rng(2).uniform(-10, 10, (40, 2))
 
 
@@ -45,77 +45,6 @@ def test_jacobian_agrees_with_differences(pad):
             columns = np.concatenate([np.arange(N_SHARED), as_built.channel_indices(channel)])
             derivative = jacobians[channel][:, columns == index].sum(axis=1)
             assert slope[:, channel] == pytest.approx(derivative, abs=1e-6)
-
-
-def test_other_values_scale_the_profile_to_one_keep_predictions_and_are_fitted(pad):
-    values = pad.values.copy()
-    values[4:N_SHARED] *= 3
-    scaled = pad.with_values(values)
-    assert np.abs(scaled.profile(np.linspace(0, scaled.max_distance, 101))[0]).max() == pytest.approx(1)
-    assert scaled.predict(POSITIONS_MM) == pytest.approx(replace(pad, values=values).predict(POSITIONS_MM))
-    # gains and rests are recovered
-    responses = Responses(POSITIONS_MM, pad.predict(POSITIONS_MM), np.ones((40, 3), bool))
-    values = pad.values.copy()
-    values[N_SHARED:].reshape(-1, N_CHANNEL)[:, :2] = [1.0, 0.0]
-    fitted = replace(pad, values=values).fit_gains(responses)
-    assert fitted.channel_values[:, :2] == pytest.approx(pad.channel_values[:, :2])
-
-
-def test_align_transform_moves_common_offsets_into_the_transform(pad):
-    values = pad.values.copy()
-    values[N_SHARED:].reshape(-1, N_CHANNEL)[:, OFFSET] = np.repeat([0.2, -0.1], N_OFFSET)
-    shifted = replace(pad, values=values)
-    aligned = shifted.align_transform()
-    assert np.abs(aligned.channel_values[:, OFFSET]).max() < 1e-6
-    assert aligned.predict(POSITIONS_MM) == pytest.approx(shifted.predict(POSITIONS_MM), abs=1e-9)
-    volts = pad.predict(POSITIONS_MM)  # offsets that have a rotation in common
-    assert pad.align_transform().predict(POSITIONS_MM) == pytest.approx(volts, abs=0.02 * np.ptp(volts))
-
-
-def test_channel_response_moves_with_the_fibre_grows_with_it_and_ends_with_the_profile():
-    rng = np.random.default_rng(1)
-    x = np.linspace(0, 4, F + 1)
-    line = np.column_stack([x, 0.4 * np.sin(2 * x)])
-    step = np.diff(line, axis=0)
-    length = np.hypot(*step.T)
-    fibre: dict[str, Any] = {
-        "fibre": ((line[1:] + line[:-1]) / 2, step / length[:, None], length),
-        "lateral_offset": 0.1 * rng.standard_normal((2, J)),
-        "log_sensitivity": 0.2 * rng.standard_normal((1, J)),
-        "positions": np.column_stack([rng.uniform(0, 4, 9), rng.uniform(-1, 1, 9)]),
-        "profile": rng.standard_normal((2, K)),
-    }
-    moved = {**fibre, "lateral_offset": np.tile([[0.3], [-0.2]], J)}
-    back = {**fibre, "lateral_offset": np.zeros((2, J)), "positions": fibre["positions"] - [0.3, -0.2]}
-    assert as_built.channel_response(**moved, step=STEP)[0] == pytest.approx(
-        as_built.channel_response(**back, step=STEP)[0], abs=1e-12
-    )
-    far = {**back, "positions": np.array([[2.0, 0.4 + 0.5 + (K + 1) * STEP]])}
-    assert not any(np.any(part) for part in as_built.channel_response(**far, step=STEP))
-    # it grows with the length of a stretched fibre
-    path = np.column_stack([(np.arange(F) + 0.5) / F, np.zeros(F)])
-    elements = path, np.tile([1.0, 0.0], (F, 1)), np.full(F, 1 / F)
-    straight = {**fibre, "fibre": elements, "log_sensitivity": np.zeros((1, J))}
-    straight |= {"profile": np.ones((2, K)) * [[1.0], [0.0]], "positions": np.array([[0.5, 0.0]])}
-    stretched = {**straight, "lateral_offset": np.vstack([0.1 * (np.arange(J) - 1) / (J - 3), np.zeros(J)])}
-    plain = {**straight, "lateral_offset": np.zeros((2, J))}
-    # within one step of the press all splines of weight 1 add up to 1, so the response is the length
-    assert as_built.channel_response(**plain, step=2.0)[0][0] == pytest.approx(1.0)
-    assert as_built.channel_response(**stretched, step=2.0)[0][0] == pytest.approx(1.1)
-
-
-@pytest.mark.slow  # the quick tests of `identify` find wirings, too
-@few_candidates()
-def test_find_wirings_puts_the_true_one_first(printed, responses) -> None:
-    """Though readings are missing, and what stands in their place is nonsense."""
-    volts, valid = responses.volts.copy(), responses.valid.copy()
-    volts[::3, 0], valid[::3, 0] = 5.0, False
-    responses = Responses(responses.positions_mm, volts, valid)
-    best = find_wirings(PadPlan.from_morphology(PLAN), responses, np.random.default_rng(0))[0]
-    assert best.fibres == tuple(channel.fibre for channel in printed.channels if channel.fibre is not None)
-    assert best.transform.mirrored
-    assert np.hypot(*np.subtract(best.transform.shift_mm, printed.frame.shift_mm)) < 1.0
-    assert best.match > 0.9
 
 
 @pytest.mark.parametrize(
@@ -150,24 +79,6 @@ def test_planned_paths_lie_under_the_arm_where_the_transform_takes_them_to_the_p
     np.testing.assert_allclose(on_plan, expected, atol=1e-9)
 
 
-def test_the_stated_wiring_reads_fibres_in_order_of_a_pad_in_the_middle_of_what_was_pressed(responses) -> None:
-    elsewhere = replace(responses, positions_mm=responses.positions_mm + np.array([200.0, -100.0]))
-    wiring = as_stated(np.array([0, 2, 3]), elsewhere, 11.25)
-    assert wiring.fibres == (0, 2, 3)
-    assert np.abs(wiring.transform.to_plan(elsewhere.positions_mm).mean(axis=0)).max() < 3
-    assert as_stated(np.array([1]), responses, 11.25).transform == PlanTransform()
-
-
-def test_response_is_the_held_level_minus_the_rest() -> None:
-    """Readings of 2 V at rest, of 5 V while the tip comes to rest, and of 3 V then."""
-    recording = simulate(Morphology.straight(2), RigSettings(presses=80, seed=0))
-    readings = np.full_like(recording.readings, 2.0)
-    for down, up in zip(recording.down_command, recording.up_command, strict=True):
-        readings[down : down + 4], readings[down + 4 : up] = 5.0, 3.0
-    responses = compute_responses(replace(recording, readings=readings), np.arange(80) < 60)
-    np.testing.assert_allclose(responses.volts, 1.0, atol=0.02)  # of which history takes a little
-
-
 def test_select_one_depth_keeps_the_most_common_and_all_of_unknown_depth() -> None:
     recording = simulate(
         Morphology.straight(2), RigSettings(presses=9, depths_mm=(0.5, 3.0, 5.0)), Contact(model="profile")
@@ -177,23 +88,6 @@ def test_select_one_depth_keeps_the_most_common_and_all_of_unknown_depth() -> No
     unknown = replace(recording, depths_mm=np.full(9, np.nan))
     assert select_one_depth(unknown) is unknown
     assert select_one_depth(replace(recording, depths_mm=np.linspace(4.7, 5.3, 9))).has_position.all()
-
-
-def test_fit_gps_separate_noise_from_a_function_of_position_and_ignore_invalid_responses():
-    positions_mm = np.random.default_rng(0).uniform(-20, 20, (500, 2))
-    noise = np.random.default_rng(1).standard_normal((500, 2))
-    function = 3 * np.sin(positions_mm[:, 0] / 9) + np.cos(positions_mm[:, 1] / 7)
-    volts = np.column_stack([function + 0.2 * noise[:, 0], noise[:, 1]])
-    smooth, noisy = fit_gps(Responses(positions_mm, volts, np.ones((500, 2), bool)), 10)
-    assert (smooth.noise_v, noisy.noise_v) == pytest.approx((0.2, 1.0), rel=0.12)
-    assert smooth.log_bayes_factor > 100
-    assert noisy.log_bayes_factor < 5
-    assert smooth.predict(positions_mm / 10) == pytest.approx(function, abs=0.3)
-    valid = np.column_stack([np.arange(500) % 2 == 1, np.arange(500) < 9])
-    smooth, unknown = fit_gps(Responses(positions_mm, np.where(valid, volts, 1e6), valid), 10)
-    assert smooth.noise_v == pytest.approx(0.2, rel=0.15)
-    assert np.isnan(unknown.noise_v)
-    assert not unknown.predict(positions_mm / 10).any()
 
 
 PAD = Morphology.random(2, knots=3, seed=5)
@@ -315,6 +209,37 @@ def test_estimate_scatter_recovers_share_common_and_floor(printed, fitted, share
     assert scatter.floor * noise_v.mean() == pytest.approx(floor * full_scale, rel=0.35, abs=0.25 * noise_v.mean())
     if share:
         assert scatter.common == pytest.approx(common, abs=0.15)
+
+
+def test_gains_wander_by_their_deviation_between_blocks_beyond_chance(pad: AsBuiltPad) -> None:
+    """Of 0.9, 1 and 1.1; and of noise alone, of which nothing is left."""
+    positions_mm, rest = np.tile(POSITIONS_MM, (20, 1))[:750], pad.channel_values[:, 1]
+    responses = pad.predict(positions_mm) - rest
+    volts, all_valid = rest + np.repeat([0.9, 1.0, 1.1], 250)[:, None] * responses, np.ones(responses.shape, bool)
+    assert gain_wander(pad, Responses(positions_mm, volts, all_valid)) == pytest.approx(0.1)
+    noise = 0.3 * responses.std() * np.random.default_rng(0).standard_normal(responses.shape)
+    assert gain_wander(pad, Responses(positions_mm, rest + responses + noise, all_valid)) < 0.015
+    assert gain_wander(pad, Responses(positions_mm, volts, all_valid).select(np.arange(499))) == 0
+
+
+def test_parts_learn_nothing_from_what_presses_held_out_read(monkeypatch: pytest.MonkeyPatch) -> None:
+    """But for the time of the touch, which is no part, and those presses' own parts."""
+    first = first_presses(simulate(PAD, RIG.model_copy(update={"presses": 160})), 150)
+    training = np.arange(150) % 5 != 0
+    plain, compute = separate_parts(first, training, 20.0), press_parts.compute_features
+
+    def spoil(readings: np.ndarray, *commands: Any) -> PressFeatures:
+        features = compute(readings, *commands)
+        if len(features) == len(training):  # not those of kernels
+            features.windows[~training] = 99.0
+        return features
+
+    monkeypatch.setattr(press_parts, "compute_features", spoil)
+    spoilt = separate_parts(first, training, 20.0)
+    for part, other in zip((*plain.parts, plain.pressed), (*spoilt.parts, spoilt.pressed), strict=True):
+        np.testing.assert_array_equal(other.volts[training], part.volts[training])
+        assert not np.array_equal(other.volts, part.volts)
+    assert spoilt.rig | {"touch_s": 0} == plain.rig | {"touch_s": 0}
 
 
 def press(contact: Contact, transform: PlanTransform, presses: int) -> Responses:
