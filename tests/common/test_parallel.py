@@ -14,16 +14,6 @@ from padforge.common.parallel import cluster, makespan, one_thread, run_tasks
 from padforge.common.validation import Fault
 
 
-@pytest.mark.parametrize("threads", [None, 1, 3])
-def test_run_tasks_yields_results_by_key_and_raises_errors(threads):
-    tasks = [(number, partial(pow, number, 2)) for number in range(20)]
-    pool = ThreadPoolExecutor(threads) if threads else None
-    assert dict(run_tasks(tasks, pool)) == {number: number**2 for number in range(20)}
-    assert dict(run_tasks([], pool)) == {}
-    with pytest.raises(ZeroDivisionError):
-        list(run_tasks([("a", partial(pow, 0, -1)), ("b", partial(pow, 1, 2))], pool))
-
-
 @pytest.mark.parametrize(
     ("parts", "workers", "expected"),
     [([3, 3, 2], 1, 8), ([3, 3, 2], 2, 5), ([3, 3, 2], 3, 3), ([3, 3, 2], 8, 3), ([4, 2, 1, 1], 2, 4)],

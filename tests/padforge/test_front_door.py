@@ -72,6 +72,7 @@ WHOLE = [[-40, -40], [40, -40], [40, 40], [-40, 40]]  # a keep-out
         ("", "fabricate pad.toml", "pad.toml: no morphology, allowed are a .json and a published .mat"),
         ("", "fabricate check pad.csv", "allowed are a mesh .stl or .3mf, a morphology .json or .mat"),
         ("", "report none", "none"),
+        ("", "report .", ".: no design.json, fabrication.json, calibration.json or study to report on"),
         ("", "design --start-from wavy", "--start-from is wavy, allowed are random, straight and a .json or .mat"),
         ("", "run --formats stl,obj", "Invalid value for '--formats': got 'obj', allowed are stl, 3mf"),
         ("", "run --time-budget nan", "Invalid value for '--time-budget': got 'nan', expected a finite number"),

@@ -7,13 +7,12 @@ import numpy as np
 import pytest
 
 from padforge.common import profiling
-from padforge.design import Morphology
-from padforge.design.optimize.search import SearchOptions, search
+from padforge.design import Morphology, SearchOptions, search
 from padforge.design.settings import PUBLISHED_CONTACT, PadSettings, RulesSettings, SearchSettings
 from padforge.fabricate import build
 
 
-def test_stages_of_other_threads_count_for_main_thread(monkeypatch):
+def test_stages_are_those_of_the_main_thread_and_end_with_an_error(monkeypatch):
     now = [0.0]
     monkeypatch.setattr(profiling.time, "perf_counter", lambda: now[0])
 
@@ -27,9 +26,6 @@ def test_stages_of_other_threads_count_for_main_thread(monkeypatch):
         thread.join()
     assert "aside" not in profile.seconds
     assert profile.seconds["main"] == 3
-
-
-def test_failing_stage_ends_profile():
     finders = list(sys.meta_path)
     with pytest.raises(ValueError, match="on purpose"), profiling.profiled() as profile, profiling.stage("failing"):
         raise ValueError("on purpose")
