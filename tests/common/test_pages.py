@@ -145,7 +145,7 @@ def test_pages_escape_all_but_their_own_elements(tmp_path: Path, golden: Golden)
     Image.new("RGB", (3, 2)).save(tmp_path / "a.png")
     (tmp_path / "b.svg").write_text("<svg/>")
     rows = [
-        ["1e-05", "1.5 mm", "pass", "short", "w" * 31, "many short words in a line"],
+        ["1e-05", "1.5 mm", "pass", "sixteen letters.", "w" * 31, "seventeen letters"],
         [-2.34567, "-", "warn", None, True, ""],
         [12, "3 %", "fail", False, "<i>", "x"],
     ]

@@ -42,6 +42,8 @@ def test_run_tasks_follows_up_and_yields_as_completed_within_max_parallel():
     found = [key for key, _ in run_tasks([(key, partial(counted, work)) for key, work in tasks], max_parallel=2)]
     assert found[0] == "quick"
     assert most == 2
+    with pytest.raises(ZeroDivisionError):
+        list(run_tasks([("a", partial(pow, 0, -1))]))
 
 
 def test_run_tasks_starts_nothing_after_an_exception_and_does_not_wait():

@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 
 from padforge.common import profiling
-from padforge.design import Morphology, SearchOptions, search
+from padforge.design import SearchOptions, search
 from padforge.design.settings import PUBLISHED_CONTACT, PadSettings, RulesSettings, SearchSettings
-from padforge.fabricate import build
 
 
 def test_stages_are_those_of_the_main_thread_and_end_with_an_error(monkeypatch):
@@ -49,11 +48,3 @@ def test_finished_starts_are_not_repeated(tmp_path, monkeypatch):
     assert not heard
     assert profile.counts["starts"] == [0, 2]
     np.testing.assert_array_equal(first.morphology.knots, again.morphology.knots)
-
-
-def test_only_requested_formats_are_written(tmp_path):
-    with profiling.profiled() as profile:
-        build(Morphology.straight(1), tmp_path, ("svg", "dxf"))
-    assert profile.counts["formats"] == [2, 7]
-    assert {"write tracks.svg", "write tracks.dxf"} <= set(profile.seconds)
-    assert not {"CAD solid", "write mould.stl"} & set(profile.seconds)

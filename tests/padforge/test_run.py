@@ -123,6 +123,7 @@ def test_resume_repeats_stages_of_changed_settings(folder: Path, monkeypatch: py
             ]
             for name, result in as_before.items():
                 monkeypatch.setattr(f"padforge.{name}", lambda *ask, make=result, **_: asked.append(ask) or make())
+    assert resumed(folder, "--formats", "stl") == "design, recording, contacts, calibration"
     asked.clear()
     assert resumed(folder, "--seed", "7") == ""
     design, _, recording, contacts, calibration = asked
@@ -273,7 +274,7 @@ def test_report_is_deterministic(folder: Path, monkeypatch: pytest.MonkeyPatch) 
     pages = []
     for _ in range(2):
         page.unlink()
-        assert called("report", cwd=folder).code == 0
+        assert called("report", ".", cwd=page.parent).code == 0
         pages.append(page.read_bytes())
     assert pages[0] == pages[1]
-    assert b">Calibration</h2>" in pages[0]
+    assert b"<title>Pad report: pad</title>" in pages[0]

@@ -38,6 +38,7 @@ def test_written_settings(validator: jsonschema.Draft7Validator, tmp_path: Path,
         assert (ended.code, ended.out) == (0, f"settings -> {preset or 'pad'}.toml\n")
         text = (tmp_path / f"{preset or 'pad'}.toml").read_text(encoding="utf-8")
         validator.validate(tomllib.loads(text))
+        (tmp_path / f"{preset or 'pad'}.toml").write_text(text, encoding="utf-8-sig")  # as editors on Windows do
         check_settings(spec := Spec.load(tmp_path / f"{preset or 'pad'}.toml"))
         stated = resolve_name(PRESETS[preset]) if preset else {}
         for name, model in MODELS.items():

@@ -29,7 +29,7 @@ def test_every_command_refuses_sections_that_contradict_each_other(tmp_path: Pat
     for text in CONTRADICTIONS:
         (tmp_path / "pad.toml").write_text(text)
         commands = ("design check morphology.json", "fabricate check morphology.json", "run")
-        said = {refused(*command.split(), cwd=tmp_path) for command in commands}
+        said = dict.fromkeys(refused(*command.split(), cwd=tmp_path) for command in commands)
         lines += [" ".join(text.split()), *(f"  {line.strip()}" for line in said)]
     golden("padforge/contradictions.txt", "\n".join(lines))
 

@@ -66,7 +66,7 @@ INVALID = (
 )
 
 
-def test_save_does_not_replace_what_another_program_wrote_since(tmp_path):
+def test_save_replaces_neither_what_another_program_wrote_since_nor_a_pad_with_a_mould(tmp_path):
     """Into the file that lay there from the beginning, and into the one saved last."""
     Morphology.straight(1).save(tmp_path / "out.json")
     editor, _ = session(tmp_path, grid=1)
@@ -79,9 +79,7 @@ def test_save_does_not_replace_what_another_program_wrote_since(tmp_path):
         assert (editor.out.name, Morphology.load(other)) == (name, foreign)
         editor.save(b"{}")
         assert editor.out.name == name
-
-
-def test_save_does_not_replace_pad_with_mould(tmp_path):
+    tmp_path = tmp_path / "other"
     editor, _ = session(tmp_path, Morphology.straight(2))
     read = sha256(tmp_path / "pad.json")
     Morphology.random(2, 3, 3).save(tmp_path / "pad.json")  # what was read counts

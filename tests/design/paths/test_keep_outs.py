@@ -66,6 +66,10 @@ def test_bend_radius_on_a_cylinder_matches_curves_in_space():
     found, place = bend_radius(points, angle, window, rolled_turns(points, angle, cylinder))
     assert found == pytest.approx(1 / np.hypot(1 / r, 1 / cylinder), rel=1e-3)
     assert place == pytest.approx((0, 0), abs=0.05)
+    rules, pad = only(min_mean_bend_radius_mm=10.0), Morphology.straight(Layout.create((3, 2), (8.0, 15.0)))
+    assert check_rules(pad, rules, PadSettings(bent_radius_mm=10.5)) == []
+    broken = check_rules(pad, rules, PadSettings(bent_radius_mm=9.0))
+    assert [(v.fibres, v.measured) for v in broken] == [((fibre,), pytest.approx(9)) for fibre in (1, 2, 3)]
 
 
 def test_fibres_are_back_at_their_levels_after_a_keep_out_by_the_wall():

@@ -17,12 +17,6 @@ from tests.helpers.less import blank_pictures
 from tests.padforge.report.conftest import HOSTILE, design_document, study_document, written
 
 
-def test_report_loads_nothing_external(page: Path) -> None:
-    text = page.read_text()
-    assert "http://" not in text
-    assert "https://" not in text
-
-
 def test_text_from_files_is_escaped(pad: Path) -> None:
     design, mould, study = design_document(), json.loads((pad / "fabrication.json").read_text()), study_document()
     design["violations"] = [{"rule": HOSTILE, "fibres": [HOSTILE], "measured": 1, "limit": 2, "place_mm": None}]
