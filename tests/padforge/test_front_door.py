@@ -100,11 +100,11 @@ def test_mistakes_are_refused_in_one_line(tmp_path: Path, settings: str, words: 
 
 
 def test_missing_library_is_told_with_the_extra_of_the_command(tmp_path: Path, golden, monkeypatch) -> None:
+    (tmp_path / "out" / "pad").mkdir(parents=True)
     lines = []
     for word, command in cli.commands.items():
         monkeypatch.setattr(command, "callback", Mock(side_effect=ModuleNotFoundError(name="matplotlib")))
-        ended = called(word, *list(getattr(command, "commands", ()))[:1], cwd=tmp_path)
-        lines.append(f"{word}: {ended.err}")
+        lines.append(f"{word}: {called(word, *list(getattr(command, 'commands', ()))[:1], cwd=tmp_path).err}")
     golden("padforge/missing_library.txt", "".join(lines))
 
 

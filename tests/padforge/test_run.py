@@ -217,9 +217,8 @@ def test_run_exits_1_on_a_failed_check_or_a_broken_rule_and_writes_all_neverthel
 
     assert ended("[mould]\nfloor_mm = 2.05\n", "warn layers: ") == 0
     assert ended("[printer]\nbed_mm = [30, 30, 30]\n", "FAIL bed: ") == 1
-    broken = Violation("max_length_mm", (1,), 600.0, 500.0)
-    patched = "padforge.design.design_run.load_result"
-    monkeypatch.setattr(patched, lambda out: replace(load_result(out), violations=[broken]))
+    broken = replace(load_result(folder / "out" / "pad"), violations=[Violation("max_length_mm", (1,), 600.0, 500.0)])
+    monkeypatch.setattr("padforge.design.design_run.load_result", lambda _: broken)
     assert ended("", "broken: max_length_mm: fibre 1: ") == 1
 
 
