@@ -253,7 +253,8 @@ def _run(command: click.Command, name: str, extras: Mapping[str, str]) -> int:
     except OSError as error:
         return _fail(name, f"{error.filename}: {error.strerror}" if error.filename else str(error))
     except ModuleNotFoundError as error:
-        message = missing_extra(error, extras.get("".join(sys.argv[1:2]), ",".join(dict.fromkeys(extras.values()))))
+        every = ",".join(dict.fromkeys(",".join(extras.values()).split(",")))
+        message = missing_extra(error, extras.get("".join(sys.argv[1:2]), every))
         if message is None:
             raise
         return _fail(name, message)

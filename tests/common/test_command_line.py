@@ -7,6 +7,7 @@ import pytest
 
 from padforge.common import command_line
 from padforge.common.validation import InputError
+from padforge.design.cli import search_progress
 
 _log = logging.getLogger("padforge.sense.somewhere")
 
@@ -15,11 +16,13 @@ _log = logging.getLogger("padforge.sense.somewhere")
 @click.option("--bar", is_flag=True)
 def log(bar: bool) -> None:
     if bar:
-        with command_line.progress() as progress:
-            progress.add_task("training", total=2, note="1 of 2")
-            progress.refresh()
+        with command_line.progress_bar("training") as training:
+            training(1, 0, "begun")
             _log.warning("a warning")
-            progress.refresh()
+            training(1, 2, "error 3 mm")
+        with search_progress() as search:
+            for done, start in ((20, 1), (10, 2), (40, 1)):
+                search(done, 40, f"start {start}: objective 0.{done}, best 0.1")
     else:
         _log.info("a note of 100 %")
         _log.debug("for debugging")
@@ -37,9 +40,11 @@ def test_log_records_are_plain_lines_and_above_a_progress_bar_lines_of_their_own
     for name, value in {"FORCE_COLOR": "1", "TERM": "xterm", "COLUMNS": "80"}.items():
         monkeypatch.setenv(name, value)
     assert run(monkeypatch, "--bar") == 0
-    lines = re.sub(r"\x1b\[[0-9;?]*[a-zA-Z]", "", capsys.readouterr().err).replace("\r", "\n").split("\n")
-    assert "a warning" in lines
-    assert [line for line in lines if line.startswith("training")]
+    shown = re.sub(r"\x1b\[[0-9;?]*[a-zA-Z]", "", capsys.readouterr().err).replace("\r", "\n")
+    bars = {line.rpartition(" ")[0].rstrip() for line in re.sub("[━╸╺]+", "-", shown).split("\n")}
+    starts = (f"start {start}      - objective 0.{done}, best 0.1" for start, done in ((1, 40), (2, 10)))
+    assert bars >= {"training     - 1 of 2  error 3 mm", *starts}, shown
+    assert "\na warning\n" in shown
 
 
 def test_text_table_aligns_text_to_the_left_and_numbers_to_the_right() -> None:
@@ -96,20 +101,3 @@ def test_texts_of_files_feign_no_lines(monkeypatch: pytest.MonkeyPatch, capsys: 
     assert command_line.run_to_end(show, "padforge", {}) == 0
     line = r"µ\x1b[2K\nall fibres sound" + "\n"
     assert capsys.readouterr() == (f"{line}{line}next\n", line * 2)
-
-
-def test_help_lists_a_command_a_line_under_its_heading() -> None:
-    """However narrow the terminal is, and in the order in which they were added."""
-    group = command_line.SectionedGroup()
-    told = "Say in many words what this one does, so that no terminal has room for all of them on a line of its own."
-    headings = {"zeta": "First", "alpha-and-more": "Second", "beta": "First"}
-    for name, heading in headings.items():
-        group.add_command(click.Command(name, help=told), heading=heading)
-    for width in (60, 80):
-        formatter = click.HelpFormatter(width=width)
-        group.format_commands(click.Context(group), formatter)
-        lines = [line for line in formatter.getvalue().splitlines() if line]
-        assert [line.split()[0] for line in lines] == ["First:", "zeta", "beta", "Second:", "alpha-and-more"]
-        assert {line.index("Say") for line in lines if "Say" in line} == {2 + len("alpha-and-more") + 2}
-        assert all(len(line) <= width for line in lines)
-        assert all(line.endswith("...") for line in lines if "Say" in line)

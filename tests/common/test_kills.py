@@ -52,13 +52,6 @@ def test_atomic_files_after_a_kill_at_any_operation(tmp_path: Path) -> None:
     assert results == sorted(results, key=["old", "refused", "new"].index)
 
 
-def test_atomic_file_after_a_kill_at_any_operation(tmp_path: Path) -> None:
-    folders = after_kills(lambda folder: files.write_text(folder / "set.json", "new"), make_set, tmp_path)
-    results = [(folder / "set.json").read_text() for folder in folders]
-    assert results == sorted(results, reverse=True)
-    assert {*results} == {"old", "new"}
-
-
 def work(folder: Path) -> None:
     """A search that keeps its states, goes on from them, and comes to its end."""
     kept = Checkpoints(folder, {"search": {"seed": 1}})

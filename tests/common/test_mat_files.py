@@ -74,24 +74,17 @@ def test_morphology_refuses_samples_not_as_published(tmp_path: Path) -> None:
             Morphology.load(path)
 
 
-def external(file: h5py.File) -> None:
-    file.create_dataset("para", (3, 8), "f8", external=[("/etc/hostname", 0, 192)])
-
-
-def virtual(file: h5py.File) -> None:
+def test_load_mat_refuses_external_and_virtual_values(tmp_path: Path) -> None:
+    newer(tmp_path / "other.h5", {"para": CONTENT["para"]})
     layout = h5py.VirtualLayout((3, 8), "f8")
     layout[:] = h5py.VirtualSource("other.h5", "para", (3, 8))
-    file.create_virtual_dataset("para", layout)
-
-
-def linked(file: h5py.File) -> None:
-    file["para"] = h5py.ExternalLink("other.h5", "para")
-
-
-@pytest.mark.parametrize("spoil", [external, virtual, linked])
-def test_load_mat_refuses_external_and_virtual_values(tmp_path: Path, spoil: Callable) -> None:
-    newer(tmp_path / "other.h5", {"para": CONTENT["para"]})
-    with h5py.File(newer(tmp_path / "new.mat", {"K": {"object_size": 0.6}}), "a") as file:
-        spoil(file)
-    with pytest.raises(InputError, match=r"new\.mat: has no variable para"):
-        Morphology.load(tmp_path / "new.mat")
+    spoils: tuple[Callable[[h5py.File], object], ...] = (
+        lambda file: file.create_dataset("para", (3, 8), "f8", external=[("/etc/hostname", 0, 192)]),
+        lambda file: file.create_virtual_dataset("para", layout),
+        lambda file: file.__setitem__("para", h5py.ExternalLink("other.h5", "para")),
+    )
+    for spoil in spoils:
+        with h5py.File(newer(tmp_path / "new.mat", {"K": {"object_size": 0.6}}), "a") as file:
+            spoil(file)
+        with pytest.raises(InputError, match=r"new\.mat: has no variable para"):
+            Morphology.load(tmp_path / "new.mat")

@@ -1,18 +1,24 @@
+import errno
 import json
 import re
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, closing
 from functools import partial
 from http.client import HTTPConnection, HTTPResponse
+from pathlib import Path
 from typing import Any
 
 import pytest
+from PIL import Image
 
-from padforge.common.page import PageSection, render_markdown, table
-from padforge.common.page import page as whole_page
+from padforge.common import page as page_elements
+from padforge.common.page import PageSection
 from padforge.common.server import HOST, LocalPage
 from padforge.common.validation import InputError
+from tests.helpers.golden import Golden
+from tests.helpers.refusals import refusal_table
 
+FORGET = r"(?<=sha256-)[^']*", '(?<=base64,)[^"]*'
 PAGE = "<!doctype html><title>x</title><style>p { margin: 0 }</style><script>1</script>"
 
 
@@ -92,9 +98,18 @@ def test_token_is_required_under_any_host_name() -> None:
         assert asked("/") == asked("/events") == asked("/?token=") == asked("/?token=known+to+few") == 403
         assert asked("/?token=known+to+few+%26+all") == asked("/", Authorization=f"Bearer {token}") == 200
         assert asked("/", Authorization="Bearer another") == 403
-    for host, token in (("0.0.0.0", ""), ("::", ""), ("", ""), ("0.0.0.0", "short")):
-        with pytest.raises(InputError, match="token"):
-            LocalPage(0, PAGE, {}, host=host, token=token)
+
+
+def test_refusals_of_servers(golden: Golden, monkeypatch: pytest.MonkeyPatch) -> None:
+    def forbidden(*_: object) -> None:
+        raise OSError(errno.EACCES, "denied")
+
+    hosts = ("0.0.0.0", ""), ("::", ""), ("", ""), ("0.0.0.0", "short"), ("192.0.2.1", "t" * 16), (".", "t" * 16)
+    rows = {f"{host!r} {token!r}": partial(LocalPage, 0, PAGE, {}, host=host, token=token) for host, token in hosts}
+    said = refusal_table(rows)
+    monkeypatch.setattr("socket.socket.bind", forbidden)
+    said += f"\n{refusal_table({'a port of others': partial(LocalPage, 80, PAGE, {})})}"
+    golden("padforge/refusals_of_servers.txt", said, forget=[r"(?<=--token )\S+", r"(?<=machine \().*(?=\))"])
 
 
 @pytest.mark.parametrize(
@@ -125,20 +140,27 @@ def test_every_reader_gets_the_latest_view(page: LocalPage) -> None:
             assert next(line for line in stream if line.endswith(b'{"at": 1}\n'))
 
 
-def test_markdown_renders_elements_and_escapes_html():
-    rows = "| a | b |\n| --- | --- |\n| 1.5 mm | fail |"
-    steps = "1. Stir **well**.\n2. Read `x.json`."
-    head, rows, steps, end = render_markdown(f"# Title\n\n## Mix\n\n{rows}\n\n{steps}\n\nDone.")
-    assert head == "<h3>Mix</h3>"
-    assert rows == table(["a", "b"], [["1.5 mm", "fail"]])
-    assert '<td class="number">1.5 mm</td><td class="fail">fail</td>' in rows
-    assert re.sub(r"\s", "", steps) == ("<ol><li>Stir<strong>well</strong>.</li><li>Read<code>x.json</code>.</li></ol>")
-    assert end.strip() == "<p>Done.</p>"
-    (piece,) = render_markdown('<img src="x"> [a](javascript:b) ![c](http://d) &lt;')
-    assert piece.strip() == "<p>&lt;img src=&quot;x&quot;&gt; [a](javascript:b) ![c](http://d) &amp;lt;</p>"
-    text = whole_page("<b>", "&", [PageSection("A <i> b", [table(["<u>"], [["<s>"]])], [("<1>", "<2>")])])
-    assert not re.search("<[ius12]>", text)
-    assert "<title>&lt;b&gt;</title>" in text
-    assert '<a href="#a-i-b">A &lt;i&gt; b</a>' in text
-    assert '<h2 id="a-i-b">A &lt;i&gt; b</h2>' in text
-    assert '<div class="tile"><b>&lt;1&gt;</b> &lt;2&gt;</div>' in text
+def test_pages_escape_all_but_their_own_elements(tmp_path: Path, golden: Golden) -> None:
+    """Each of which is here, with a cell of every kind in a table, and a row of none."""
+    Image.new("RGB", (3, 2)).save(tmp_path / "a.png")
+    (tmp_path / "b.svg").write_text("<svg/>")
+    rows = [
+        ["1e-05", "1.5 mm", "pass", "sixteen letters.", "w" * 31, "seventeen letters"],
+        [-2.34567, "-", "warn", None, True, ""],
+        [12, "3 %", "fail", False, "<i>", "x"],
+    ]
+    steps = "1. Stir **well**.\n2. Read `x.json`.\n\n| a | b |\n| --- | --- |\n| 1.5 mm | fail |"
+    body = [
+        *page_elements.render_markdown(f"# Title\n\n## Mix\n\n{steps}\n\nDone."),
+        *page_elements.render_markdown('<img src="x"> [a](javascript:b) ![c](http://d) &lt;'),
+        page_elements.table([*"abcdef"], rows, {(0, 1): 0.25, (2, 5): 1.0}),
+        page_elements.table(["<u>"], []),
+        page_elements.columns([page_elements.paragraph("<p>")], [page_elements.heading("&")]),
+        page_elements.collapsible("<s>", [page_elements.paragraph("in it")]),
+        page_elements.figures([(tmp_path / name, f"<{name}>") for name in ("a.png", "b.svg", "none.png")]),
+        page_elements.figures([]),
+    ]
+    sections = [PageSection("A <i> b", body, [("<1>", "<2>")], "run()"), PageSection("Last", [])]
+    text = page_elements.page("<b>", "&", sections)
+    golden("padforge/elements.html", re.sub(r"(?s)<(style|script)>.*?</\1>", r"<\1/>", text), forget=FORGET)
+    assert re.findall("<script>(.*?)</script>", text)[-1] == "run()"

@@ -14,16 +14,6 @@ from padforge.common.parallel import cluster, makespan, one_thread, run_tasks
 from padforge.common.validation import Fault
 
 
-@pytest.mark.parametrize("threads", [None, 1, 3])
-def test_run_tasks_yields_results_by_key_and_raises_errors(threads):
-    tasks = [(number, partial(pow, number, 2)) for number in range(20)]
-    pool = ThreadPoolExecutor(threads) if threads else None
-    assert dict(run_tasks(tasks, pool)) == {number: number**2 for number in range(20)}
-    assert dict(run_tasks([], pool)) == {}
-    with pytest.raises(ZeroDivisionError):
-        list(run_tasks([("a", partial(pow, 0, -1)), ("b", partial(pow, 1, 2))], pool))
-
-
 @pytest.mark.parametrize(
     ("parts", "workers", "expected"),
     [([3, 3, 2], 1, 8), ([3, 3, 2], 2, 5), ([3, 3, 2], 3, 3), ([3, 3, 2], 8, 3), ([4, 2, 1, 1], 2, 4)],
@@ -52,6 +42,8 @@ def test_run_tasks_follows_up_and_yields_as_completed_within_max_parallel():
     found = [key for key, _ in run_tasks([(key, partial(counted, work)) for key, work in tasks], max_parallel=2)]
     assert found[0] == "quick"
     assert most == 2
+    with pytest.raises(ZeroDivisionError):
+        list(run_tasks([("a", partial(pow, 0, -1))]))
 
 
 def test_run_tasks_starts_nothing_after_an_exception_and_does_not_wait():

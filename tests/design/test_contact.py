@@ -3,11 +3,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from padforge.design import Contact, Morphology, indented_signals, press_forces_n, signals, signals_quantized
-from padforge.design.contact import half_width_mm
+from padforge.design import Contact, Morphology, check_rules, indented_signals, press_forces_n, signals
+from padforge.design.contact import half_width_mm, signals_quantized
 from padforge.design.contact_set import judged_contacts, served_contacts
 from padforge.design.layer import solve_press
-from padforge.design.objectives.rules import check_rules
 from padforge.design.paths.curves import crossings, lengths
 from padforge.design.settings import PUBLISHED_CONTACT, Layout, RulesSettings, SearchSettings
 from tests.helpers.golden import Golden
@@ -65,7 +64,7 @@ def test_rules_and_lengths_of_a_transposed_rectangle(pad):
 PAD = Morphology.random(2, 3, 1)
 
 
-def test_indented_signals_are_those_of_solved_contacts():
+def test_indented_signals_and_press_forces_are_those_of_solved_contacts():
     contact, presses = Contact(), np.random.default_rng(0).uniform(0.3, 2.7, (12, 2))
     full_scale = np.abs(signals(PAD, presses, contact)).max()
     depths_mm = (0.03, 1.3)
@@ -77,9 +76,6 @@ def test_indented_signals_are_those_of_solved_contacts():
     np.testing.assert_array_equal(deepest, signals(PAD, presses, contact))
     assert not indented_signals(PAD, presses, 0.0, contact).any()
     assert indented_signals(PAD, [], [], contact).shape == (0, 4)
-
-
-def test_press_forces_are_those_of_solved_contacts():
     contact, depths_mm = Contact(tool="ball", tool_radius_mm=6.0, base="slipping"), [0.02, 1.3, 4.8]
     presses = (solve_press("ball", 6.0, depth_mm, contact.thickness_mm, "slipping") for depth_mm in depths_mm)
     expected = np.reshape([0.0, *(press.force_n() for press in presses)], (2, 2))

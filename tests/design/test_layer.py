@@ -6,7 +6,7 @@ from functools import partial
 import numpy as np
 import pytest
 
-from padforge.design.contact import describe_large_strain, profile_weights
+from padforge.design.contact import FIBRE_BLUR_MM, contact_press, describe_large_strain, profile_weights
 from padforge.design.layer import solve_press
 from padforge.design.settings import Contact
 from tests.helpers.axisymmetric import press
@@ -120,6 +120,23 @@ def test_extreme_presses_are_solved(tool, radius, depth, thickness, base):
     if tool != "finger":
         shape = tool_depth(tool, radius, depth, r[:3])
         np.testing.assert_allclose(face[:3], shape, atol=0.05 * depth)
+
+
+@pytest.mark.parametrize("contact", [Contact(), Contact(tool="ball", base="slipping", squeeze=0.7, stretch=1.3)])
+def test_weights_of_elements_are_those_of_short_ones_that_are_carried_along(contact):
+    """By the silicone, which goes outward: how much longer they get, and how much flatter they are pressed."""
+    press = contact_press(contact)
+    for depth_mm, (distance, plain, directed) in zip(contact.fibre_depths_mm, profile_weights(contact), strict=True):
+        at = np.flatnonzero((distance > 0.5) & (distance < 9))[::20]
+        for angle in (0.0, 0.6, math.pi / 2):
+            way = 1e-3 * np.array([math.cos(angle), math.sin(angle)])
+            ends = np.stack([distance[at], 0 * at], axis=1) + np.array([[-1], [1]])[..., None] * way / 2
+            strains = press.strains(np.linalg.norm(ends, axis=-1), contact.thickness_mm - depth_mm, FIBRE_BLUR_MM)
+            moved = ends + 1e-3 * ends * strains.hoop[..., None]
+            longer = 1e3 * (np.linalg.norm(moved[1] - moved[0], axis=1) / 1e-3 - 1)
+            expected = contact.stretch * longer + contact.squeeze * strains.compressive.mean(axis=0)
+            found = plain[at] + directed[at] * math.cos(angle) ** 2
+            np.testing.assert_allclose(found, expected, atol=2e-3 * np.abs(plain).max())
 
 
 def test_strains_above_1_are_said_with_their_size(golden: Golden) -> None:

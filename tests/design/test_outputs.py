@@ -5,22 +5,31 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from padforge import InputError, Spec
 from padforge.common.server import page_text as served_page
-from padforge.design import Contact, Morphology, PadSettings, RulesSettings, SearchOptions, search
+from padforge.design import (
+    Contact,
+    Morphology,
+    PadSettings,
+    RulesSettings,
+    SearchOptions,
+    SearchResult,
+    draw_plan,
+    search,
+)
 from padforge.design import compare as comparison
 from padforge.design.contact_comparison import compare_contacts
 from padforge.design.design_run import load_result, summary_lines
 from padforge.design.editor import EditSession
 from padforge.design.objectives.rules import Violation
-from padforge.design.optimize.search import SearchResult
 from padforge.design.settings import SearchSettings
 from tests.design.conftest import max_distance_mm
 from tests.helpers.door import call
 from tests.helpers.folders import files_in
-from tests.helpers.golden import Golden, json_text, page_text
+from tests.helpers.golden import Golden, figure_text, json_text, page_text
 from tests.helpers.less import compare_little
 
 SETTINGS = """[pad]
@@ -40,6 +49,7 @@ horizontals = 1
 verticals = 2
 pitch_mm = [10, 12]
 [search]
+seed = 3
 starts = 2
 steps = 20
 max_failures = 1
@@ -77,7 +87,7 @@ def test_design(run, golden: Golden) -> None:
     """From a pad, which has as many knots as are searched for."""
     Path("pad.toml").write_text(SEARCH)
     Morphology.random((1, 2), 2, 1, (10.0, 12.0)).save("first.json")
-    printed = run("--seed", "3", "--start-from", "first.json")
+    printed = run("--start-from", "first.json")
     golden("design/design.txt", printed, forget=SECONDS, rtol=1e-3)
     document = document_of("out/pad/design.json")
     golden("design/design.json", json_text(document), forget=[VERSIONS, *SECONDS], rtol=1e-3)
@@ -127,6 +137,18 @@ def test_show_draws_what_import_reads(run, golden: Golden, figures: list[Any], b
     golden("design/show_plan.txt", figures[0], forget=[ROUNDING])
     golden("design/show.txt", printed + run("import", "plan.svg", "--tolerance-mm", "0.5"), rtol=1e-3)
     assert max_distance_mm(Morphology.load("out/plan/morphology.json"), bent_pad) < 0.6
+
+
+def test_plans_of_every_contact_with_none_and_with_few_broken_rules(golden: Golden) -> None:
+    """Of a pad of which two fibres of a family cross, and with a keep-out."""
+    knots = [[[0.0, 1], [1.5, 2.5], [3, 1]], [[0, 2], [1.5, 2], [3, 2]], *([[x, 0], [x, 1.5], [x, 3]] for x in (1, 2))]
+    places = (1.0, -2.0), None, (3.0, 4.0)
+    pad, broken = Morphology(np.array(knots)), [Violation("max_length_mm", (1,), 60.0, 50.0, at) for at in places]
+    texts = []
+    for number, contact in enumerate((Contact(), Contact(model="profile"), Contact(radius=0.6), Contact(sides=None))):
+        plan = draw_plan(pad, contact, broken[:number], [((9, 9), (12, 9), (9, 12))])
+        texts.append(figure_text(plan))
+    golden("design/plans.txt", "\n".join(texts), forget=[ROUNDING])
 
 
 def test_import(run, golden: Golden) -> None:
@@ -185,8 +207,8 @@ def test_names_of_variants(golden: Golden) -> None:
 def test_contacts(run, golden: Golden, bent_pad: Morphology) -> None:
     Path("out/pad").mkdir(parents=True)
     bent_pad.save("out/pad/morphology.json")
-    spec = Spec({"contact": {"model": "profile"}, "search": {"max_failures": 1}})
-    compare_contacts(spec, bent_pad, Path("out/pad"), seed=3)
+    spec = Spec({"contact": {"model": "profile"}, "search": {"max_failures": 1, "seed": 3}})
+    compare_contacts(spec, bent_pad, Path("out/pad"))
     golden("design/contacts.json", json_text(document_of("out/pad/contacts.json")), forget=[VERSIONS], rtol=1e-3)
 
 

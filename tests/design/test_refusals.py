@@ -1,5 +1,6 @@
 import json
 from collections.abc import Callable
+from dataclasses import asdict, replace
 from functools import reduce
 from pathlib import Path
 from typing import Any
@@ -7,10 +8,11 @@ from typing import Any
 import numpy as np
 from click.testing import CliRunner
 
-from padforge import design
+from padforge import Spec, design
 from padforge.design import Contact, Morphology, PadSettings, SearchSettings, Twin, cli, signals
 from padforge.design.layer import solve_press
 from padforge.design.objectives.ambiguity import free_presses
+from padforge.design.optimize.search import settings_for_twin
 from padforge.design.paths.import_plan import import_plan
 from padforge.design.paths.keep_outs import check_fibre_ends
 from padforge.design.settings import Layout
@@ -94,12 +96,12 @@ def test_refusals_of_values(golden: Golden) -> None:
 def test_refusals_of_twins(golden: Golden, twin: Path, tmp_path: Path) -> None:
     whole, path = Twin.load(twin), tmp_path / "twin.json"
 
-    def with_value(value: Any, *way: str) -> Callable[[], Twin]:
-        def load() -> Twin:
+    def with_value(value: Any, *way: str) -> Callable[[], Spec]:
+        def load() -> Spec:
             document = json.loads(twin.read_text())
             reduce(dict.__getitem__, way[:-1], document)[way[-1]] = value
             path.write_text(json.dumps(document))
-            return Twin.load(path)
+            return settings_for_twin(Spec({}), path)
 
         return load
 
@@ -109,6 +111,7 @@ def test_refusals_of_twins(golden: Golden, twin: Path, tmp_path: Path) -> None:
         "no such part": lambda: whole.as_built_stretch([[0.0, 0.0]], "of"),
         "a file of another kind": with_value("padforge-design/1", "format"),
         "a file of other channels": with_value([{"gain": 1}], "channels"),
+        "no channel that responds": with_value([asdict(replace(whole.channels[0], gain_v=0.0))], "channels"),
     }
     golden("design/refusals_of_twins.txt", refusal_table(rows).replace(str(path), "twin.json"), forget=[CAUSE])
 

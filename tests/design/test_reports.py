@@ -78,7 +78,7 @@ def test_contact_section_and_lines(golden: Golden) -> None:
     golden("design/contact_lines.txt", "\n".join(lines))
 
 
-@pytest.mark.parametrize("tool", ["dome", "flat"])
+@pytest.mark.parametrize("tool", ["dome", "flat", "ball"])
 def test_press_is_drawn_to_scale(golden: Golden, figures: list[Any], monkeypatch, tool: str) -> None:
     blank_pictures(monkeypatch)
     document, contact = design_document(), PRESS.model_copy(update={"tool": tool})

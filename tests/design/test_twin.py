@@ -3,11 +3,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from padforge import InputError, Spec
-from padforge.design import Morphology, Twin
+from padforge.design import Morphology, Twin, flatten
 from padforge.design.contact import relative_stretch
-from padforge.design.optimize.search import settings_for_twin
-from padforge.design.paths.curves import flatten
 from padforge.design.twin import PARTS, PlanTransform, TwinChannel, TwinPart, TwinReadings, TwinResidual, TwinScatter
 from tests.helpers.golden import Golden
 
@@ -80,10 +77,3 @@ def test_effects_that_another_pad_does_not_have(twin: Twin, golden: Golden) -> N
     both = {"sensitivity": all_uneven, "angular_weight": 0.1 * WEIGHT}
     effects = [str(replace(twin, **each).ignored_effects()) for each in (*changes, both)]
     golden("design/twin_effects.txt", "\n".join(effects))
-
-
-def test_settings_for_a_twin_without_a_channel_that_responds_are_refused(twin, tmp_path):
-    silent = replace(twin, channels=tuple(replace(channel, gain_v=0.0) for channel in twin.channels))
-    silent.save(tmp_path / "twin.json")
-    with pytest.raises(InputError, match="no channel that responds"):
-        settings_for_twin(Spec({}), tmp_path / "twin.json")

@@ -82,9 +82,10 @@ def test_help_examples_parse_and_groups_list_all_commands_uncut(name, command, p
         for call in arguments(example):
             parser.main(call, standalone_mode=False, prog_name="padforge")
     if isinstance(command, click.Group):
-        lines = command.get_help(click.Context(command, info_name=name, terminal_width=80)).splitlines()
-        assert [line for line in lines if len(line) > 80] == []
-        for word in command.commands:
-            listed = [line for line in lines if re.match(rf"  {word}  ", line)]
-            assert len(listed) == 1, word
-            assert not listed[0].endswith("..."), listed
+        for width in (60, 80):
+            lines = [*command.get_help(click.Context(command, info_name=name, terminal_width=width)).splitlines(), ""]
+            assert width < 80 or max(map(len, lines)) <= 80
+            for word in command.commands:
+                (listed,) = (line for line in lines if re.match(rf"  {word}  ", line))
+                assert not lines[lines.index(listed) + 1].startswith("   "), "it goes on in the next line"
+                assert width < 80 or not listed.endswith("..."), listed

@@ -38,8 +38,8 @@ def test_links_and_pictures_exist_and_no_path_of_a_machine(page: Path) -> None:
     assert not re.search(r"\b[A-Z]:\\", text)
 
 
-def test_readme_devcontainer_and_pre_commit_agree() -> None:
-    """The README's command for tests, with `-e`; the ruff of the constraints."""
+def test_readme_devcontainer_and_pre_commit_agree_and_workflows_name_actions_by_commit() -> None:
+    """The README's with `-e`; the ruff of the constraints. A tag may be moved; its version is beside the commit."""
     line = re.search(r"<!-- tests -->\n```sh\n(.*) && [^&]*pytest", read("README.md"))
     assert line
     container = json.loads(read(".devcontainer/devcontainer.json"))
@@ -49,10 +49,6 @@ def test_readme_devcontainer_and_pre_commit_agree() -> None:
     assert pinned
     assert hooked
     assert hooked[1] == pinned[1]
-
-
-def test_workflows_name_actions_by_commit() -> None:
-    """A tag may be moved; with the version beside it, which Dependabot raises with the commit."""
     paths = (ROOT / ".github" / "workflows").glob("*.yml")
     used = [line for path in paths for line in re.findall(r"uses: (.*)", path.read_text())]
     actions = [action for action in used if not action.startswith("./")]

@@ -1,19 +1,15 @@
-import importlib.util
 import re
+import runpy
 import subprocess
 import tomllib
 from datetime import date
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
 ROOT = Path(__file__).parents[2]
-_SPEC = importlib.util.spec_from_file_location("release", ROOT / ".github" / "release.py")
-assert _SPEC
-assert _SPEC.loader
-release = importlib.util.module_from_spec(_SPEC)
-_SPEC.loader.exec_module(release)
-
+release = SimpleNamespace(**runpy.run_path(str(ROOT / ".github" / "release.py")))
 DAY = date(2030, 1, 2)
 OLDER = "# Changelog\n\nIntroduction.\n\n## Unreleased\n\n### Added\n\n- Pads.\n\n## 0.1.0 - 2029-12-31\n\n- Moulds.\n"
 FILES = {

@@ -7,12 +7,11 @@ import trimesh
 from shapely import affinity
 
 from padforge.design.morphology import Morphology
+from padforge.fabricate import Plan
 from padforge.fabricate import mould as bodies
 from padforge.fabricate.checks.plan_checks import check_plan
 from padforge.fabricate.mesh import build_mesh, mesh_arrays
 from padforge.fabricate.mould import Body, Prism, conductive_plan, lid_body, mould_body, well_outlines
-from padforge.fabricate.plan import Plan
-from padforge.fabricate.settings import WELL_MM
 from tests.fabricate.planted import with_settings
 
 
@@ -78,7 +77,7 @@ def test_holder_fits_the_pad_with_its_leads():
         height_at(read, inside, -inside)  # where fibres 1 and 3 start, as the pad lies
 
 
-def test_ridges_run_to_the_end_of_their_slots():
+def test_ridges_run_to_the_end_of_their_slots_and_have_their_draft():
     plan = Plan(Morphology.straight(1, pitch_mm=10.0), with_settings({"number_mm": 0.0, "border_mm": 1.0}))
     read = as_read(mould_body(plan))
     edge = 10 + 1.0
@@ -91,9 +90,6 @@ def test_ridges_run_to_the_end_of_their_slots():
     ):
         assert height_at(read, *place) == pytest.approx(z, abs=1e-4), place
     assert {round(2 * side, 6) for side in plan.tray.bounds[2:]} == {round(2 * (edge + 2 + 2 + plan.flare_mm), 6)}
-
-
-def test_walls_and_ridges_have_their_draft():
     leaning = {"number_mm": 0.0, "exit_mm": 0.0, "wall_draft_deg": 10.0, "ridge_draft_deg": 10.0}
     plan = Plan(Morphology.straight(1, pitch_mm=20.0), with_settings(leaning))
     read = as_read(mould_body(plan))
@@ -136,17 +132,6 @@ def test_tapered_moulds_with_wells_are_closed(tapered, knots, layer_mm):
         assert_one_closed_body(as_read(body))
 
 
-def test_conductive_mould_has_a_well_at_every_ridge_end():
-    plan = conductive_plan(Plan(Morphology.straight(2, pitch_mm=15.0), with_settings({"number_mm": 0.0})))
-    read = as_read(mould_body(plan, well_outlines(plan)))
-    assert_one_closed_body(read)
-    edge = 1.5 * 15
-    for x in (-edge - 2.5, edge + 2.5):
-        for offset in (0.0, 0.9 * WELL_MM / 2):
-            assert height_at(read, x, -7.5 + offset + 0.01) == pytest.approx(2 + 1.2, abs=1e-4)
-        assert height_at(read, x, -7.5 + 1.1 * WELL_MM / 2) == pytest.approx(2.0, abs=1e-4)
-
-
 def test_mesh_arrays_separates_coincident_vertices():
     """Two blocks that share one upright line: joined there, the line would have four faces."""
     touching = Body((Prism(shapely.box(0, 0, 1, 1), 0, 1), Prism(shapely.box(1, 1, 2, 2), 0, 1)))
@@ -173,18 +158,3 @@ def test_crossing_gap_is_a_lower_bound():
     assert isinstance(stated, float)
     for c in plan.crossings:
         assert abs(floors[c.first] - floors[c.second]) - fibre > stated - 1e-4
-
-
-def test_pins_are_on_three_corners_so_that_a_lid_fits_one_way() -> None:
-    """Half as wide as the corner they stand on, as high as wide; the far corner at the right has none."""
-    plan = Plan(Morphology.straight(2), with_settings({"wall_mm": 3.0, "exit_mm": 2.0, "pins": True}))
-    pins = bodies.registration_pins(plan)
-    places = [pin.area.centroid.coords[0] for pin in pins]
-    middle = plan.tray.bounds[2] - plan.corner_mm / 2
-    assert np.array(places) == pytest.approx(np.array([(-1, -1), (1, -1), (-1, 1)]) * middle, abs=1e-6)
-    top = plan.settings.mould.floor_mm + plan.silicone_mm
-    for pin in pins:
-        x_min, _, x_max, _ = pin.area.bounds
-        assert x_max - x_min == pytest.approx(plan.corner_mm / 2, abs=0.1)
-        assert pin.top_mm - top == pytest.approx(x_max - x_min, abs=1e-6)
-        assert pin.bottom_mm < top

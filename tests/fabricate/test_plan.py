@@ -9,7 +9,6 @@ from shapely import affinity
 from shapely.geometry.base import BaseGeometry
 
 from padforge.common.settings import Spec
-from padforge.common.validation import InputError
 from padforge.design.morphology import Morphology
 from padforge.design.paths.curves import Crossing
 from padforge.design.settings import FIBRE_MM, read_contact
@@ -66,16 +65,13 @@ def test_assign_layers_separates_crossing_fibres(grid, data):
     assert set(levels) == set(range(max(levels) + 1))
 
 
-def test_common_tracks_include_all_crossings_of_layers():
+def test_layers_are_a_step_apart_thicken_the_pad_and_have_common_tracks_where_fibres_cross():
     plan = Plan(Morphology.random(3, 3, seed=3))
     levels = plan.layer_indices
     assert max(levels) >= 2
     crossing = {tuple(sorted((c.first, c.second), key=lambda fibre: levels[fibre])) for c in plan.crossings}
     assert any(levels[deep] - levels[shallow] > 1 for shallow, deep in crossing)
     assert {(each.shallow, each.deep) for each in plan.common_tracks} >= crossing
-
-
-def test_layers_are_a_step_apart_and_thicken_the_pad():
     plan = Plan(level_pad(1.8, 1.2))
     assert plan.heights_mm == (0.4, 1.2, 2.0)
     assert plan.layer_indices[0] != plan.layer_indices[1]
@@ -95,16 +91,6 @@ def test_every_family_is_laid_at_the_depth_that_it_is_designed_for(fibres, deep)
     contact = read_contact(Spec({"pad": {"deep_family": deep}}))
     assert depths_mm == pytest.approx(np.repeat(contact.fibre_depths_mm, fibres).tolist())
     assert plan.silicone_mm == 6.0
-
-
-def test_require_levels_refuses_crossings_of_a_family():
-    settings = with_settings({"levels": "two"})
-    plan = Plan(level_pad(1.8, 1.2), settings)
-    line = r'^[^\n]*levels: got "two"[^\n]*2 crossings: fibres 1 x 2 at \(-\d+\.\d, -?0\.0\)[^\n]*$'
-    with pytest.raises(InputError, match=line):
-        plan.require_levels()
-    assert plan.heights_mm == (0.4, 1.2)
-    Plan(Morphology.straight(3), settings).require_levels()
 
 
 def test_digits_turned_over_or_upside_down_are_no_other_digits():

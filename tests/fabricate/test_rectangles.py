@@ -8,8 +8,7 @@ from hypothesis import given
 from hypothesis import settings as effort
 from hypothesis import strategies as st
 
-from padforge.design.morphology import Morphology
-from padforge.design.settings import PadSettings
+from padforge.design import Morphology, PadSettings
 from padforge.fabricate.cad.model import body_solid
 from padforge.fabricate.checks.plan_checks import check_mould
 from padforge.fabricate.leads import lead_spacing
@@ -42,15 +41,12 @@ def test_round_holes_are_round_pillars_whose_feet_are_the_heads_of_screws():
     assert sorted(face.area for face in round_) == pytest.approx(sorted(areas), rel=1e-3)
 
 
-def test_keep_out_at_the_edge_joins_the_wall():
+def test_keep_out_at_the_edge_joins_the_wall_and_bores_of_lids_are_clear_of_pillars():
     notch = ((20.0, 20.0), (28.0, 20.0), (28.0, 30.0), (20.0, 30.0))
     plan = Plan(Morphology.straight((1, 1), (28.0, 30.0)), settings(PAD, keep_out_mm=(notch,)))
     rim = DEFAULTS.mould.floor_mm + DEFAULTS.mould.silicone_mm
     free = [ring for ring in mould_mesh(plan).slice(rim - 1e-3).to_polygons() if len(ring)]
     assert len(free) == 2  # the walls' outside and inside: no film between pillar and wall
-
-
-def test_lid_bores_are_clear_of_pillars():
     hole = ((-6.0, -5.0), (6.0, -5.0), (6.0, 5.0), (-6.0, 5.0))
     plan = Plan(PAD, settings(PAD, {"lid": True, "spout": True}, keep_out_mm=(hole,)))
     for prism in lid_body(plan).cuts:

@@ -4,26 +4,15 @@ from dataclasses import asdict
 from functools import partial
 from typing import Any
 
-import numpy as np
 import pytest
 
-from padforge.common.settings import Spec, commented_toml
+from padforge.common.settings import Spec
 from padforge.design.morphology import Morphology
-from padforge.fabricate import materials
+from padforge.fabricate import FabricationSettings, MouldSettings, Plan, materials
 from padforge.fabricate.mould import conductive_plan, lid_body, mould_body
-from padforge.fabricate.plan import Plan
-from padforge.fabricate.settings import DEFAULTS, DispenserSettings, FabricationSettings, MouldSettings, PrinterSettings
 from tests.fabricate.planted import with_settings
 from tests.helpers.golden import json_text
 from tests.helpers.refusals import refusal_table
-
-
-def test_defaults_survive_a_settings_file(tmp_path):
-    path = tmp_path / "pad.toml"
-    models = (MouldSettings, PrinterSettings, DispenserSettings, materials.SiliconeSettings, materials.FibreSettings)
-    path.write_text(commented_toml({model.section(): model for model in models}), encoding="utf-8")
-    assert FabricationSettings.from_spec(Spec.load(path)) == DEFAULTS
-
 
 OWN = {"name": "Sylgard 184", "density_g_per_ml": 1.03, "parts": [10, 1], "pot_life_min": 90, "cure_h": 48}
 KEYS: list[tuple[str, dict[str, Any]]] = [
@@ -69,20 +58,6 @@ def test_terraces_are_whole_layers():
         settings = FabricationSettings(mould=MouldSettings(ridge_draft_deg=draft))
         assert settings.terrace_mm == pytest.approx(layers * 0.1)
     assert FabricationSettings().terrace_mm == math.inf
-
-
-def test_shrinkage_compensated_scales_lengths_of_the_pad():
-    shrinkage = 0.2
-    hole = [[[0, 0], [3, 0], [0, 4]]]
-    asked = with_settings({"border_mm": 1.5}, pad={"keep_out_mm": hole}, silicone={"shrinkage": shrinkage})
-    mould = asked.shrinkage_compensated().mould
-    corners = np.array(asked.shrinkage_compensated().pad.keep_out_mm) * (1 - shrinkage)
-    np.testing.assert_allclose(corners, hole, rtol=1e-12)
-    for key in ("border_mm", "ridge_width_mm", "exit_mm", "exit_width_mm", "number_mm"):
-        assert getattr(mould, key) * (1 - shrinkage) == pytest.approx(getattr(asked.mould, key), rel=1e-12)
-    for key in ("floor_mm", "wall_mm", "wall_draft_deg", "tolerance_mm", "min_silicone_mm", "lead_mm"):
-        assert getattr(mould, key) == getattr(asked.mould, key)
-    assert asked.shrinkage_compensated().shrinkage_factor == 1
 
 
 def test_materials_are_those_of_their_preset_or_of_their_keys():

@@ -1,3 +1,4 @@
+import re
 from types import SimpleNamespace
 
 import pytest
@@ -12,13 +13,14 @@ from tests.helpers.door import called, refused
 
 def test_compare_designs_every_variant_in_its_folder(tmp_path, brief):
     (tmp_path / "pad.toml").write_text("[search]\nsteps = 2\nstarts = 1\nknots = 2\n[rules]\nenforce = false\n")
-    words = "design compare --vary pad.grid=1 --vary pad.pitch_mm=9,[8,12] --seed 5 --out c"
+    words = "design compare --vary pad.grid=1 --vary pad.pitch_mm=9,[8,12] --seed 5 --out c --profile"
     result = called(*words.split(), cwd=tmp_path)
     assert result.code == 0, result.err
     folders = sorted(path.name for path in (tmp_path / "c").iterdir() if path.is_dir())
     assert folders == ["grid-1-pitch_mm-8-x-12", "grid-1-pitch_mm-9"]
     assert "grid 1, pitch_mm 8 x 12" in result.out
     assert max(map(len, result.out.splitlines())) <= 100
+    assert re.search(r"where \d+\.\d\d s went\n(.*\n)+  formats +12 of 14\n", result.err)
     pad = Morphology.load(tmp_path / "c" / folders[0] / "morphology.json")
     assert (pad.layout.counts, pad.pitch_mm, pad.provenance["seed"]) == ((1, 1), (8.0, 12.0), 5)
 

@@ -8,7 +8,7 @@ from padforge.sense import Recording
 from tests.helpers.door import called, refused
 
 
-def test_example_is_a_buildable_pad_and_its_presses_again_at_every_call(tmp_path: Path) -> None:
+def test_example_is_a_buildable_pad_and_its_presses_again_at_every_call_and_spares_other_files(tmp_path: Path) -> None:
     (tmp_path / "pad.toml").write_text("[rig]\npresses = 3\n")  # which changes nothing
     first = called("example", cwd=tmp_path)
     assert first.code == 0, first
@@ -23,9 +23,6 @@ def test_example_is_a_buildable_pad_and_its_presses_again_at_every_call(tmp_path
     digest = sha256(example / "recording")
     assert called("example", cwd=tmp_path) == first
     assert sha256(example / "recording") == digest
-
-
-def test_example_spares_other_files(tmp_path: Path) -> None:
     (tmp_path / "pad").mkdir()
     Morphology.straight(2).save(tmp_path / "pad/morphology.json")
     assert "pad: exists and is not empty" in refused("example", "--out", "pad", cwd=tmp_path)

@@ -4,9 +4,11 @@ import sys
 import sysconfig
 from importlib import metadata
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 
+from padforge.cli import cli
 from padforge.common import compilation
 from tests.helpers.door import called, refused
 from tests.padforge.conftest import SMALLEST
@@ -72,6 +74,7 @@ WHOLE = [[-40, -40], [40, -40], [40, 40], [-40, 40]]  # a keep-out
         ("", "fabricate pad.toml", "pad.toml: no morphology, allowed are a .json and a published .mat"),
         ("", "fabricate check pad.csv", "allowed are a mesh .stl or .3mf, a morphology .json or .mat"),
         ("", "report none", "none"),
+        ("", "report .", ".: no design.json, fabrication.json, calibration.json or study to report on"),
         ("", "design --start-from wavy", "--start-from is wavy, allowed are random, straight and a .json or .mat"),
         ("", "run --formats stl,obj", "Invalid value for '--formats': got 'obj', allowed are stl, 3mf"),
         ("", "run --time-budget nan", "Invalid value for '--time-budget': got 'nan', expected a finite number"),
@@ -94,6 +97,15 @@ def test_mistakes_are_refused_in_one_line(tmp_path: Path, settings: str, words: 
     (tmp_path / "pad.toml").write_text(settings)
     (tmp_path / "deep.csv").write_text("x_mm,y_mm,depth_mm\n1,2,6\n")
     assert said in refused(*words.split(), cwd=tmp_path)
+
+
+def test_missing_library_is_told_with_the_extra_of_the_command(tmp_path: Path, golden, monkeypatch) -> None:
+    (tmp_path / "out" / "pad").mkdir(parents=True)
+    lines = []
+    for word, command in cli.commands.items():
+        monkeypatch.setattr(command, "callback", Mock(side_effect=ModuleNotFoundError(name="matplotlib")))
+        lines.append(f"{word}: {called(word, *list(getattr(command, 'commands', ()))[:1], cwd=tmp_path).err}")
+    golden("padforge/missing_library.txt", "".join(lines))
 
 
 def test_only_the_genetic_search_needs_pymoo(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

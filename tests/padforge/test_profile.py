@@ -7,13 +7,11 @@ import numpy as np
 import pytest
 
 from padforge.common import profiling
-from padforge.design import Morphology
-from padforge.design.optimize.search import SearchOptions, search
+from padforge.design import SearchOptions, search
 from padforge.design.settings import PUBLISHED_CONTACT, PadSettings, RulesSettings, SearchSettings
-from padforge.fabricate import build
 
 
-def test_stages_of_other_threads_count_for_main_thread(monkeypatch):
+def test_stages_are_those_of_the_main_thread_and_end_with_an_error(monkeypatch):
     now = [0.0]
     monkeypatch.setattr(profiling.time, "perf_counter", lambda: now[0])
 
@@ -27,9 +25,6 @@ def test_stages_of_other_threads_count_for_main_thread(monkeypatch):
         thread.join()
     assert "aside" not in profile.seconds
     assert profile.seconds["main"] == 3
-
-
-def test_failing_stage_ends_profile():
     finders = list(sys.meta_path)
     with pytest.raises(ValueError, match="on purpose"), profiling.profiled() as profile, profiling.stage("failing"):
         raise ValueError("on purpose")
@@ -53,11 +48,3 @@ def test_finished_starts_are_not_repeated(tmp_path, monkeypatch):
     assert not heard
     assert profile.counts["starts"] == [0, 2]
     np.testing.assert_array_equal(first.morphology.knots, again.morphology.knots)
-
-
-def test_only_requested_formats_are_written(tmp_path):
-    with profiling.profiled() as profile:
-        build(Morphology.straight(1), tmp_path, ("svg", "dxf"))
-    assert profile.counts["formats"] == [2, 7]
-    assert {"write tracks.svg", "write tracks.dxf"} <= set(profile.seconds)
-    assert not {"CAD solid", "write mould.stl"} & set(profile.seconds)

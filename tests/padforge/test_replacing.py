@@ -12,7 +12,7 @@ from tests.helpers.folders import files_in
 from tests.helpers.less import blank_pictures
 from tests.padforge.conftest import SMALLEST
 
-DESIGN = "design --out pad"
+DESIGN, IMPORT = "design --out pad", "design import plan.svg --out pad"
 
 
 def made_from(path: Path, **inputs: object) -> None:
@@ -42,10 +42,7 @@ def pad(designed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path
     return folder
 
 
-@pytest.mark.parametrize(
-    "words",
-    [f"{DESIGN} --seed 1", "design import plan.svg --out pad", "design edit other.json --out pad/morphology.json"],
-)
+@pytest.mark.parametrize("words", [f"{DESIGN} --seed 1", IMPORT, "design edit other.json --out pad/morphology.json"])
 def test_pad_in_use_is_not_replaced(pad: Path, words: str) -> None:
     line = refused(*words.split(), cwd=pad)
     for said in ("pad/morphology.json: calibration.json", "fabrication.json, recording", "twin.json", "--force"):
@@ -65,12 +62,16 @@ def undrawn(pad: Path) -> dict[str, bytes]:
 
 
 def test_same_pad_replaces_nothing_and_force_what_is_in_use(pad: Path) -> None:
-    before, digest = undrawn(pad), sha256(pad / "pad" / "morphology.json")
+    path = pad / "pad" / "morphology.json"
+    before, digest = undrawn(pad), sha256(path)
     for again in (DESIGN, f"{DESIGN} --resume"):
         assert called(*again.split(), cwd=pad).code == 0
         assert undrawn(pad) == before
-    assert called(*DESIGN.split(), "--seed", "1", "--force", cwd=pad).code in (0, 1)
-    assert sha256(pad / "pad" / "morphology.json") != digest
+    for forced, command in ((f"{DESIGN} --seed 1", "padforge design"), (IMPORT, "padforge design import")):
+        assert called(*forced.split(), "--force", cwd=pad).code in (0, 1)
+        assert sha256(path) != digest
+        digest, origin = sha256(path), json.loads(path.read_text())["provenance"]
+        assert (origin["command"], origin["seed"]) == (command, None if "import" in command else 1)
 
 
 def test_refused_search_keeps_checkpoints(pad: Path) -> None:

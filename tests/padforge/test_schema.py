@@ -1,14 +1,14 @@
 import json
 import tomllib
+from contextlib import nullcontext
 from pathlib import Path
 from pkgutil import resolve_name
 
 import jsonschema
 import pytest
 
+from padforge import InputError, Spec
 from padforge.cli import PRESETS
-from padforge.common.settings import Spec
-from padforge.common.validation import InputError
 from padforge.settings import SECTIONS, check_settings, section_models
 from tests.docs.pages import BLOCK, PAGES, relative
 from tests.helpers.door import called
@@ -38,6 +38,7 @@ def test_written_settings(validator: jsonschema.Draft7Validator, tmp_path: Path,
         assert (ended.code, ended.out) == (0, f"settings -> {preset or 'pad'}.toml\n")
         text = (tmp_path / f"{preset or 'pad'}.toml").read_text(encoding="utf-8")
         validator.validate(tomllib.loads(text))
+        (tmp_path / f"{preset or 'pad'}.toml").write_text(text, encoding="utf-8-sig")  # as editors on Windows do
         check_settings(spec := Spec.load(tmp_path / f"{preset or 'pad'}.toml"))
         stated = resolve_name(PRESETS[preset]) if preset else {}
         for name, model in MODELS.items():
@@ -64,31 +65,30 @@ def test_documented_settings_validate(validator: jsonschema.Draft7Validator) -> 
         Spec(table, page, SECTIONS)
 
 
-@pytest.mark.parametrize(
-    ("section", "key", "value", "is_valid"),
-    [
-        ("pad", "pitch_mm", 8, True),
-        ("pad", "pitch_mm", [5, 8], True),
-        ("pad", "pitch_mm", "5 mm", False),
-        ("pad", "pitch_mm", [8, 8, 8], False),
-        ("pad", "horizontals", "grid", True),
-        ("pad", "bent_radius_mm", "round", False),
-        ("pad", "gird", 4, False),
-        ("contact", "sensitivity_profile", [[0, 1], [5, 0.5], [9, 0]], True),
-        ("contact", "sensitivity_profile", [[0, 1]] * 65, False),
-        ("search", "contacts", [{"depth_mm": "2 mm"}], False),
-        ("search", "max_failures", [0, 1], True),
-        ("rig", "max_force_n", "unwatched", True),
-        ("rig", "channels", [0, 600], False),
-        ("dispenser", "origin_mm", [0, 0, 0], False),
-        ("localizer", "method", "forest", False),
-    ],
-)
-def test_schema_judges_a_key_as_the_settings_do(validator, section, key, value, is_valid) -> None:
-    assert validator.is_valid({section: {key: value}}) == is_valid
-    spec = Spec({section: {key: value}})
-    if is_valid:
-        spec.section(MODELS[section])
-    else:
-        with pytest.raises(InputError):
-            spec.section(MODELS[section])
+VALID = """\
+pad pitch_mm 8
+pad pitch_mm [5, 8]
+pad horizontals "grid"
+contact sensitivity_profile [[0, 1], [5, 0.5], [9, 0]]
+search max_failures [0, 1]
+rig max_force_n "unwatched"
+"""
+INVALID = """\
+pad pitch_mm "5 mm"
+pad pitch_mm [8, 8, 8]
+pad bent_radius_mm "round"
+pad gird 4
+search contacts [{"depth_mm": "2 mm"}]
+rig channels [0, 600]
+dispenser origin_mm [0, 0, 0]
+localizer method "forest"
+"""
+
+
+def test_schema_judges_keys_as_the_settings_do(validator: jsonschema.Draft7Validator) -> None:
+    for line in [*VALID.splitlines(), *INVALID.splitlines(), f"contact sensitivity_profile {[[0, 1]] * 65}"]:
+        section, key, value = line.split(maxsplit=2)
+        tables, is_valid = {section: {key: json.loads(value)}}, line in VALID
+        assert validator.is_valid(tables) == is_valid, line
+        with nullcontext() if is_valid else pytest.raises(InputError):
+            Spec(tables).section(MODELS[section])

@@ -7,11 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from padforge.common.settings import Spec
-from padforge.common.validation import InputError
-from padforge.design.morphology import Morphology
-from padforge.design.objectives.rules import check_rules
-from padforge.design.settings import PadSettings, RulesSettings
+from padforge import InputError, Spec
+from padforge.design import Morphology, PadSettings, RulesSettings, check_rules
 from padforge.fabricate.checks import plan_checks
 from padforge.fabricate.settings import FabricationSettings
 from padforge.run import Run, check_run

@@ -81,13 +81,6 @@ def test_signals_agree_in_every_form(contact, function):
     np.testing.assert_allclose(together, found[0, ::2] + found[0, 1::2], rtol=1e-12, atol=1e-12)
 
 
-def test_profile_signals_are_0_beyond_its_end():
-    found = signals(Morphology.straight(4), [[1.0, 1.0], [9.0, 9.0]], PROFILES["broad"], precision=1e-6)
-    assert not found[1].any()
-    assert found[0, 0] == found[0, 4] > 0 > found[0, 1] == found[0, 5]
-    assert not found[0, [2, 3, 6, 7]].any()
-
-
 @pytest.mark.parametrize("contact", CONTACTS.values(), ids=CONTACTS)
 def test_signals_of_a_search_are_within_their_precision(contact):
     pad = Morphology.random((3, 2), 5, seed=2, pitch_mm=(8.0, 12.0))

@@ -1,7 +1,6 @@
 import numpy as np
 
-from padforge.design import Morphology
-from padforge.design.settings import RulesSettings
+from padforge.design import Morphology, RulesSettings
 
 NONE = RulesSettings(
     min_mean_bend_radius_mm=0,

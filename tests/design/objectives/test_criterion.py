@@ -147,12 +147,31 @@ def test_window_presses_sample_the_remaining_pad_coarsely():
 
 
 def test_evaluation_of_a_huge_pad_samples_windows_and_presses():
+    """Of straight fibres full scale is by their length alone."""
     size = PadSettings(grid=96)
     windows = evaluation_windows(size.sensed)
     assert len(windows) == len(set(windows)) == module.MAX_WINDOWS
     presses = window_presses(size, windows[0], SIDE, np.random.default_rng(0))
     assert 0.9 * module.MAX_FAR < len(presses.far) <= module.MAX_FAR
     assert np.ptp(presses.far, axis=0).min() > 90
+    profile = Contact(model="profile")
+    small, large = (module.straight_full_scale(PadSettings(grid=n).layout, profile, "beyond") for n in (4, 96))
+    assert large * 97 == pytest.approx(small * 5, rel=0.02)
+
+
+def test_expected_error_ignores_failed_fibres_and_counts_distant_presses_with_equal_responses():
+    other = random_responses()
+    other[1] = other[1, ::-1]
+    kept, scatter = [[1.0, 0.0, 1.0], [1.0, 1.0, 1.0]], Scatter(0.01, 0.18, 0.36)
+    found, changed = errors(random_responses(), kept, scatter), errors(other, kept, scatter)
+    assert [changed[0], error(random_responses()[[0, 2]], scatter)] == pytest.approx([found[0]] * 2)
+    assert found[1] != pytest.approx(changed[1])
+    signals, kept = PLACES.T / 4, np.ones((1, 2))
+    alike, other = signals[:, 90:91], signals[:, 90:91] + 3.0
+    given = np.vstack([PLACES, [[30.0, 30.0]]]), STEPS, FREE, kept, SILENT, np.ones(2)
+    confused, apart = (criterion(np.hstack([signals, far]), *given)[0][0] for far in (alike, other))
+    assert apart == pytest.approx(error(signals), rel=0.2)
+    assert confused > 5 * apart
 
 
 def test_sets_that_are_alike_in_a_window_count_as_often_as_they_are(monkeypatch):
@@ -170,27 +189,3 @@ def test_sets_that_are_alike_in_a_window_count_as_often_as_they_are(monkeypatch)
         monkeypatch.setattr(module, "failure_masks", lambda *_, mask=mask: mask[None])
         alone.append(module.criterion_errors(*given)[1])
     assert together == pytest.approx(np.mean(alone))
-
-
-def test_full_scale_of_straight_fibres_is_by_their_length_alone():
-    profile = Contact(model="profile")
-    small, large = (module.straight_full_scale(PadSettings(grid=n).layout, profile, "beyond") for n in (4, 96))
-    assert large * 97 == pytest.approx(small * 5, rel=0.02)
-
-
-def test_expected_error_ignores_failed_fibres():
-    other = random_responses()
-    other[1] = other[1, ::-1]
-    kept, scatter = [[1.0, 0.0, 1.0], [1.0, 1.0, 1.0]], Scatter(0.01, 0.18, 0.36)
-    found, changed = errors(random_responses(), kept, scatter), errors(other, kept, scatter)
-    assert [changed[0], error(random_responses()[[0, 2]], scatter)] == pytest.approx([found[0]] * 2)
-    assert found[1] != pytest.approx(changed[1])
-
-
-def test_expected_error_counts_distant_presses_with_equal_responses():
-    signals, kept = PLACES.T / 4, np.ones((1, 2))
-    alike, other = signals[:, 90:91], signals[:, 90:91] + 3.0
-    given = np.vstack([PLACES, [[30.0, 30.0]]]), STEPS, FREE, kept, SILENT, np.ones(2)
-    confused, apart = (criterion(np.hstack([signals, far]), *given)[0][0] for far in (alike, other))
-    assert apart == pytest.approx(error(signals), rel=0.2)
-    assert confused > 5 * apart

@@ -1,12 +1,10 @@
 import numpy as np
 import pytest
 
-from padforge.design import Morphology, crossings
+from padforge.design import Morphology, PadSettings, RulesSettings, check_rules, crossings
 from padforge.design.contact import fibre_axes
 from padforge.design.objectives.penalties import penalties
-from padforge.design.objectives.rules import check_rules
 from padforge.design.paths.curves import slopes
-from padforge.design.settings import PadSettings, RulesSettings
 from tests.design.objectives.pads import bent, climbing, only, swung
 
 

@@ -1,15 +1,12 @@
 import numpy as np
 import pytest
 
-from padforge.design import Contact, Morphology
+from padforge.design import Contact, Morphology, PadSettings, RulesSettings, check_rules, draw_plan
 from padforge.design.contact import fibre_axes
 from padforge.design.objectives.penalties import penalties
-from padforge.design.objectives.rules import check_rules
 from padforge.design.objectives.score import score, sharpness, sharpness_loss
 from padforge.design.optimize.gradient import Parametrization
 from padforge.design.published.objective import published_terms
-from padforge.design.report import draw_plan
-from padforge.design.settings import PadSettings, RulesSettings
 from padforge.design.signal_gradients import FibreCurves
 from tests.design.wild_pads import KINDS, wild_knots
 

@@ -4,12 +4,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.interpolate import PchipInterpolator
 
-from padforge.design import Contact, Morphology
+from padforge.design import Contact, Morphology, check_rules
 from padforge.design.contact_set import served_contacts
 from padforge.design.morphology import MARGIN
 from padforge.design.objectives.criterion import criterion_errors
 from padforge.design.objectives.penalties import penalties
-from padforge.design.objectives.rules import check_rules
 from padforge.design.optimize import gradient
 from padforge.design.optimize.problem import SearchProblem
 from padforge.design.paths.curves import refine

@@ -6,10 +6,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from padforge.design import Contact, Morphology
+from padforge.design import Contact, Morphology, check_rules
 from padforge.design.contact_set import served_contacts
 from padforge.design.objectives.criterion import criterion_errors
-from padforge.design.objectives.rules import check_rules
 from padforge.design.objectives.score import ScoredPad, describe_terms, score
 from padforge.design.optimize.gradient import GENTLE
 from padforge.design.optimize.problem import build_problem
@@ -150,11 +149,12 @@ def test_search_for_twin_begins_no_search_after_an_interrupt(monkeypatch):
 
     def interrupted(*asked, run, **others):
         searches.append(run)
-        return replace(found, stopped="interrupted" if len(searches) == 2 else "")
+        return replace(found, stopped="interrupted" if len(searches) == 2 else "", seconds=4.0 * len(searches))
 
     monkeypatch.setattr("padforge.design.optimize.search.search", interrupted)
     result = search_for_twin(PadSettings(grid=1), Contact(), QUICK, RULES, QUICK, run=SearchOptions(time_budget=10))
     assert ([run.time_budget for run in searches], result.stopped) == ([3.5, 4.0], "interrupted")
+    assert result.seconds == 4 + 8
 
 
 @pytest.mark.parametrize(

@@ -165,19 +165,26 @@ enforce = false
 """
 
 
-def test_interrupted_design_says_so_and_keeps_its_states(tmp_path, monkeypatch):
-    def interrupted(*asked, run, **others):
+@pytest.mark.parametrize(("why", "code"), [("interrupted", 130), ("out of time", 0)])
+def test_design_that_is_cut_short_says_so_and_keeps_its_states(why, code, tmp_path, monkeypatch):
+    """Until it comes to its end."""
+
+    def cut_short(*asked, run, **others):
         def report(*progress):
-            signal.raise_signal(signal.SIGINT)
+            if why == "interrupted":
+                signal.raise_signal(signal.SIGINT)
 
-        return search(*asked, run=replace(run, on_progress=report), **others)
+        return replace(search(*asked, run=replace(run, on_progress=report), **others), stopped=why)
 
-    monkeypatch.setattr(design_run, "search", interrupted)
     (tmp_path / "pad.toml").write_text(SETTINGS)
-    ended = called("design", "--out", "pad", cwd=tmp_path)
-    assert (ended.code, "interrupted: the best so far" in ended.out) == (130, True)
-    assert json.loads((tmp_path / "pad" / "design.json").read_text())["stopped"] == "interrupted"
+    with monkeypatch.context() as patch:
+        patch.setattr(design_run, "search", cut_short)
+        ended = called("design", "--out", "pad", cwd=tmp_path)
+    assert (ended.code, f"{why}: the best so far" in ended.out) == (code, True)
+    assert json.loads((tmp_path / "pad" / "design.json").read_text())["stopped"] == why
     assert (tmp_path / "pad" / "search" / "start_0000.npz").exists()
+    assert called("design", "--out", "pad", "--resume", cwd=tmp_path).code == 0
+    assert not (tmp_path / "pad" / "search").exists()
 
 
 @pytest.mark.filterwarnings("ignore")

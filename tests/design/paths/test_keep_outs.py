@@ -3,10 +3,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from padforge.design import Morphology
+from padforge.design import Morphology, check_rules
 from padforge.design.contact import fibre_axes
 from padforge.design.objectives.penalties import penalties
-from padforge.design.objectives.rules import check_rules
 from padforge.design.paths.curves import bend_radius, rolled_turns
 from padforge.design.paths.keep_outs import is_outside, keep_outs, pass_keep_outs, straight_paths
 from padforge.design.settings import Layout, PadSettings, RulesSettings
@@ -67,6 +66,10 @@ def test_bend_radius_on_a_cylinder_matches_curves_in_space():
     found, place = bend_radius(points, angle, window, rolled_turns(points, angle, cylinder))
     assert found == pytest.approx(1 / np.hypot(1 / r, 1 / cylinder), rel=1e-3)
     assert place == pytest.approx((0, 0), abs=0.05)
+    rules, pad = only(min_mean_bend_radius_mm=10.0), Morphology.straight(Layout.create((3, 2), (8.0, 15.0)))
+    assert check_rules(pad, rules, PadSettings(bent_radius_mm=10.5)) == []
+    broken = check_rules(pad, rules, PadSettings(bent_radius_mm=9.0))
+    assert [(v.fibres, v.measured) for v in broken] == [((fibre,), pytest.approx(9)) for fibre in (1, 2, 3)]
 
 
 def test_fibres_are_back_at_their_levels_after_a_keep_out_by_the_wall():
@@ -77,13 +80,6 @@ def test_fibres_are_back_at_their_levels_after_a_keep_out_by_the_wall():
     assert (along[:, 1] - along[:, 0] < along[:, 3] - along[:, 2]).all()
     np.testing.assert_allclose(across[:, [0, 3]], size.layout.levels[:2, None] * [1, 1], atol=1e-3)
     assert np.abs(across[:, 1:3] - size.layout.levels[:2, None]).max() > 0.2
-
-
-def test_min_bend_radius_of_a_bent_pad_is_that_of_fibres_around_it():
-    rules, pad = only(min_mean_bend_radius_mm=10.0), Morphology.straight(Layout.create((3, 2), (8.0, 15.0)))
-    assert check_rules(pad, rules, PadSettings(bent_radius_mm=10.5)) == []
-    found = check_rules(pad, rules, PadSettings(bent_radius_mm=9.0))
-    assert [(v.fibres, v.measured) for v in found] == [((f,), pytest.approx(9)) for f in (1, 2, 3)]
 
 
 def test_fibres_and_presses_keep_clear_of_the_head_of_a_screw():

@@ -8,7 +8,7 @@ from padforge.design.published.networks import SimulatedPresses, fit_batch, fres
 from padforge.design.settings import PUBLISHED_CONTACT, Layout, between_fibres
 
 
-def test_networks_ignore_the_signals_of_failed_fibres():
+def test_networks_ignore_failed_fibres_and_are_scaled_by_their_training_samples_alone():
     pad = Morphology.straight(3)
     presses = SimulatedPresses.simulate(pad, 12, 50, 0, lambda positions: signals(pad, positions))
     failed = (0, 4)
@@ -17,9 +17,6 @@ def test_networks_ignore_the_signals_of_failed_fibres():
     changed[:, failed] = np.nan
     errors = presses.position_errors(network, failed, changed, presses.test_positions)
     np.testing.assert_array_equal(errors, presses.test_errors(network, failed))
-
-
-def test_networks_are_scaled_by_their_training_samples_alone():
     rng = np.random.default_rng(0)
     x, y = rng.uniform(-1, 1, (1, 60, 3)), rng.uniform(-1, 1, (60, 2))
     checked = rng.uniform(-9, 9, (1, 20, 3)), rng.uniform(-9, 9, (20, 2))

@@ -12,13 +12,12 @@ from scipy.spatial import KDTree
 
 from padforge.common.validation import InputError
 from padforge.design.morphology import Morphology
-from padforge.design.paths.curves import lengths
 from padforge.fabricate.cad import model as of_model
 from padforge.fabricate.cad.curves import fit_spline
-from padforge.fabricate.cad.model import FIT_TOLERANCES_MM, CadPart, assemble, build_mould, build_parts, mould_parts
+from padforge.fabricate.cad.model import FIT_TOLERANCES_MM, CadPart, assemble, build_mould, mould_parts
 from padforge.fabricate.cad.step_file import write_step
 from padforge.fabricate.mesh import build_mesh
-from padforge.fabricate.mould import conductive_plan, holder_body, lid_body, mould_body, well_outlines
+from padforge.fabricate.mould import conductive_plan, mould_body
 from padforge.fabricate.plan import Plan
 from tests.fabricate.planted import exact_fibre, level_pad, winding_pad, with_settings
 
@@ -64,19 +63,6 @@ def test_fused_mould_is_one_solid_of_the_volume_of_the_mesh():
     fused = build_mould(plan.pad, plan.settings, fused=True)
     assert isinstance(fused, Solid)
     assert fused.volume == pytest.approx(build_mesh(mould_body(plan)).volume(), rel=1e-6)
-
-
-def test_ridge_walls_are_as_long_as_exact_offsets():
-    """Where a bend is wider than half the track, the offsets to the left and right are together as long as two fibres.
-
-    So are each by itself where a fibre leaves the pad as it came: what one gains in a bend the other loses.
-    """
-    ridge = judged(Plan(SOFT, with_settings(PLAIN)))["horizontal 1"]
-    length, height = SOFT.unit_mm * float(lengths(SOFT)[0]) + 2 * 0.5, 1.2 + 0.2
-    upright = sum(face.area for face in ridge.faces() if abs(face.normal_at().Z) < 0.5)
-    assert upright == pytest.approx(2 * length * height + 2 * 0.4 * height, rel=5e-5)
-    mean_mm = 2.4e-4  # of how far walls lie off, of 2 µm allowed
-    assert ridge.volume == pytest.approx(length * 0.4 * height, rel=mean_mm / 0.4)
 
 
 @pytest.mark.parametrize(
@@ -206,24 +192,6 @@ def test_build_mould_is_compensated_for_shrinkage():
     size = np.array([*build_mould(SOFT, plan.settings).bounding_box().size])
     printed = plan.shrinkage_compensated
     assert size == pytest.approx([2 * printed.tray.bounds[2]] * 2 + [2.0 + printed.silicone_mm])
-
-
-def test_assemble_places_bodies_side_by_side():
-    settings = with_settings({"lid": True, "pins": True, "spout": True, "holder": True, "conductive": True})
-    plan = Plan(SOFT, settings)
-    wells = conductive_plan(plan)
-    second = mould_body(wells, well_outlines(wells))
-    bodies = {"mould": mould_body(plan), "lid": lid_body(plan), "conductive": second, "holder": holder_body(wells)}
-    built = build_parts(plan, bodies)
-    assert max(part.deviation for parts in built.values() for part in parts) < 5e-4  # meshes have polygons for circles
-    whole = assemble(built, plan)
-    assert [child.label for child in whole.children] == list(bodies)
-    boxes = {child.label: child.bounding_box() for child in whole.children}
-    assert pytest.approx(8.0) == boxes["lid"].min.Z
-    assert pytest.approx(10.0) == boxes["mould"].max.Z
-    assert pytest.approx(boxes["mould"].min.X) == boxes["lid"].min.X
-    assert pytest.approx(boxes["mould"].max.X + 10) == boxes["conductive"].min.X
-    assert pytest.approx(boxes["conductive"].max.X + 10) == boxes["holder"].min.X
 
 
 def test_ridges_are_fitted_finer_until_they_are_valid(monkeypatch):

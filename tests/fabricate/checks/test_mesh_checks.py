@@ -11,11 +11,10 @@ from manifold3d import CrossSection, Manifold, OpType
 from shapely.geometry.base import BaseGeometry
 
 from padforge.design.morphology import Morphology
-from padforge.fabricate.checks import Finding
+from padforge.fabricate import Finding, PrinterSettings
 from padforge.fabricate.checks.mesh_checks import check_triangles
 from padforge.fabricate.mesh import mesh_arrays, mould_mesh
 from padforge.fabricate.plan import Plan, polygon_rings
-from padforge.fabricate.settings import PrinterSettings
 
 FLOOR, DEPTH, SIZE = 2.0, 6.0, 20.0
 """Floor and depth of the trays here, and the width of what they hold, mm."""

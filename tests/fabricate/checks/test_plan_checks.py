@@ -8,13 +8,11 @@ import pytest
 from numpy.typing import ArrayLike
 
 from padforge.common.settings import Spec
-from padforge.design.morphology import Morphology
-from padforge.design.settings import Contact, RulesSettings
-from padforge.fabricate.checks.plan_checks import check, check_plan, compute_bending_strains
+from padforge.design import Contact, Morphology, RulesSettings
+from padforge.fabricate import FabricationSettings, Plan
+from padforge.fabricate.checks.plan_checks import check_plan, compute_bending_strains
 from padforge.fabricate.fibre_placement import check_toolpath, plan_toolpath
-from padforge.fabricate.plan import Plan
-from padforge.fabricate.settings import FabricationSettings
-from tests.design.objectives.pads import square
+from tests.design.objectives.pads import climbing, square
 from tests.fabricate.checks.test_mesh_checks import finding_lines
 from tests.fabricate.planted import level_pad, with_settings
 
@@ -38,11 +36,6 @@ def tight(*runs: float) -> Morphology:
     """A pad of 1 x 1 whose fibres climb by 0.05 within runs (grid units)."""
     horizontal, vertical = (np.array([[0, 1], [0.9, 1], [0.9 + run, 1.05], [1.5, 1.05], [2, 1]]) for run in runs)
     return Morphology(np.stack([horizontal, vertical[:, ::-1]]), 11.25)
-
-
-def at_a_lead(rise: float) -> Morphology:
-    """A straight climb from the left end of the horizontal on, where its lead begins straight."""
-    return one_fibre([0, 0.4, 0.8, 1.4, 2], [1, 1 + 0.4 * rise, 1 + 0.8 * rise, 1, 1], pitch_mm=11.25)
 
 
 def corner(family: int, rise: float) -> Morphology:
@@ -110,8 +103,8 @@ CASES: dict[str, tuple[Morphology, dict[str, Any]]] = {
     "a shallow crossing of any length": (SHALLOW, {"rules": {"max_common_track_mm": "any"}}),
     "bends of 13 mm, the fibre bears 20 mm": (GENTLE, {"fibre": {"min_bend_radius_mm": 20.0}}),
     "bends of 13 mm, 12 mm are allowed": (GENTLE, {"rules": {"min_mean_bend_radius_mm": 12.0}}),
-    "half a radian at a lead": (at_a_lead(0.5), ONE_SIDE),
-    "0.54 radians at a lead": (at_a_lead(0.6), {}),
+    "half a radian at a lead": (climbing(0.5, 0, 0), ONE_SIDE),
+    "0.54 radians at a lead": (climbing(0.6, 0, 0), {}),
     "bends of two radii": (tight(0.08, 0.03), {}),
     "bends of two radii, exchanged": (tight(0.03, 0.08), {}),
     "leads that bend by 3 mm": (STRAIGHT, ONE_SIDE | {"rules": {"min_mean_bend_radius_mm": 3.0}}),
@@ -159,12 +152,6 @@ def test_findings_of_plans(golden):
     golden("fabricate/findings_of_plans.txt", "\n".join(lines))
 
 
-def test_check_passes_a_straight_pad():
-    findings = check(STRAIGHT)
-    assert {finding.status for finding in findings} == {"pass"}
-    assert len({finding.name for finding in findings}) == len(findings)
-
-
 def test_fibre_bend_includes_leads():
     """Planted: leads of another radius than the rules have."""
     one_side = with_settings(**ONE_SIDE, rules={"min_mean_bend_radius_mm": 3.0})
@@ -178,14 +165,11 @@ def bent(pad: Morphology, radius: float) -> Plan:
     return Plan(pad, with_settings(pad={**pad.layout.settings, "bent_radius_mm": radius}))
 
 
-def test_bending_strain_of_straight_fibres():
+def test_bending_strains_have_closed_forms():
     """Horizontals, 1.2 mm deep, lie 3 - 1.2 + 0.15 mm above the middle of 6 mm; verticals stay as they are."""
     shallow, deep = compute_bending_strains(bent(Morphology.straight((3, 2), (8.0, 15.0)), 30.0))
     assert shallow[:2] == (0.4, 0.0)
     assert deep[1] == pytest.approx(1.95 / 33)
-
-
-def test_bending_strain_falls_with_the_squared_cosine():
     knots = Morphology.straight((0, 1), 10.0).knots
     middle = np.array([[[0.7, 0.3], [1.3, 0.7]]])
     pad = Morphology(np.concatenate([knots[:, :1], middle, knots[:, 1:]], axis=1), 10.0, fibres=(0, 1))

@@ -9,7 +9,7 @@ from scipy.spatial import KDTree
 
 from padforge.design.morphology import Array, Morphology
 from padforge.fabricate.export import Fabrication
-from padforge.fabricate.fibre_placement import gcode
+from padforge.fabricate.fibre_placement import gcode, plan_toolpath
 from padforge.fabricate.outputs.laying_page import laying_document
 from padforge.fabricate.plan import Plan
 from tests.fabricate.planted import exact_fibre, level_pad, with_settings
@@ -138,6 +138,23 @@ def test_gcode_of_one_family_says_where_fibre_1_starts(fibres, start):
     assert f"; fibre 1 starts {start}\n" in text
     ends = np.vstack([way.corners[[0, -1], :2] for _, way in placed_fibres(run_gcode(text))])
     assert ends[0] == pytest.approx((ends[:, 0].max(), ends[:, 1].min()))
+
+
+@pytest.mark.parametrize(("acceleration", "max_strain", "feed"), [(9.5, 9e9, 6.0), (26.0, 0.07, 4.0), (9.5, 0.11, 6.0)])
+def test_feed_in_a_bend_follows_from_its_radius(acceleration, max_strain, feed):
+    """Leads to one side turn by quarters of a circle of 4 mm; all else here is straight. Feeds are tenths of 10 mm/s.
+
+    The machine goes by sqrt(9.5 * 4) = 6.16 mm/s, the fibre by 1 - 0.3 / (2 * 4 * 0.07) = 0.464 of them, or by 0.659.
+    """
+    dispenser = {"acceleration_mm_s2": acceleration, "feed_mm_s": 10.0}
+    rules: dict[str, object] = {"min_mean_bend_radius_mm": 4.0}
+    settings = with_settings(pad={"leads": "one side"}, rules=rules, dispenser=dispenser)
+    steps = plan_toolpath(Plan(Morphology.straight(2), settings), 0.3, max_strain)
+    (horizontal,) = (stroke for step in steps for stroke in step.strokes if stroke.fibre == 0)
+    assert (horizontal.feeds_mm_s.min(), horizontal.feeds_mm_s.max()) == (feed, 10.0)
+    slow_mm = horizontal.steps_mm[horizontal.feeds_mm_s == feed].sum()
+    # beside both quarters the needle has half a diameter to get slower in
+    assert slow_mm == pytest.approx(math.pi * 4.0, abs=4 * 2 * 0.3)
 
 
 def test_fibre_settings_set_depth_and_speed():

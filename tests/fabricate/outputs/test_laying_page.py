@@ -8,11 +8,9 @@ import shapely
 from scipy.integrate import quad
 
 from padforge.design.morphology import Morphology
-from padforge.fabricate.export import build
+from padforge.fabricate import MouldSettings, Plan, PrinterSettings, build
 from padforge.fabricate.mesh import mould_mesh
 from padforge.fabricate.outputs import laying_page as laying
-from padforge.fabricate.plan import Plan
-from padforge.fabricate.settings import MouldSettings, PrinterSettings
 from tests.fabricate.planted import exact_fibre, with_settings
 
 

@@ -7,9 +7,7 @@ import pytest
 
 from padforge.common.files import provenance
 from padforge.common.plotting import save_figure
-from padforge.design.morphology import Morphology
-from padforge.design.report import draw_plan
-from padforge.design.settings import Contact
+from padforge.design import Contact, Morphology, draw_plan
 from padforge.fabricate import build
 from padforge.report import write_report
 from tests.design import test_reports as made_up

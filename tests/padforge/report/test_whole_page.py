@@ -30,6 +30,7 @@ def test_page_of_all_stages(page: Path, golden) -> None:
         assert text.count(f'id="{anchor}"') == 1
     assert text.count("data:image/") == 7  # plan, press, mould, tracks, orientation, crossing, and the study's figure
     assert len(text) < MAX_PAGE_BYTES
+    assert not re.search("https?://", text)
 
 
 def test_page_with_a_study_of_lost_fibres_and_presses_of_known_force(pad: Path, golden) -> None:
