@@ -29,12 +29,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from padforge.common.parallel import one_thread
 from padforge.design.contact import grid_positions, relative_stretch
 from padforge.design.kernels.error_bound import error_bound
+from padforge.design.kernels.leave_one_out import leave_one_out_errors
 from padforge.design.morphology import Array, Ints, Morphology
 from padforge.design.objectives.fibre_loss import failure_masks, failure_shares
-from padforge.design.objectives.leave_one_out import leave_one_out_errors
 from padforge.design.paths.keep_outs import is_outside
 from padforge.design.settings import (
     Contact,
@@ -89,7 +88,6 @@ class PressWindow(NamedTuple):
         return np.concatenate([self.positions, self.far[partners]])
 
 
-@one_thread()
 def criterion_errors(
     pad: Morphology, contact: Contact, search: SearchSettings, pad_settings: PadSettings
 ) -> list[float]:
@@ -253,7 +251,8 @@ def criterion(
     factor = weights[:, None] / WIDTH
     scaled = np.float32(factor * responses[:, rows])
     centred = np.float32(positions[rows] - positions[:n_grid].mean(axis=0))
-    regression, grad_scaled = leave_one_out_errors(scaled, centred, masks, int(free.sum()), RIDGE, differentiate)
+    grad_scaled = np.empty((len(masks), fibres, len(rows)))
+    regression = leave_one_out_errors(scaled, centred, masks, int(free.sum()), RIDGE, grad_scaled)
     gradient[:, :, rows] = REGRESSION_WEIGHT * factor[:fibres] * grad_scaled
     # 2. the bound, over cells of four free corners; between keep-outs there may be none
     side = math.isqrt(n_grid)

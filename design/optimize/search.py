@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from padforge.common import profiling
-from padforge.common.parallel import Checkpoints, State, one_thread, run_tasks
+from padforge.common.parallel import Checkpoints, State, run_tasks
 from padforge.common.progress import OnProgress, ignore_progress
 from padforge.common.settings import Spec, or_default
 from padforge.common.validation import InputError, check_float, check_path, check_type, short_repr
@@ -233,7 +233,6 @@ def stop_on_interrupt(stop: Stop) -> Iterator[None]:
         signal.signal(signal.SIGINT, before)
 
 
-@one_thread()
 def _run_slice(problem: SearchProblem, start: int, state: State | None) -> tuple[State, int, float]:
     """Run the next slice of a start, from its beginning without a `state`; return its state, step and objective."""
     run, until = _open_start(problem, start, state), time.perf_counter() + SLICE_S
