@@ -105,7 +105,7 @@ class FibreSamples:
     margin: float
     all_bends: bool
 
-    @property
+    @cached_property
     def layout(self) -> Layout:
         """Number and spacing of the fibres."""
         return self.pad.layout
