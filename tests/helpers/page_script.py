@@ -1,11 +1,14 @@
-"""The script of a page in Node, with the little of a browser that it asks for, and what it shows as text."""
+"""The script of a page: what it reads of views, and what it shows of them, in Node with the little of a browser."""
 
 import json
+import re
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 import pytest
+
+from padforge.common.server import page_text
 
 BROWSER = Path(__file__).with_name("browser.js")
 
@@ -24,3 +27,9 @@ def shown(page: str, actions: Iterable[tuple[str, str, Any]]) -> str:
     done = node(["-"], return_completed_process=True, input=program, capture_output=True, text=True, encoding="utf-8")
     assert done.returncode == 0, done.stderr
     return done.stdout
+
+
+def names_in_view(page: str) -> set[str]:
+    """Names of the values that a page of sense reads of a view: the two sides of it are written in two languages."""
+    text = page_text("padforge.sense.live", f"pages/{page}", "pages/common.css", "pages/common.js")
+    return set(re.findall(r"\bview\.(\w+)", text))
