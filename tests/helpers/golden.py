@@ -180,9 +180,11 @@ def figure_text(figure: Figure) -> str:
             values = np.asarray(image.get_array(), dtype=float)
             extent = f"{_numbers(image.get_extent())} {image.get_cmap().name} {_numbers(image.get_clim())}"
             lines.append(f"  image {values.shape} {extent}: {_summary(values.reshape(-1, 1))}")
+        alphas = {patch.get_alpha() for patch in axes.patches}
         for patch in axes.patches:
             corners = patch.get_patch_transform().transform_path(patch.get_path()).vertices
-            lines.append(f"  {type(patch).__name__} {to_hex(patch.get_facecolor())}: {_summary(corners)}")
+            shade = to_hex(patch.get_facecolor()) + (f" alpha {patch.get_alpha():.2g}" if len(alphas) > 1 else "")
+            lines.append(f"  {type(patch).__name__} {shade}: {_summary(corners)}")
         for text in axes.texts:
             place = text.xy if isinstance(text, Annotation) else text.get_position()
             lines.append(f"  text {text.get_text()!r} at {_numbers(place)}")

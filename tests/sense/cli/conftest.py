@@ -4,6 +4,7 @@ import shutil
 import sys
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 from unittest import mock
@@ -74,36 +75,20 @@ def short_calibrations() -> Iterator[None]:
         yield
 
 
-def command_in(folder: str) -> Any:
-    """Make a fixture: `padforge_sense` in a copy of the folder that another fixture makes."""
+def command_in(name: str, make: Callable[[Path], Path]) -> Any:
+    """Make a fixture: `padforge_sense` in a copy of the folder that `make` fills once."""
 
     @pytest.fixture
-    def run(padforge_sense: Run, request: pytest.FixtureRequest) -> Run:
-        shutil.copytree(request.getfixturevalue(folder), Path(), dirs_exist_ok=True)
+    def run(padforge_sense: Run, once: Once) -> Run:
+        shutil.copytree(once(name, make), Path(), dirs_exist_ok=True)
         return padforge_sense
 
     return run
 
 
-few, enough, deep = (command_in(folder) for folder in ("few_presses", "enough_presses", "deep_presses"))
-
-
-@pytest.fixture(scope="session")
-def few_presses(once: Once) -> Path:
-    """A folder with `rec` of 60 presses and `model`."""
-    return once("few presses and their model", lambda folder: make_model(folder, 60))
-
-
-@pytest.fixture(scope="session")
-def enough_presses(once: Once) -> Path:
-    """The same with enough presses to learn health from."""
-    return once("enough presses and their model", lambda folder: make_model(folder, 360))
-
-
-@pytest.fixture(scope="session")
-def deep_presses(once: Once) -> Path:
-    """The same with presses of several depths and a localizer of depth and force."""
-    return once("deep presses and their model", make_deep_presses)
+FEW = ("few presses and their model", partial(make_model, presses=60))
+ENOUGH = ("enough presses and their model", partial(make_model, presses=360))  # to learn health from
+few, enough, deep = (command_in(*each) for each in (FEW, ENOUGH, ("deep presses and their model", make_deep_presses)))
 
 
 @pytest.fixture

@@ -1,7 +1,6 @@
 """`import`, `export`, `calibrate`, `locate`, `deploy` and `live`: what they write and show."""
 
 import json
-import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -11,6 +10,7 @@ import numpy as np
 import pytest
 import scipy.io
 
+from padforge.common.files import sha256
 from padforge.design import Morphology
 from padforge.sense import Recording, import_mat
 from padforge.sense.cli import options
@@ -30,23 +30,29 @@ from padforge.sense.signals.press_detection import first_readings
 from padforge.sense.simulation.simulated_recording import simulate
 from tests.helpers.folders import files_in
 from tests.helpers.golden import Golden
-from tests.helpers.page_names import names_in_view
+from tests.helpers.page_script import names_in_view
 from tests.sense.cli.conftest import SPEC
 from tests.sense.conftest import first_presses
 
 
-def test_import_notes_a_cut_end(padforge_sense, recording: Recording) -> None:
+def test_import_notes_a_cut_end_and_keeps_the_digests_of_its_files(padforge_sense, recording: Recording) -> None:
     content = {"voltage": recording.readings[:391], "tim": recording.times_s[None, :391]}
     scipy.io.savemat("cut.mat", content | {"pos": recording.presses_mm[:10].T})
     note = "cut.mat: the last of 10 presses is left out, with 31 of 40 readings\n"
     code, out, err = padforge_sense("import", "cut.mat")
-    assert (code, err) == (0, note)
-    assert out.startswith("9 presses over ")
+    assert (code, err, out[:14]) == (0, note, "9 presses over")
     imported = Recording.open("out/cut/recording")
     assert (imported, imported.source["note"] in note) == (import_mat("cut.mat"), True)
-    assert set(json.loads(Path("out/cut/recording/start.json").read_text())["provenance"]["inputs"]) == {"cut.mat"}
     assert padforge_sense("export", "cut.mat", "cut.csv")[2] == note
     assert padforge_sense("export", "out/cut/recording", "again.csv")[2] == ""
+    np.savetxt("plain.txt", np.column_stack([recording.times_s, recording.readings])[:400])
+    spans_s = recording.times_s[[recording.down_command[:9], recording.up_command[:9]]]
+    np.savetxt("presses.txt", spans_s.T, header="down_s up_s", comments="")
+    columns = ("--columns", "time=1,fibres=2-5", "--presses", "presses.txt")
+    assert padforge_sense("import", "plain.txt", *columns)[0] == 0
+    for name, files in (("cut", {"cut.mat"}), ("plain", {"plain.txt", "presses.txt"})):
+        made_by = json.loads(Path(f"out/{name}/recording/start.json").read_text())["provenance"]
+        assert made_by["inputs"] == {file: sha256(Path(file)) for file in files}
 
 
 def test_recording_line_counts_what_is_unknown_and_missing() -> None:
@@ -108,21 +114,11 @@ def test_two_fingers_are_marked_in_the_table(enough) -> None:
     """A recording is superposed on itself, some presses later."""
     whole = Recording.open("rec")
     readings = whole.readings + np.roll(whole.readings, -7 * 40, axis=0) - np.median(whole.readings, axis=0)
-    two = replace(whole, readings=readings)
-    two.save("two", {})
+    (two := replace(whole, readings=readings)).save("two", {})
     enough("locate", "--model", "model", "two")
     unlike = np.genfromtxt("places.csv", delimiter=",", names=True)["unlike"]
     assert 0 < unlike.mean() < 1
     np.testing.assert_array_equal(unlike, LocalizerModel.load("model").predict(two).unlike)
-
-
-def test_deploy_names_a_missing_library(few, monkeypatch: pytest.MonkeyPatch) -> None:
-    for name in [name for name in sys.modules if name.startswith("padforge.sense.deploy.onnx")]:
-        monkeypatch.delitem(sys.modules, name)
-    monkeypatch.setitem(sys.modules, "onnx", None)
-    code, out, err = few("deploy", "--model", "model", "localizer.onnx")
-    assert (code, out) == (2, "")
-    assert err == "padforge: this needs onnx, which is not installed: pip install 'padforge[deploy]'\n"
 
 
 def test_locate_looks_at_the_readings_nearest_to_a_moment(few) -> None:
@@ -177,9 +173,12 @@ def views(monkeypatch: pytest.MonkeyPatch) -> list[dict]:
     return views
 
 
-def test_live_replays_a_recording(replay, views: list[dict]) -> None:
-    code, out, err = replay("--json")
+def test_live_replays_a_recording_to_the_page_viewers_and_programs(replay, views: list[dict], golden: Golden) -> None:
+    outputs = ("--tcp", "0", "--token", "a word of sixteen", "--foxglove", "0", "--rerun", "pad.rrd")
+    code, out, err = replay("--json", *outputs)
     assert code == 0, err
+    golden("cli/live_addresses.txt", err, forget=[r"(?<=127\.0\.0\.1:)\d+"])
+    assert Path("pad.rrd").stat().st_size > 10_000
     told = [json.loads(line) for line in out.splitlines()]
     assert {each["event"] for each in told} == {"estimate"}
     final = [each["press"] for each in told if each["final"]]
@@ -189,14 +188,6 @@ def test_live_replays_a_recording(replay, views: list[dict]) -> None:
     assert {view["mirrored"] for view in views} == {True}
     assert [view["ended"] for view in views][-2:] == ["", "ended"]
     assert names_in_view("live.html") <= views[-1].keys()
-
-
-def test_live_sends_to_viewers_and_programs(replay, golden: Golden) -> None:
-    token = "a word of sixteen"
-    code, _, err = replay("--tcp", "0", "--token", token, "--foxglove", "0", "--rerun", "pad.rrd")
-    assert code == 0, err
-    golden("cli/live_addresses.txt", err, forget=[r"(?<=127\.0\.0\.1:)\d+"])
-    assert Path("pad.rrd").stat().st_size > 10_000
 
 
 LOST = RigFault("stale", "the board does not send", "reset it")
@@ -221,6 +212,7 @@ def test_live_shows_a_rig_until_it_ends(few, views, monkeypatch, error, code: in
     assert said in err.splitlines()[-1]
     assert err.count("touches are simulated") == 1
     assert {view["title"] for view in views} == {"simulated touches, mine"}
+    assert views[-1]["ended"] == (str(error) or "ended")
     board.close.assert_called_once()
     assert told.call_args[0][1] is True
     assert {view["mirrored"] for view in views} == {True}

@@ -67,15 +67,17 @@ def test_locate_works_without_optional_libraries(few) -> None:
         "sense locate --model model rec",
         "sense live --model model --replay short --speed 1e6 --port 0",
         "sense calibrate rec --out again",
+        "sense deploy --model model localizer.onnx",
         "run --out pad",
     )
     done = subprocess.run([sys.executable, "-c", BARE, *lines], capture_output=True, text=True, check=True)
-    located, shown, calibrated, run = json.loads(done.stdout)
+    located, shown, calibrated, deployed, run = json.loads(done.stdout)
     assert located == [0, "60 positions -> places.csv\n", ""]
     assert shown[0] == 0, shown[2]
     assert calibrated[:2] == [2, ""]
     assert calibrated[2].startswith("padforge: this needs ")
     assert calibrated[2].endswith("pip install 'padforge[design]'\n")
+    assert deployed == [2, "", "padforge: this needs onnx, which is not installed: pip install 'padforge[deploy]'\n"]
     assert (run[0], run[2].count("\n")) == (2, 1)
     assert run[2].endswith("pip install 'padforge[design,cad]'\n")
 

@@ -1,7 +1,6 @@
 """`record` and `doctor`."""
 
 import json
-import os
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
@@ -20,17 +19,16 @@ from padforge.sense import Recording
 from padforge.sense.formats.ros_recording import import_bag
 from padforge.sense.live import outputs
 from padforge.sense.rig import operation
+from padforge.sense.rig.devices import RigFault
 from padforge.sense.settings import RigSettings
 from tests.emulators.finger import Finger
 from tests.emulators.rigs import emulate_printer, printer_settings
 from tests.helpers.rigs import rig_toml
 from tests.sense.cli.conftest import Run
-from tests.sense.rig.fakes import PAD, RIG, FakeArm, FakeBoard, FingerBoard, Time
-
-EMULATED = pytest.mark.skipif(not hasattr(os, "openpty"), reason="there are no pseudo-terminals here")
+from tests.sense.rig.fakes import PAD, RIG, TERMINALS, FakeArm, FakeBoard, FingerBoard, Time
 
 
-def test_record_writes_beside_its_pad(padforge_sense) -> None:
+def test_record_writes_beside_its_pad_and_presses_as_deep_as_the_contact(padforge_sense) -> None:
     assert padforge_sense("record", "--presses", "4")[0] == 0
     assert Recording.open("out/pad/recording").source["rig"]["presses"] == 4
     Morphology.random(2, 3, 1).save(Path("mine/morphology.json"))
@@ -38,9 +36,7 @@ def test_record_writes_beside_its_pad(padforge_sense) -> None:
     assert code == 0
     assert out.endswith(" -> mine/recording\n")
     assert Recording.open("mine/recording").source["rig"]["seed"] == 7
-
-
-def test_record_follows_the_depth_of_the_contact_and_says_if_the_pad_is_designed_for_another(padforge_sense) -> None:
+    # as deep as the contact, and it is said if the pad is designed for another depth
     Path("soft.toml").write_text("[contact]\ndepth_mm = 2\n[rig]\npresses = 4\n")
     assert padforge_sense("record", "--spec", "soft.toml", "--out", "soft")[::2] == (0, "")
     assert set(Recording.open("soft").depths_mm) == {2.0}
@@ -82,8 +78,8 @@ def test_record_simulates_a_twin(padforge_sense) -> None:
     assert Recording.open("other").fibres == 6
 
 
-@EMULATED
-@pytest.mark.usefixtures("steady")
+@TERMINALS[0]
+@TERMINALS[1]
 def test_record_with_a_printer(padforge_sense) -> None:
     fast = {"rate_hz": 50, "readings_per_press": 30, "clearance_mm": 1, "depth_mm": 1, "travel_mm_s": 400}
     pad = Morphology.straight(2)
@@ -236,11 +232,16 @@ def test_record_by_hand(padforge_sense, monkeypatch: pytest.MonkeyPatch) -> None
     board = FingerBoard(finger, time, {"name": "virtual", "channels": len(pad.knots), "rate_hz": rig.board_rate_hz})
     monkeypatch.setattr(operation, "make_board", lambda rig, inputs: board)
 
+    shown, troubles = list[Mapping[str, Any]](), list[RigFault]()
+
     class WatchedPage(outputs.LivePage):
         def show(self, view: Mapping[str, Any]) -> None:
             super().show(view)
+            shown.append(view)
             finger.look(view)
             assert time() < 1000, "the recording comes to no end"
+            if troubles:
+                raise troubles.pop()
 
         def read_commands(self) -> list[str]:
             return [*super().read_commands(), *finger.commands()]
@@ -257,6 +258,11 @@ def test_record_by_hand(padforge_sense, monkeypatch: pytest.MonkeyPatch) -> None
     *messages, last = out.splitlines()
     assert sum(line.startswith("counted: x ") for line in messages) == 2
     assert last.startswith(f"{len(recording.presses_mm)} presses")
+    assert shown[-1]["ended"] == "ended"
+    troubles.append(RigFault("lost", "the board is gone", "see why"))
+    with time.of_all():
+        assert padforge_sense(*by_hand[:-1], "again")[0] == 1
+    assert shown[-1]["ended"] == "the board is gone; see why"
 
 
 def test_doctor_examines_each_device_without_the_other(padforge_sense, golden, monkeypatch) -> None:

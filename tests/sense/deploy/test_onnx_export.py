@@ -41,16 +41,12 @@ def graph_inputs(recording: Recording, fibre_mask: np.ndarray) -> dict[str, np.n
     return {"readings": interpolate_gaps(recording.readings), **commands, "fibre_mask": fibre_mask}
 
 
-def check_positions(positions_mm: Any, expected: Localization) -> None:
-    assert np.shape(positions_mm) == expected.positions_mm.shape
-    assert np.hypot(*(np.asarray(positions_mm) - expected.positions_mm).T).max() < MAX_DIFFERENCE_MM
-
-
 def check_graph(graph: onnxruntime.InferenceSession, inputs: dict[str, np.ndarray], expected: Localization) -> None:
     """Compare positions, deviations and radii."""
     names = ["std_mm", "r50_mm", "r90_mm"]
     positions_mm, *others = graph.run(["positions_mm", *names], inputs)
-    check_positions(positions_mm, expected)
+    assert np.shape(positions_mm) == expected.positions_mm.shape
+    assert np.hypot(*(np.asarray(positions_mm) - expected.positions_mm).T).max() < MAX_DIFFERENCE_MM
     for name, values in zip(names, others, strict=True):
         np.testing.assert_allclose(np.asarray(values), getattr(expected, name), rtol=1e-4)
 
@@ -90,7 +86,7 @@ def test_graph_gives_the_predictions_at_every_reading(graph, localizer, recordin
     assert sorted(set(n_complete)) == list(range(18))
 
 
-def test_graph_gives_the_predictions_of_presses_without_pauses(graph, localizer, recording) -> None:
+def test_graph_gives_the_predictions_of_presses_without_pauses(graph, localizer, recording, brief) -> None:
     """Short ones, too, and from the first readings on: windows and rests end where a press or the recording begins."""
     edges = np.cumsum(np.random.default_rng(0).choice([1, 2, 3, 7, 12, 25], 2 * 60))
     until = edges[-1] + 2
@@ -101,10 +97,7 @@ def test_graph_gives_the_predictions_of_presses_without_pauses(graph, localizer,
         fibre_mask = scaled.fibre_mask & ~np.isin(np.arange(4), failed)
         expected = localizer.predict_features(replace(scaled, fibre_mask=fibre_mask))
         check_graph(graph, graph_inputs(quick, fibre_mask), expected)
-
-
-def test_graph_follows_a_finger_that_slides(graph, localizer, brief) -> None:
-    """After the touch of a press come the readings of another one."""
+    # a finger that slides: after the touch of a press come the readings of another one
     readings = np.array(brief.readings)
     for press in range(0, 38, 2):
         here, there = (brief.down_command[row] + np.arange(8, 20) for row in (press, press + 1))
@@ -176,7 +169,7 @@ def test_script_of_the_tutorial_predicts_positions(localizer, brief, exported, t
     assert np.array_equal(names["down_command"], brief.down_command)
     presses = localizer.scaled_features(brief)
     without_last = localizer.predict_features(presses[np.arange(len(brief.down_command) - 1)])
-    check_positions(names["positions_mm"][:-1], without_last)
+    np.testing.assert_allclose(names["positions_mm"][:-1], without_last.positions_mm, atol=MAX_DIFFERENCE_MM)
 
 
 def test_onnxruntime_sends_no_telemetry(monkeypatch: pytest.MonkeyPatch) -> None:

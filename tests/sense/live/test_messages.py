@@ -177,18 +177,16 @@ def decode(channel: dict[str, Any], content: bytes) -> Any:
     return message_factory.GetMessageClass(pool.FindMessageTypeByName(channel["schemaName"])).FromString(content)
 
 
-def test_foxglove_names_a_port_in_use(foxglove_port: int) -> None:
-    with pytest.raises(InputError, match=rf"^port {foxglove_port} of .*: another program uses it; .*--foxglove"):
-        FoxgloveOutput(foxglove_port, **AREA)
-
-
 def test_foxglove(golden: Golden) -> None:
     """All topics with their schemas, and the messages that a client gets that subscribes to all."""
     sent = messages()
     with FoxgloveOutput(0, **AREA) as output:
         for message in sent:
             output.send(message)
-        client = FoxgloveClient(int(output.url.rpartition(":")[2]))
+        port = int(output.url.rpartition(":")[2])
+        with pytest.raises(InputError, match=rf"^port {port} of .*: another program uses it; .*--foxglove"):
+            FoxgloveOutput(port, **AREA)
+        client = FoxgloveClient(port)
         received = client.messages({SCENE, *(message.topic for message in sent)})
         lines = ["at first " + next(received)[1].decode()]  # the latest health, though it was sent before
         for message in sent:

@@ -197,10 +197,7 @@ def test_a_press_that_the_next_one_cuts_off_ends_where_that_began(recording, has
     assert events[events.index(last) + 1].press == 2
     assert_as_a_whole(part, hasty, [last])
     assert [each.press for each in live.presses] == [0, 1, 2, 3]
-
-
-def test_a_tap_that_its_release_shows_is_estimated_from_then_on(recording, hasty) -> None:
-    part = first_presses(recording, 1)
+    part = first_presses(recording, 1)  # a tap that its release shows is estimated from then on
     part = replace(part, up_command=part.down_command + 5)
     _, events = replay(part, hasty, (8, 3))
     assert [(each.since, each.readings) for each in events] == [("lift", n) for n in range(4, RELEASE + 1)]

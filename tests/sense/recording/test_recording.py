@@ -33,9 +33,7 @@ from tests.helpers.rigs import RECTANGLE
 def test_save_and_open_round_trip_and_torn_readings(recording: Recording, folder: Path) -> None:
     opened = Recording.open(folder)
     assert opened == recording
-    assert opened.digest == recording.digest
-    assert opened.source == recording.source
-    assert opened.torn_presses == 0
+    assert (opened.digest, opened.source, opened.torn_presses) == (recording.digest, recording.source, 0)
     assert sorted(path.name for path in folder.parent.iterdir()) == ["run"]
     (folder.parent / "empty").mkdir()
     recording.save(folder.parent / "empty", {})  # an empty folder is filled
@@ -255,6 +253,7 @@ def test_folders_are_refused_in_these_words_and_left_as_they_are(made: Recording
         "format": opened("format", format="padforge-recording/0"),
         "event": opened("event", old=started, new='"event": "began"'),
         "number": opened("number", old="{" + started, new="3\n{" + started),
+        "no number": opened("no-number", old='"press": 0', new='"pres": 0'),
         "torn": opened("torn", old="{" + started, new="{event"),
         "place": opened("place", old=done, new=f'{done} "at_mm": [1, 2],'),
         "force": opened("force", old=done, new=f'{done} "force_n": "much",'),

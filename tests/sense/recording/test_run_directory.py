@@ -254,11 +254,8 @@ def test_begin_numbers_presses(tmp_path):
     def press(recorder, number=None, aborted=False):
         recorder.append(recorder.n_readings / 10 + np.array([0, 0.1]), np.zeros((2, FIBRES)))
         recorder.begin((0, 0), recorder.n_readings - 1, number)
-        if not aborted:
-            recorder.finish(recorder.n_readings)
-            return
-        for reason in ("the arm stopped", "a second time"):
-            recorder.abort(reason)
+        for end in (recorder.abort, recorder.abort) if aborted else (recorder.finish,):
+            end("the arm stopped" if aborted else recorder.n_readings)
 
     with Recorder(tmp_path / "run", FIBRES, {"kind": "made"}, {}) as recorder:
         for number, aborted in ((None, False), (None, False), (None, True), (None, False), (7, False)):

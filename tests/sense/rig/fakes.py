@@ -1,5 +1,6 @@
 """An arm and a board in virtual time, on a pad of a formula: minutes of pressing take moments."""
 
+import os
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
@@ -25,6 +26,13 @@ RIG = RigSettings.model_validate(
     | {"pad_mm": (0.0, -400.0), "contact_mm": 50.0, "box_mm": (-100, 100, -500, -300, 40, 120)}
     | {"travel_mm_s": 400, "press_mm_s": 100, "acceleration_mm_s2": 2000}
 )
+
+
+TERMINALS = [
+    pytest.mark.skipif(not hasattr(os, "openpty"), reason="there are no pseudo-terminals here"),
+    pytest.mark.usefixtures("steady"),
+]
+"""Marks of tests through pseudo-terminals, by the clock that stands still while a thread gets no processor."""
 
 
 @dataclass
@@ -111,17 +119,19 @@ class FakeArm:
             self._from = None
 
 
-class FakePad:
-    """Four fibres at rest from 1.8 to 2.1 V, which read up to 50 mV less for each mm of depth, the nearer the more."""
+def fake_pad() -> Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray[np.float64]]:
+    """Four fibres at rest from 1.8 to 2.1 V, which read up to 50 mV less for each mm of depth, the nearer the more.
 
-    def __init__(self) -> None:
-        self._rng = np.random.default_rng(1)
+    Returns the (n, 4) readings, V, with a noise of 2 mV, at (n, 2) positions and (n,) depths.
+    """
+    rng = np.random.default_rng(1)
 
-    def volts(self, positions_mm: NDArray[np.float64], depths_mm: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the (n, 4) readings, V, with a noise of 2 mV, at (n, 2) positions and (n,) depths."""
+    def volts(positions_mm: NDArray[np.float64], depths_mm: NDArray[np.float64]) -> NDArray[np.float64]:
         away_mm = positions_mm[:, [1, 1, 0, 0]] - np.array([-5.6, 5.6, -5.6, 5.6])
-        rest_v = np.array([1.8, 1.9, 2.0, 2.1]) + 0.002 * self._rng.standard_normal((len(depths_mm), FIBRES))
+        rest_v = np.array([1.8, 1.9, 2.0, 2.1]) + 0.002 * rng.standard_normal((len(depths_mm), FIBRES))
         return rest_v - 0.05 * np.maximum(depths_mm, 0.0)[:, None] * np.exp(-np.abs(away_mm) / 10)
+
+    return volts
 
 
 class FakeBoard:
@@ -129,7 +139,7 @@ class FakeBoard:
 
     def __init__(self, arm: FakeArm, rig: RigSettings = RIG) -> None:
         self.arm, self.rig, self.frame = arm, rig, RobotFrame.from_settings(rig)
-        self.volts = FakePad().volts
+        self.volts = fake_pad()
         self.rate_hz, self.taken_s = rig.board_rate_hz, arm.time()
         self.lose = self._unreported = 0
         self.lost = self.stalled = False

@@ -23,7 +23,7 @@ from padforge.sense.rig.config import RigConfig
 from padforge.sense.settings import RigSettings
 from padforge.sense.signals.press_detection import PressDetector, PressEvent
 from tests.emulators.finger import SCATTER_MM, Finger
-from tests.helpers.page_names import names_in_view
+from tests.helpers.page_script import names_in_view
 from tests.sense.rig.fakes import FingerBoard, Time, fault_of
 
 
@@ -31,7 +31,7 @@ def config_of(**settings: object) -> RigConfig:
     return RigConfig(Morphology.straight(4), Contact(), RigSettings(**settings), Path("out"), "test")  # type: ignore[arg-type]
 
 
-def test_plan_targets_orders_uniform_ones_in_short_rounds() -> None:
+def test_plan_targets_orders_uniform_ones_in_short_rounds(tmp_path: Path) -> None:
     positions = by_hand.plan_targets(config_of(presses=4 * ROUND, seed=3))
     assert np.array_equal(positions, np.rint(positions))
     ways = np.linalg.norm(np.diff(positions, axis=0), axis=1)
@@ -39,9 +39,7 @@ def test_plan_targets_orders_uniform_ones_in_short_rounds() -> None:
     assert ways.mean() < 0.5 * np.linalg.norm(np.diff(shuffled, axis=0), axis=1).mean()
     for first in range(0, len(positions), ROUND):
         assert (np.ptp(positions[first : first + ROUND], axis=0) > 0.6 * 45).all()
-
-
-def test_plan_targets_keeps_the_order_of_a_file_and_rounds_none_into_a_keep_out(tmp_path: Path) -> None:
+    # those of a file keep their order, and none is rounded into a keep-out
     (tmp_path / "places.csv").write_text("x_mm,y_mm\n3.25,-1\n0,2\n3.25,-1\n")
     places = by_hand.plan_targets(config_of(plan=str(tmp_path / "places.csv")))
     assert places.tolist() == [[3.25, -1], [0, 2], [3.25, -1]]
@@ -287,15 +285,10 @@ def readings(early: np.ndarray, late: np.ndarray) -> np.ndarray:
     return np.repeat([BASELINE, BASELINE + early, BASELINE + late, BASELINE], [10, 10, 10, 1], axis=0)
 
 
-@pytest.fixture
-def validator() -> PressValidator:
+def test_validator_rejects_weak_and_moved_presses_and_detects_that_nothing_touches() -> None:
     validator = PressValidator()
     for _ in range(MIN_PRESSES):
         validator.accept(np.array([PRESS, PRESS]), BASELINE)
-    return validator
-
-
-def test_validator_rejects_weak_and_moved_presses_by_responses_from_the_baseline(validator: PressValidator) -> None:
     np.testing.assert_allclose(by_hand.press_responses(readings(PRESS, 2 * PRESS), 10, 30), [PRESS, 2 * PRESS])
     gaps = readings(PRESS, PRESS)
     gaps[12:18, 0] = np.nan
@@ -305,9 +298,7 @@ def test_validator_rejects_weak_and_moved_presses_by_responses_from_the_baseline
     assert validator.rejection(by_hand.press_responses(readings(PRESS, 1.3 * PRESS), 10, 30)) == ""
     assert "weaker" in validator.rejection(np.array([0.1 * PRESS, 0.1 * PRESS]))
     assert "changed" in validator.rejection(by_hand.press_responses(readings(PRESS, PRESS[::-1]), 10, 30))
-
-
-def test_validator_detects_that_nothing_touches(validator: PressValidator) -> None:
+    # whether nothing touches the pad
     pressed = BASELINE + PRESS
     assert not validator.is_untouched(pressed, BASELINE, held_s=5.0)
     assert validator.is_untouched(BASELINE + 0.1 * PRESS, BASELINE, held_s=2.0)

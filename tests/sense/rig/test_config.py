@@ -141,19 +141,6 @@ def run(tmp_path_factory) -> Path:
     return out
 
 
-def test_make_plan_refuses_to_resume_into_a_new_keep_out(tmp_path):
-    pad = Morphology.random((1, 3), 2, 0, (8.0, 15.0))
-    plan = make_plan(pad, RIG, np.random.default_rng(0))
-    with open_recorder(config_of(tmp_path, pad), plan.to_rows(), tmp_path, False, IDENTITIES):
-        pass
-    assert resumed_plan(tmp_path, pad) == plan.to_rows()
-    x, y = plan.positions_mm[1].tolist()
-    hole = ((x - 1, y - 1), (x + 1, y - 1), (x, y + 1))
-    config = replace(config_of(tmp_path, pad), pad_settings=PadSettings(keep_out_mm=(hole,)))
-    with pytest.raises(InputError, match=r"press 1, at .* lies in a keep-out"):
-        load_or_make_plan(config, resume=True)
-
-
 def test_resume_keeps_the_plan_and_accepts_other_limits_addresses_and_controllers(run, tmp_path):
     """Another arm, tool, board or pad is in the table of refusals."""
     plan, out = resumed_plan(run), Path(shutil.copytree(run, tmp_path / "run"))

@@ -1,14 +1,11 @@
 """The press loop in virtual time: every press is kept, whatever breaks, and the arm is stopped and lifted off first."""
 
 import contextlib
-import os
 import signal
 import threading
 import time
-from contextlib import closing
 from functools import partial
 from pathlib import Path
-from typing import Any
 from unittest.mock import Mock
 
 import numpy as np
@@ -16,17 +13,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from padforge.design.settings import PUBLISHED_CONTACT
 from padforge.sense.recording.press_plan import PressPlan
 from padforge.sense.recording.recording import Recording
 from padforge.sense.recording.run_directory import Recorder, read_journal
-from padforge.sense.rig import operation
-from padforge.sense.rig.arms.ur5 import UR5
-from padforge.sense.rig.config import RigConfig
 from padforge.sense.rig.devices import BoardSamples, RigFault
 from padforge.sense.rig.press_loop import Averager, DiskThread, PressLoop, check_plan
 from tests.sense.rig import fakes
-from tests.sense.rig.fakes import PAD, RIG, FakeArm, FakeBoard, Time
+from tests.sense.rig.fakes import RIG, FakeArm, FakeBoard, Time
 
 PLAN = PressPlan(np.array([[0, 0], [5, 3], [-5, 4], [2, -6], [0, 5], [3, 3]], float), np.full(6, 4.0))
 FOUR = PressPlan(PLAN.positions_mm[:4], PLAN.depths_mm[:4])
@@ -116,22 +109,6 @@ def test_run_checks_a_changed_plan_before_its_next_press(tmp_path):
     assert len(arm.moves) == 3  # of the press before
 
 
-@pytest.mark.parametrize(
-    ("fault", "time_s"), [("protective_stop", 0.05), ("emergency_stop", 0.5), ("lost", 0.71), ("lost", 1.3)]
-)
-def test_run_loses_no_finished_press_by_a_fault_of_the_arm(tmp_path, fault, time_s):
-    arm, board, options = rig()
-    arm.hook = lambda arm: setattr(arm, fault, arm.time() > 100 + time_s)
-    assert fault_of(tmp_path / "run", arm, board, options, ".", FOUR) == fault
-    assert arm.stops >= 1
-    assert arm.time() - 100 < time_s + 1
-    done = n_done(tmp_path / "run")
-    arm, board, options = rig()
-    run(tmp_path / "run", arm, board, options, FOUR)
-    assert np.array_equal(Recording.open(tmp_path / "run").presses_mm, FOUR.positions_mm)
-    assert len(arm.moves) == 3 * (len(FOUR) - done)
-
-
 @pytest.mark.parametrize(("silent_s", "end_mm"), [(0.9, 60), (3.0, 46)])
 def test_run_retreats_as_soon_as_states_come_again(tmp_path, silent_s, end_mm):
     """A state that is too old ends the recording, and the tool is pressed into the pad."""
@@ -180,7 +157,15 @@ def sensor_lost(arm, board):
     arm.force_n = None if arm.pose[2] < 48 or arm.force_n is None else 0.0
 
 
+def arm_fails(arm, board, cause, time_s):
+    setattr(arm, cause, arm.time() > 100 + time_s)
+
+
 FAULTS = {
+    "a protective stop at first": (partial(arm_fails, cause="protective_stop", time_s=0.05), "protective_stop", None),
+    "an emergency stop": (partial(arm_fails, cause="emergency_stop", time_s=0.5), "emergency_stop", None),
+    "the link is lost above the pad": (partial(arm_fails, cause="lost", time_s=0.71), "lost", None),
+    "the link is lost": (partial(arm_fails, cause="lost", time_s=1.3), "lost", None),
     "the board vanishes": (partial(board_lost, lost=True), "lost", 60),
     "the board stalls": (partial(board_lost, stalled=True), "stale", 60),
     "the board is silent, but raises nothing": (partial(board_lost, rate_hz=1e-3), "deadline", 60),
@@ -194,7 +179,7 @@ FAULTS = {
 """What breaks at every poll, the cause of the fault, and the height of the tool at the end if it can be lifted."""
 
 
-def test_run_stops_and_retreats_and_says_whether_the_tool_stays_on_the_pad(tmp_path, golden):
+def test_run_stops_retreats_says_whether_the_tool_stays_on_the_pad_and_is_resumed(tmp_path, golden):
     reports = []
     for name, (trouble, cause, end_mm) in FAULTS.items():
         arm, board, options = rig()
@@ -206,7 +191,13 @@ def test_run_stops_and_retreats_and_says_whether_the_tool_stays_on_the_pad(tmp_p
         if end_mm is not None:
             assert arm.stops >= 1, name
             assert arm.pose[2] == pytest.approx(end_mm, abs=2), name
-        reports.append(f"{name}, {n_done(tmp_path / name)} presses done:\n    [{cause}] {caught.value}")
+        assert arm.time() < 110, name
+        done = n_done(tmp_path / name)
+        reports.append(f"{name}, {done} presses done:\n    [{cause}] {caught.value}")
+        arm, board, options = rig()
+        run(tmp_path / name, arm, board, options, FOUR)  # what was done is not pressed again
+        assert np.array_equal(Recording.open(tmp_path / name).presses_mm, FOUR.positions_mm), name
+        assert len(arm.moves) == 3 * (len(FOUR) - done), name
     golden("rig/faults.txt", "\n".join(reports))
 
 
@@ -302,12 +293,9 @@ def test_disk_thread_stops_after_a_failure() -> None:
     with DiskThread() as disk:
         disk.submit(done.append, 1)
         disk.submit(full)
-        disk.submit(done.append, 2)
-        for _ in range(2):
+        for call in (lambda: disk.submit(done.append, 2).result(5), disk.check) * 2:
             with pytest.raises(OSError, match="No space"):
-                disk.submit(done.append, 3).result(5)
-            with pytest.raises(OSError, match="No space"):
-                disk.check()
+                call()
     assert done == [1]
 
 
@@ -351,66 +339,3 @@ def test_interrupts_do_not_keep_the_tool_on_the_pad(tmp_path: Path, error: type[
     arm = FakeArm(Time())
     arm.hook = interrupt_often
     run_until(arm, tmp_path / "run", error)
-
-
-def test_record_handles_a_second_ctrl_c_after_the_loop(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """If the disk hangs, nothing else could end the program."""
-    received = []
-
-    class InterruptedLoop:
-        def __init__(self, *devices: object, **more: object) -> None:
-            pass
-
-        def run(self, *plan: object) -> None:
-            for _ in range(2):
-                try:
-                    signal.raise_signal(signal.SIGINT)
-                except KeyboardInterrupt:
-                    received.append(signal.SIGINT)
-            raise KeyboardInterrupt
-
-    arm = FakeArm(Time())
-    monkeypatch.setattr(operation, "PressLoop", InterruptedLoop)
-    monkeypatch.setattr(operation, "load_device", lambda group, name: lambda rig: arm)
-    monkeypatch.setattr(operation, "make_board", lambda rig, inputs: FakeBoard(arm))
-    config = RigConfig(PAD, PUBLISHED_CONTACT, RIG, tmp_path / "run", "test")
-    with pytest.raises(KeyboardInterrupt):
-        operation.record("ur5", config)
-    assert received == [signal.SIGINT] * 2
-
-
-@pytest.mark.slow
-def test_emulated_arm_retreats_from_force_however_slow_the_disk(robots: Any, host: str, tmp_path, monkeypatch) -> None:
-    """20 N/mm at 10 mm/s: a tenth of a second without a check costs 20 N, and the disk would take half a press."""
-    robot = robots.get("e", pose=(0.0, -400.0, 60.0, 0.0, np.pi, 0.0), surface_mm=50, stiffness_n_mm=20.0)
-    slow = {"press_mm_s": 10.0, "clearance_mm": 2.0}
-    options = RIG.model_copy(update={"max_force_n": 20.0, "readings_per_press": 20, **slow})
-    board = FakeBoard(FakeArm(time.monotonic))  # pyright: ignore[reportArgumentType]
-    arm, stopped, fsync = UR5(host), threading.Event(), os.fsync
-    arm_stop = arm.stop
-
-    def stop() -> None:
-        arm_stop()
-        stopped.set()
-
-    def slow_fsync(file: int) -> None:
-        stopped.wait(1.0)
-        fsync(file)
-
-    with closing(arm):
-        arm.connect()
-        monkeypatch.setattr(arm, "stop", stop)
-        with Recorder(tmp_path / "run", 4, {}, {}) as recorder:
-            monkeypatch.setattr(os, "fsync", slow_fsync)
-            with pytest.raises(RigFault, match=r"allowed 20 N; the tool was lifted off"):
-                PressLoop(arm, board, recorder, options).run(  # pyright: ignore[reportArgumentType]
-                    PressPlan(np.zeros((1, 2)), np.array([5.0]))
-                )
-            monkeypatch.setattr(os, "fsync", fsync)
-    rows = robot.pose_log.rows()
-    over = rows[rows[:, 7] > 20]
-    assert over[:, 7].max() < 60
-    assert over[-1, 0] - over[0, 0] < 2
-    assert rows[-1, 7] == 0
-    assert (rows[-3:, 1:4] == (0, -400, 60)).all()
-    robots.free()

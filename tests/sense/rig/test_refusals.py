@@ -16,10 +16,11 @@ import numpy as np
 import pytest
 
 from padforge.design import Contact, Morphology
-from padforge.design.settings import PUBLISHED_CONTACT
+from padforge.design.settings import PUBLISHED_CONTACT, PadSettings
 from padforge.fabricate import build
 from padforge.sense.recording.press_plan import PressPlan
 from padforge.sense.recording.run_directory import FORMAT, START
+from padforge.sense.rig import config as rig_config
 from padforge.sense.rig import devices
 from padforge.sense.rig.arms.printer import Printer
 from padforge.sense.rig.arms.ur5 import UR5
@@ -27,14 +28,6 @@ from padforge.sense.rig.boards import due, line_board
 from padforge.sense.rig.boards.board_reader import select_inputs
 from padforge.sense.rig.boards.line_board import LineAssembler, LineBoard, LineDecoder, LineHeader, LineSample
 from padforge.sense.rig.by_hand import open_recorder_by_hand, plan_targets
-from padforge.sense.rig.config import (
-    RigConfig,
-    RobotFrame,
-    load_or_make_plan,
-    locate_on_bed,
-    open_recorder,
-    plan_notice,
-)
 from padforge.sense.rig.devices import ArmState, RigFault
 from padforge.sense.rig.press_loop import check_plan
 from padforge.sense.rig.safety import Limits, check_probe, check_start_state, check_state, check_target, check_tcp
@@ -68,8 +61,8 @@ def state(limits: Limits = LIMITS, until_s: float = np.inf, **change: Any) -> Ca
 
 def test_limits_and_states_are_refused_in_these_words(golden) -> None:
     rows: Rows = {
-        "no contact height": lambda: RobotFrame.from_settings(rig(contact_mm=None)),
-        "no place of the pad": lambda: RobotFrame.from_settings(rig(pad_mm=None)),
+        "no contact height": lambda: rig_config.RobotFrame.from_settings(rig(contact_mm=None)),
+        "no place of the pad": lambda: rig_config.RobotFrame.from_settings(rig(pad_mm=None)),
         "no workspace": lambda: Limits.from_settings(rig(box_mm=None)),
         "a workspace from right to left": lambda: Limits.from_settings(rig(box_mm=(1, -1, -2, 2, 0, 90))),
         "no depth": lambda: Limits.from_settings(rig(max_depth_mm=0.0)),
@@ -226,14 +219,16 @@ CHANGES: dict[str, Any] = {
     **{"tool_rad": (0.1, 3.1, 0.0), "tcp_mm": (0.0, 0.0, 150.0), "mirrored": True},
 }
 """Settings that change what a press is."""
+MIDDLE_OUT = PadSettings(keep_out_mm=(((-1.0, -1.0), (1.0, -1.0), (0.0, 1.0)),))
 
 
 def test_recordings_are_not_resumed_in_these_words(golden, tmp_path: Path) -> None:
     run, hand, broken = (tmp_path / name for name in ("run", "hand", "broken"))
     options = RIG.model_copy(update={"channels": (0, 1, 2, 3)})
-    identities = {"arm": {"model": "UR5", "serial": "2018", "tcp": [0.0] * 6}, "board": {"name": "due", "serial": "7"}}
-    config = RigConfig(PAD, PUBLISHED_CONTACT, options, run, "test")
-    with open_recorder(config, [[0.0, 0.0, 4.0]], run, False, identities):
+    arm = {"model": "UR5", "serial": "2018", "tcp": [0.0] * 6}
+    identities = {"arm": arm, "board": {"name": "due", "serial": "7", "firmware": "1.0.0"}}
+    config = rig_config.RigConfig(PAD, PUBLISHED_CONTACT, options, run, "test")
+    with rig_config.open_recorder(config, [[0.0, 0.0, 4.0]], run, False, identities):
         pass
     recorder, _, _ = open_recorder_by_hand(replace(config, out=hand), {"name": "due"}, resume=False)
     with recorder:
@@ -243,13 +238,13 @@ def test_recordings_are_not_resumed_in_these_words(golden, tmp_path: Path) -> No
 
     def resumed(out: Path = run, pad: Morphology = PAD, **settings: Any) -> Callable[[], object]:
         other = replace(config, out=out, pad=pad, rig=options.model_copy(update=settings))
-        return lambda: load_or_make_plan(other, resume=True)
+        return lambda: rig_config.load_or_make_plan(other, resume=True)
 
     def opened(device: str, **changed: Any) -> Callable[[], object]:
         other = identities | {device: identities[device] | changed}
-        return lambda: open_recorder(config, [[0.0, 0.0, 4.0]], run, True, other)
+        return lambda: rig_config.open_recorder(config, [[0.0, 0.0, 4.0]], run, True, other)
 
-    folder = tmp_path / "pad"
+    kept_out, folder = replace(config, pad_settings=MIDDLE_OUT), tmp_path / "pad"
     folder.mkdir()
     build(PAD, folder, [], with_settings({"holder": True}))
     frames = {"none": None, "far": json.loads((folder / "fabrication.json").read_text())["frame"] | {"walls_mm": 1e9}}
@@ -273,17 +268,19 @@ def test_recordings_are_not_resumed_in_these_words(golden, tmp_path: Path) -> No
         "another arm": opened("arm", serial="2019"),
         "another tool": opened("arm", tcp=[0.0, 0.0, 149.0, 0.0, 0.0, 0.0]),
         "another board": opened("board", serial="8"),
+        "other firmware": opened("board", firmware="1.0.1"),
+        "a keep-out where it presses": lambda: rig_config.load_or_make_plan(kept_out, resume=True),
         "an adaptive plan by hand": lambda: plan_targets(replace(config, rig=rig(plan="adaptive"))),
-        "a pad that never was in a holder": lambda: locate_on_bed(printer, tmp_path / "none"),
-        "no mould": lambda: locate_on_bed(printer, tmp_path),
-        "a damaged frame": lambda: locate_on_bed(printer, tmp_path / "far"),
+        "a pad that never was in a holder": lambda: rig_config.locate_on_bed(printer, tmp_path / "none"),
+        "no mould": lambda: rig_config.locate_on_bed(printer, tmp_path),
+        "a damaged frame": lambda: rig_config.locate_on_bed(printer, tmp_path / "far"),
         "no recording of the model": lambda: simulated_board_of(tmp_path / "model"),
         "a model of a real pad": model_of("real", {"kind": "rig"}),
         "a model of a twin": model_of("twin", {**simulated, "twin": {"presses": 1500}}),
         "a model of no pad": model_of("nothing", {**simulated, "morphology": {}}),
     }
     golden("rig/refusals_to_resume.txt", refusal_table(rows))
-    assert plan_notice(replace(config, rig=rig(seed=9, presses=30))) == (
+    assert rig_config.plan_notice(replace(config, rig=rig(seed=9, presses=30))) == (
         f"{run}: keeps the plan that it was begun with, [rig] presses = 6, seed = 0"
     )
-    assert plan_notice(config) == ""
+    assert rig_config.plan_notice(config) == ""

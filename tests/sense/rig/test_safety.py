@@ -38,21 +38,36 @@ def test_check_target_passes_only_within_every_limit(pose: list[float], speed: f
         safety.check_target(SAFE, speed, 500, LIMITS)
 
 
-def test_check_target_passes_on_the_limits() -> None:
+def test_checks_pass_on_the_limits_of_settings() -> None:
     """What lies beyond them is in the table of refusals."""
+    rig = RigSettings(box_mm=(-1, 1, -2, 2, 0, 90), contact_mm=30, travel_mm_s=80, press_mm_s=20)
+    update = {"max_depth_mm": 4.5, "acceleration_mm_s2": 700, "max_force_n": 33}
+    expected = Limits(((-1, 1), (-2, 2), (0, 90)), 30, 4.5, 80, 700, max_force_n=33)
+    assert Limits.from_settings(rig.model_copy(update=update)) == expected
     for position in ((-100, Y, Z), (100, Y, Z), (X, -500, Z), (X, -300, Z), (X, Y, 44), (X, Y, 120)):
         safety.check_target((*position, *TOOL), 250, 1200, LIMITS)
     safety.check_target((X, Y, Z, 0.0, math.pi - math.radians(1.99), 0.0), 50, 500, LIMITS)
     replace(LIMITS, tool=(0.0, math.pi * 0.95, 0.0))
     with pytest.raises(ValueError, match="points the tool down"):
         replace(LIMITS, tool=(0.0, math.pi * 0.94, 0.0))
-
-
-def test_limits_from_settings() -> None:
-    rig = RigSettings(box_mm=(-1, 1, -2, 2, 0, 90), contact_mm=30, travel_mm_s=80, press_mm_s=20)
-    update = {"max_depth_mm": 4.5, "acceleration_mm_s2": 700, "max_force_n": 33}
-    expected = Limits(((-1, 1), (-2, 2), (0, 90)), 30, 4.5, 80, 700, max_force_n=33)
-    assert Limits.from_settings(rig.model_copy(update=update)) == expected
+    for degrees in (44.9, -44.9, 45.1, -170.0):
+        with pytest.raises(RigFault, match="at most 45") if abs(degrees) > 45 else contextlib.nullcontext():
+            safety.check_start_state(replace(STILL, pose=(X, Y, Z, *down(math.radians(degrees)))), LIMITS)
+    tcp_mm = 0.0, 0.0, 150.0
+    for each in (tcp_mm, None):
+        safety.check_tcp(each, {"model": "a printer, which has none"})
+    safety.check_tcp(tcp_mm, {"tcp": [0.0, 0.05, 150.09, 0.0, 0.0, 0.0]})
+    with pytest.raises(RigFault, match="tcp_mm"):
+        safety.check_tcp(tcp_mm, {"tcp": [math.nan] * 6})
+    for change in ({"time_s": 9.51}, {"force_n": -39.9}, {"pose": (900.0, 900.0, 44.0 - 0.29, *TOOL)}):
+        safety.check_state(replace(STILL, **change), LIMITS, 10.0, until_s=10.0)
+    for cause, change in (("force", {"sideways_n": math.nan}), ("refused", {"pose": (X, Y, math.nan, *TOOL)})):
+        with pytest.raises(RigFault) as caught:
+            safety.check_state(replace(STILL, **change), LIMITS, 10.0)
+        assert caught.value.cause == cause
+    for force_n in (1e6, None):
+        for check, more in ((safety.check_state, (10.0,)), (safety.check_start_state, ())):
+            check(replace(STILL, force_n=force_n), replace(LIMITS, max_force_n=None), *more)
 
 
 @given(st.floats(-math.pi, math.pi), st.tuples(*[st.floats(-7, 7)] * 3), st.tuples(*[st.floats(-7, 7)] * 3))
@@ -76,46 +91,6 @@ def test_turn_deg_is_the_angle_about_the_axis(a: float, b: float) -> None:
     turn = abs(math.remainder(a - b, 2 * math.pi))
     assert safety.turn_deg(down(a), down(b)) == pytest.approx(math.degrees(turn), abs=1e-4)
     assert safety.turn_deg((0.0, math.pi - 0.03, 0.0), LIMITS.tool) == pytest.approx(0, abs=1e-9)
-
-
-@pytest.mark.parametrize(("degrees", "is_refused"), [(44.9, False), (45.1, True), (-44.9, False), (-170.0, True)])
-def test_check_start_state_limits_the_turn(degrees: float, is_refused: bool) -> None:
-    state = replace(STILL, force_n=0.0, pose=(*SAFE[:3], *down(math.radians(degrees))))
-    with pytest.raises(RigFault, match="at most 45") if is_refused else contextlib.nullcontext():
-        safety.check_start_state(state, LIMITS)
-
-
-def test_check_tcp_compares_with_the_controller() -> None:
-    tcp_mm = 0.0, 0.0, 150.0
-    for each in (tcp_mm, None):
-        safety.check_tcp(each, {"model": "a printer, which has none"})
-    safety.check_tcp(tcp_mm, {"tcp": [0.0, 0.05, 150.09, 0.0, 0.0, 0.0]})
-    with pytest.raises(RigFault, match="tcp_mm"):
-        safety.check_tcp(tcp_mm, {"tcp": [math.nan] * 6})
-
-
-@pytest.mark.parametrize(
-    ("change", "cause"),
-    [
-        ({"time_s": 9.51}, None),
-        ({"force_n": -39.9}, None),
-        ({"pose": (900.0, 900.0, 44.0 - 0.29, *TOOL)}, None),
-        ({"force_n": 0.0, "sideways_n": math.nan}, "force"),
-        ({"pose": (0.0, -400.0, math.nan, *TOOL)}, "refused"),
-    ],
-)
-def test_check_state_accepts_the_limits_and_no_nan(change: dict[str, object], cause: str | None) -> None:
-    """What lies beyond them is in the table of refusals."""
-    state = replace(STILL, **change)  # pyright: ignore[reportArgumentType]
-    with pytest.raises(RigFault) if cause else contextlib.nullcontext() as caught:
-        safety.check_state(state, LIMITS, 10.0, until_s=10.0)
-    assert caught is None or caught.value.cause == cause
-
-
-def test_checks_of_an_unwatched_force() -> None:
-    for force_n in (1e6, None):
-        safety.check_state(replace(STILL, force_n=force_n), replace(LIMITS, max_force_n=None), 10.0)
-        safety.check_start_state(replace(STILL, force_n=force_n), replace(LIMITS, max_force_n=None))
 
 
 def scripted_arm(*script: ArmState | BaseException) -> tuple[mock.Mock, Time]:
@@ -210,16 +185,19 @@ def test_retreat_stops_if_the_force_does_not_fall(force: Callable[[FakeArm], flo
 @pytest.mark.parametrize("late_s", [0.0, 0.2])
 def test_retreat_gives_a_force_time_to_fall(late_s: float) -> None:
     """It has to begin to fall after FALL_START_S, and then along a line."""
+    limit_n = RETREAT_LIMITS.max_force_n or 0.0
 
     def force(arm: FakeArm) -> float:
         remaining = (100 + FALL_END_S + late_s - arm.time()) / (FALL_END_S - FALL_START_S)
-        limit_n = RETREAT_LIMITS.max_force_n or 0.0
         return limit_n + (200 - limit_n) * min(max(remaining, 0.0), 1.0)
 
-    arm = arm_at(DEEP_MM, force)
-    with pytest.raises(RigFault, match="the force does not fall") if late_s else contextlib.nullcontext():
+    check_end(arm_at(DEEP_MM, force), is_allowed=not late_s)
+
+
+def check_end(arm: FakeArm, is_allowed: bool) -> None:
+    with contextlib.nullcontext() if is_allowed else pytest.raises(RigFault, match="the force does not fall"):
         assert retreated(arm).pose[2] == pytest.approx(50 + RETREAT_MM)
-    assert arm.stops == (late_s > 0)
+    assert arm.stops == (not is_allowed)
 
 
 @pytest.mark.parametrize("fault", ["protective_stop", "emergency_stop", "lost", "pose"])
@@ -246,7 +224,7 @@ def test_retreat_lifts_a_tool_too_deep_or_at_the_edge_of_the_box(x: float, y: fl
 @pytest.mark.parametrize(("more_n", "is_allowed"), [(0.9 * MAX_RISE_N, True), (1.2 * MAX_RISE_N, False)])
 def test_retreat_allows_a_force_the_error_of_its_sensor(more_n: float, is_allowed: bool) -> None:
     """The force reads more than at first as the tool begins to move, and none from 2 mm on."""
-    arm = arm_at(DEEP_MM, lambda arm: 80.0 + more_n * (arm.pose[2] > DEEP_MM) if arm.pose[2] < DEEP_MM + 2 else 0.0)
-    with contextlib.nullcontext() if is_allowed else pytest.raises(RigFault, match="the force does not fall"):
-        retreated(arm)
-    assert arm.stops == (not is_allowed)
+    check_end(
+        arm_at(DEEP_MM, lambda arm: 80.0 + more_n * (arm.pose[2] > DEEP_MM) if arm.pose[2] < DEEP_MM + 2 else 0.0),
+        is_allowed,
+    )

@@ -71,7 +71,7 @@ def test_simulated_board_is_the_pad_of_the_recording() -> None:
     assert 0.5 < np.abs(volts - volts[0]).max() / np.abs(recorded.readings - volts[0]).max() < 2
 
 
-def test_simulated_board_is_pressed_to_its_depths_in_turn() -> None:
+def test_simulated_board_is_pressed_to_its_depths_in_turn_and_that_of_a_model_as_it_was(tmp_path: Path) -> None:
     rig = quiet_rig(presses=4, seed=4, depths_mm=(0.5, 5.0), readings_per_press=20)
     time = Time(least_s=0)
     board = SimulatedBoard(Morphology.straight(2), rig, Contact())
@@ -81,10 +81,7 @@ def test_simulated_board_is_pressed_to_its_depths_in_turn() -> None:
         volts = board.read().volts
     swings = [np.ptp(volts[20 * press : 20 * press + 20], axis=0).sum() for press in range(4)]
     assert max(swings[0::2]) < 0.5 * min(swings[1::2])
-
-
-def test_simulated_board_of_a_model_is_that_of_its_simulated_recording(tmp_path: Path) -> None:
-    """Pressed where that was: within what is sensed, and beside the keep-outs."""
+    # of a model: pressed where its recording was, within what is sensed, and beside the keep-outs
     size = RECTANGLE.model_copy(update={"sensed_mm": (10.0, 12.0)})
     pad, rig, time = Morphology.straight(size.layout), quiet_rig(presses=4, readings_per_press=10), Time(least_s=0)
     simulate(pad, rig, pad_settings=size).save(tmp_path / RECORDED, {})

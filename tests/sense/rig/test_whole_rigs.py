@@ -1,7 +1,6 @@
 """A whole rig without hardware: real drivers of an arm and a board, whose emulators share one simulated pad."""
 
 import json
-import os
 import subprocess
 import sys
 import time
@@ -27,13 +26,11 @@ from padforge.sense.rig.press_loop import PressLoop
 from padforge.sense.settings import RigSettings
 from tests.emulators import rigs
 from tests.helpers.rigs import rig_toml
+from tests.sense.rig.fakes import TERMINALS
 
 pytest.importorskip("serial")
 pytest.importorskip("rtde_control")
-pytestmark = [
-    pytest.mark.skipif(not hasattr(os, "openpty"), reason="there are no pseudo-terminals here"),
-    pytest.mark.usefixtures("own_address"),
-]
+pytestmark = [TERMINALS[0], pytest.mark.usefixtures("own_address")]
 
 PAD = Morphology.straight(2)
 RIG = {"rate_hz": 125, "board_rate_hz": 1000, "readings_per_press": 20, "clearance_mm": 5, "max_force_n": "unwatched"}

@@ -12,6 +12,7 @@ from padforge.design import Morphology
 from padforge.sense import PressDetector, Recording, RigSettings, detect_presses, import_mat, simulate
 from padforge.sense.signals.press_detection import Presses, align_to_detected, estimate_commands
 from padforge.sense.simulation.pad_model import Divider, Strain
+from tests.helpers.golden import Golden
 from tests.helpers.rigs import ideal_rig
 
 RATE_HZ, COUNT_V = 14.0, 3.3 / 1023
@@ -148,11 +149,16 @@ def disturb(readings: np.ndarray) -> dict[str, np.ndarray]:
     }
 
 
-@pytest.mark.parametrize("kind", disturb(np.zeros((2, 2))))
-def test_detect_presses_in_disturbed_readings(recording: Recording, kind: str) -> None:
-    recall, false, *_ = evaluate(detect_presses(disturb(recording.readings)[kind], recording.times_s), recording)
-    assert recall >= 0.98
-    assert false <= 0.02
+def test_detect_presses_in_disturbed_readings(recording: Recording, golden: Golden) -> None:
+    """What is detected is kept: models are trained on it, so that a change must be intended."""
+    lines = []
+    for kind, readings in disturb(recording.readings).items():
+        presses = detect_presses(readings, recording.times_s)
+        recall, false, *_ = evaluate(presses, recording)
+        assert recall >= 0.98, kind
+        assert false <= 0.02, kind
+        lines.append(f"{kind}: {len(presses.touched)}, sums {presses.touched.sum()} and {presses.released.sum()}")
+    golden("sense/detected.txt", "\n".join(lines))
 
 
 @settings(max_examples=10)
@@ -166,16 +172,9 @@ def test_update_does_not_depend_on_the_size_of_blocks(recording: Recording, cuts
     assert [event.reading for event in events if event.down] == touched.tolist()
     assert [event.reading for event in events if not event.down] == released[released < 2000].tolist()
     assert [event.down for event in events] == [True, False] * (len(events) // 2) + [True] * (len(events) % 2)
-
-
-def test_update_reports_events_within_two_readings(recording: Recording) -> None:
-    detector = PressDetector(recording.fibres)
-    lags = [
-        i - event.reading
-        for i in range(2000)
-        for event in detector.update(recording.times_s[i : i + 1], recording.readings[i : i + 1])
-    ]
-    assert len(lags) > 90
+    # reading by reading, events are reported within two
+    one = PressDetector(recording.fibres)
+    lags = [i - each.reading for i in range(600) for each in one.update(times[i : i + 1], readings[i : i + 1])]
     assert min(lags) >= 1
     assert np.mean(np.array(lags) <= 2) > 0.95
 
@@ -217,55 +216,6 @@ def test_estimate_commands_makes_a_valid_recording(gaps: list[int], after: int, 
     assert (waited | (times[presses.touched] - times[down_command] <= TOUCH_DELAY_S)).all()
     at_once = up_command == presses.touched + 1
     assert (at_once | (times[presses.released] - times[up_command] <= RELEASE_DELAY_S)).all()
-
-
-def scene(seed: int, rate_hz: float, presses: int, fibres: int = 5) -> tuple[np.ndarray, np.ndarray]:
-    """Times and readings (R, C) with every disturbance at once.
-
-    Presses are short, long, in two steps, with the tip moved, or close to each other, of one fibre or of all, now and
-    then of opposite sign; levels creep, drift and overshoot; readings are spiky, missing, noisier for a time, in steps
-    of a converter, and late now and then.
-    """
-    rng = np.random.default_rng(seed)
-    gaps = np.where(rng.random((presses, 3)) < 0.3, 0.15, rng.uniform(0.4, 3.0, (presses, 3)))
-    down, other, up = (1.5 + np.cumsum(gaps).reshape(-1, 3)).T
-    times = np.cumsum(np.where(rng.random(int((up[-1] + 2) * rate_hz)) < 0.01, 5, rng.uniform(0.9, 1.1)) / rate_hz)
-    readings = np.full((len(times), fibres), 2.0)
-    for start, turn, end in zip(down, other, up, strict=True):
-        first, second = rng.exponential(0.05, (2, fibres)) * (rng.random((2, fibres)) < 0.7)
-        if seed > 7 and rng.random() < 0.2:
-            first *= -1
-        second = np.where(rng.random() < 0.5, first, np.where(rng.random() < 0.5, first * 2, second))
-        for at, step in ((start, first), (turn, second - first), (end, -second)):
-            since = np.maximum(times - at, 0)[:, None]
-            over = 0.15 * np.exp(-since / 1.5) * (step < 0)
-            readings -= step * (np.clip(since / 0.15, 0, 1) * (1 + over + 0.1 * (1 - np.exp(-since / 3))))
-    readings += 0.01 * np.cumsum(rng.standard_normal(readings.shape), axis=0) / rate_hz**0.5 / 3
-    readings += rng.choice([3e-4, 2e-3, 8e-3], fibres) * rng.standard_normal(readings.shape)
-    readings[rng.random(readings.shape) < 3e-3] += 0.4
-    readings[len(times) // 2 : len(times) // 2 + int(2 * rate_hz), 0] = np.nan
-    if seed > 7:
-        third = readings[len(times) // 3 : len(times) // 2]
-        third += 0.03 * rng.standard_normal((len(third), 1))
-        readings[rng.random(readings.shape) < 0.2] = np.nan
-    readings[rng.random(readings.shape) < 0.01] = np.nan
-    return times, np.round(readings / 3.2e-3) * 3.2e-3 if seed % 2 else readings
-
-
-SCENES = {
-    (2, 5.0, 60): (40, 21532, 22152),
-    (3, 100.0, 40): (36, 218694, 224817),
-    (12, 14.0, 200): (121, 527170, 533804),
-}
-"""Number of presses detected, and sums of the readings at which they begin and end."""
-
-
-@pytest.mark.parametrize("seed", SCENES, ids=str)
-def test_detect_presses_of_scenes_is_reproducible(seed: tuple[int, float, int]) -> None:
-    """Models are trained on the detected readings: a change must be intended."""
-    times, readings = scene(*seed)
-    touched, released = detect_presses(readings, times)
-    assert (len(touched), int(touched.sum()), int(released.sum())) == SCENES[seed]
 
 
 def test_align_to_detected_moves_presses_by_a_few_readings_and_keeps_those_not_detected(recording: Recording) -> None:

@@ -1,6 +1,5 @@
 """The printer as an arm, and its numbered lines, through a real pseudo-terminal against the emulated firmware."""
 
-import os
 import re
 from collections.abc import Iterator
 from contextlib import closing, contextmanager, suppress
@@ -17,13 +16,10 @@ from padforge.sense.rig.devices import ArmState, RigFault
 from padforge.sense.settings import RigSettings
 from tests.emulators import printer as firmware
 from tests.emulators.printer import EmulatedPrinter
-from tests.sense.rig.fakes import fault_of
+from tests.sense.rig.fakes import TERMINALS, fault_of
 
 pytest.importorskip("serial")
-pytestmark = [
-    pytest.mark.skipif(not hasattr(os, "openpty"), reason="there are no pseudo-terminals here"),
-    pytest.mark.usefixtures("steady"),
-]
+pytestmark = TERMINALS
 
 AT, BAUD = (80.0, 110.0, 60.0), 115_200
 TCP = (30.0, 0.0, -20.0)

@@ -2,8 +2,7 @@
 
 import sys
 from types import SimpleNamespace
-from typing import Any
-from unittest.mock import MagicMock, call
+from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
@@ -12,7 +11,7 @@ from hypothesis import strategies as st
 
 from padforge.sense.rig.arms import rtde_worker
 from padforge.sense.rig.arms.rtde import HostClock, RtdeReader, major_version
-from padforge.sense.rig.arms.rtde_worker import CommandRejected, UrRtdeControl, lock_arm
+from padforge.sense.rig.arms.rtde_worker import UrRtdeControl
 
 POSE, SPEED, FORCE = (-0.5, -0.3, 0.1, 0.1, 3.0, 0.5), (0.3, 0.0, 0.4, 9.0, 9.0, 9.0), (6.0, 8.0, -25.0, 9.0, 9.0, 9.0)
 
@@ -41,18 +40,6 @@ def library(monkeypatch: pytest.MonkeyPatch) -> MagicMock:
     return interface
 
 
-def test_reader_converts_state(library: MagicMock) -> None:
-    state = RtdeReader("arm", 5).read(1.0)
-    assert library.rate_hz == 500
-    assert state.pose == pytest.approx((-500, -300, 100, 0.1, 3.0, 0.5))
-    assert (state.speed_mm_s, state.force_n, state.sideways_n) == pytest.approx((500, -25.0, 10.0))
-    assert (state.mode, state.runtime) == (7, 1)
-    assert (state.protective_stop, state.emergency_stop) == (False, False)
-    without = RtdeReader("arm", 3).read(1.0)
-    assert library.rate_hz == 125
-    assert (without.force_n, without.sideways_n) == (None, 0)
-
-
 def test_reader_returns_each_state_once_and_as_a_whole(library: MagicMock) -> None:
     reader = RtdeReader("arm", 3)
     reader.read(0.0)
@@ -69,8 +56,7 @@ def test_reader_returns_each_state_once_and_as_a_whole(library: MagicMock) -> No
 
 @pytest.mark.parametrize("spoilt", ["Timestamp", "ActualTCPPose", "ActualTCPSpeed", "ActualTCPForce"])
 def test_reader_refuses_impossible_state(library: MagicMock, spoilt: str) -> None:
-    value: Any = np.inf if spoilt == "Timestamp" else (np.inf,) * 6
-    getattr(library, f"get{spoilt}").return_value = value
+    getattr(library, f"get{spoilt}").return_value = np.inf if spoilt == "Timestamp" else (np.inf,) * 6
     with pytest.raises(ValueError, match="NaN or infinity"):
         RtdeReader("arm", 5).read(1.0)
 
@@ -84,19 +70,6 @@ def test_major_version_of_polyscope() -> None:
 ON_LINUX = pytest.mark.skipif(sys.platform != "linux", reason="names of local sockets are locks on Linux alone")
 
 
-@ON_LINUX
-def test_lock_admits_one_program_until_that_ends(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(rtde_worker, "SESSION_END_S", 0.05)
-    lock, another = lock_arm("192.0.2.1"), lock_arm("192.0.2.2")
-    with pytest.raises(CommandRejected) as refused:
-        lock_arm("192.0.2.1")
-    cause, message, _ = refused.value.args
-    assert (cause, message) == ("refused", "another program on this computer uses the arm 192.0.2.1")
-    lock.close()
-    lock_arm("192.0.2.1").close()
-    another.close()
-
-
 @pytest.fixture
 def control_library(monkeypatch: pytest.MonkeyPatch) -> MagicMock:
     """Its interface to an arm that takes everything."""
@@ -107,20 +80,7 @@ def control_library(monkeypatch: pytest.MonkeyPatch) -> MagicMock:
 
 
 @ON_LINUX
-def test_stops_and_moves_are_asked_of_the_library(control_library: MagicMock) -> None:
-    control = UrRtdeControl("host")
-    assert control.identity == {"driver": "ur-rtde 1.6.0"}
-    pose = (0.1, 0.2, 0.3, 0.0, 3.0, 0.0)
-    assert control.move(pose, 0.05, 0.5)
-    assert control_library.moveL.call_args == call(list(pose), 0.05, 0.5, True)  # and returns at once
-    assert control.moving
-    control.stop()
-    assert control_library.stopL.call_args == call(5.0)  # m/s²: from 0.25 m/s at rest within 50 ms
-    assert not control.moving
-    control.kick()
-    assert control_library.setWatchdog.call_args == call(4.0)  # Hz: the arm stops 0.25 s after the last kick
-    control.end()
-    assert [each[0] for each in control_library.method_calls[-2:]] == ["stopL", "stopScript"]
+def test_a_watchdog_that_is_not_set_moves_nothing(control_library: MagicMock) -> None:
     control_library.setWatchdog.return_value = False
     with pytest.raises(RuntimeError, match="watchdog"):
         UrRtdeControl("host")
