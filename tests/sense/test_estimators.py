@@ -143,7 +143,7 @@ def test_calibration_learns_nothing_from_its_test_nor_networks_from_presses_of_r
         places = slice(0, weights["last.b"].shape[2] // 2)
         assert np.array_equal(other.networks[name]["last.b"][:, :, places], weights["last.b"][:, :, places])
     assert not np.array_equal(other.interval_factors, plain.interval_factors)
-    assert learnt(fit(brief, seed=7))["released.first.w"] != learnt(plain)["released.first.w"]
+    assert learnt(fit(brief, seed=7))["pressed.first.w"] != learnt(plain)["pressed.first.w"]
     # the published training stops by presses that are not those of radii either
     stopped, other = (fit(each, method="published") for each in (brief, without_sense(brief, 32 - RADII)))
     assert learnt(other, of_radii[1:]) == learnt(stopped, of_radii[1:])
@@ -171,7 +171,7 @@ def test_cross_validated_localizer_learns_nothing_from_other_presses(brief: Reco
         for seed, each in ((0, brief), (0, spoilt), (7, brief))
     )
     assert learnt(same.model_) == learnt(plain.model_)
-    assert learnt(other.model_)["released.first.w"] != learnt(plain.model_)["released.first.w"]
+    assert learnt(other.model_)["pressed.first.w"] != learnt(plain.model_)["pressed.first.w"]
     assert plain.test_presses_.size == 0
     assert plain.score(brief[np.arange(30, 40)]) < 0
 
