@@ -180,10 +180,10 @@ def figure_text(figure: Figure) -> str:
             values = np.asarray(image.get_array(), dtype=float)
             extent = f"{_numbers(image.get_extent())} {image.get_cmap().name} {_numbers(image.get_clim())}"
             lines.append(f"  image {values.shape} {extent}: {_summary(values.reshape(-1, 1))}")
-        alphas = {patch.get_alpha() or 1.0 for patch in axes.patches}
-        for patch in axes.patches:
+        alphas = [patch.get_alpha() or 1.0 for patch in axes.patches]
+        for patch, alpha in zip(axes.patches, alphas, strict=True):
             corners = patch.get_patch_transform().transform_path(patch.get_path()).vertices
-            shade = to_hex(patch.get_facecolor()) + (f" alpha {patch.get_alpha() or 1.0:.2g}" if len(alphas) > 1 else "")
+            shade = to_hex(patch.get_facecolor()) + (f" alpha {alpha:.2g}" if len(set(alphas)) > 1 else "")
             lines.append(f"  {type(patch).__name__} {shade}: {_summary(corners)}")
         for text in axes.texts:
             place = text.xy if isinstance(text, Annotation) else text.get_position()
