@@ -44,11 +44,12 @@ def graph_inputs(recording: Recording, fibre_mask: np.ndarray) -> dict[str, np.n
 def check_graph(graph: onnxruntime.InferenceSession, inputs: dict[str, np.ndarray], expected: Localization) -> None:
     """Compare positions, deviations and radii."""
     names = ["std_mm", "r50_mm", "r90_mm"]
-    positions_mm, *others = graph.run(["positions_mm", *names], inputs)
-    assert np.shape(positions_mm) == expected.positions_mm.shape
-    assert np.hypot(*(np.asarray(positions_mm) - expected.positions_mm).T).max() < MAX_DIFFERENCE_MM
+    outputs: list[Any] = list(graph.run(["positions_mm", *names], inputs))
+    positions_mm, *others = map(np.asarray, outputs)
+    assert positions_mm.shape == expected.positions_mm.shape
+    assert np.hypot(*(positions_mm - expected.positions_mm).T).max() < MAX_DIFFERENCE_MM
     for name, values in zip(names, others, strict=True):
-        np.testing.assert_allclose(np.asarray(values), getattr(expected, name), rtol=1e-4)
+        np.testing.assert_allclose(values, getattr(expected, name), rtol=1e-4)
 
 
 def test_graph_predicts_with_masked_fibres_missing_readings_and_far_beyond_training(graph, localizer, brief) -> None:
