@@ -96,13 +96,13 @@ def signals(
         map_chunks(lambda begin, end: exact_signals(*where, begin, end, out), len(along) * len(centres), 2000)
     elif len(centres):
         precision = check_float("precision", precision, 1e-6, 1.0)
-        law, spacings = contact_law(contact, unit_mm), element_spacings(contact, unit_mm, precision)
+        law = contact_law(contact, unit_mm)
+        table, spacings = weight_table(contact, unit_mm, precision), element_spacings(contact, unit_mm, precision)
         for t, v, pad_signals in zip(along, across, out, strict=True):
             slope = population_slopes(t[None], v[None])[0]
             elements = element_signals.fibre_elements(t, v, slope, layout.horizontals, centres, law, spacings)
             if sensitivity is not None:
                 element_signals.weigh_elements(elements, t, sensitivity)
-            table = weight_table(contact, unit_mm, precision)
             element_signals.element_signals(t, v, elements, centres, law, table, pad_signals)
     return _sum_simultaneous(out, (*batch, *press_counts, fibres))
 
@@ -288,7 +288,7 @@ def element_spacings(contact: Contact, unit_mm: float, precision: float) -> tupl
 
 @lru_cache(maxsize=32)
 def weight_table(contact: Contact, unit_mm: float, precision: float) -> Array:
-    """Return the table of `element_signals` for a contact with a profile, in grid units of `unit_mm`."""
+    """Return the table of `element_signals` for a layer or a profile, in grid units of `unit_mm`."""
     return element_signals.weight_table(contact_law(contact, unit_mm), precision)
 
 

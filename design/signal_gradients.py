@@ -54,7 +54,7 @@ class FibreCurves:
         out = np.zeros((len(presses), len(t)))
         if contact.model != "shape":  # elements are cut once for both directions
             law, precision = contact_law(contact, unit_mm), search_precision(contact)
-            table, spacings = (get(contact, unit_mm, precision) for get in (weight_table, element_spacings))
+            table, spacings = weight_table(contact, unit_mm, precision), element_spacings(contact, unit_mm, precision)
             elements = fibre_elements(t, v, d, self.layout.horizontals, presses, law, spacings)
             element_signals(t, v, elements, presses, law, table, out)
             pull_back = lambda upstream: elements_gradient(t, v, d, elements, presses, upstream, law, table)  # noqa: E731

@@ -32,7 +32,7 @@ tenth to a quarter of that. The strain of a shallow fibre has a step at the edge
 twice as long.
 """
 FINE_PRECISION = 1e-3
-"""The same in the evaluation of a pad, and the maximum error of signals of a profile."""
+"""The same in the evaluation of a pad; for a profile the maximum error, in a search as well."""
 TABLE_SHARE = 0.1
 """Maximum error of tabulated weights, relative to the largest one, as a share of the precision of signals."""
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(8)  # lower orders do not resolve the bends of a span

@@ -28,6 +28,7 @@ from padforge.common.validation import InputError, short_repr
 
 UNFINISHED = ".unfinished-"  # prefix of the names of temporary files and folders
 LOCK = ".lock"  # name of the file that locks a folder
+RESULT_FOLDERS = "figures", "health"  # folders that hold results within that of a pad
 MAX_BYTES = 2**28  # size limit of a file; only recordings may be larger
 
 
@@ -267,7 +268,7 @@ def sha256(path: Path) -> str:
 def is_local(name: str) -> bool:
     """Return whether a name from a document is that of a result in its folder, or in a folder of results there."""
     path = Path(name)
-    return path.parent.as_posix() in (".", "figures", "health") and path.name not in ("", "..")
+    return path.parent.as_posix() in (".", *RESULT_FOLDERS) and path.name not in ("", "..")
 
 
 def find_unchanged(folder: Path, digests: Mapping[str, object]) -> set[str]:
@@ -305,7 +306,8 @@ def installed_version(package: str) -> str:
 
 def find_dependents(path: Path, remade: Collection[str] = ()) -> list[str]:
     """Return the names of the results in a file's folder made from it, also indirectly, except those `remade`."""
-    found = (file for pattern in ("[!.]*.json", "health/*.json") for file in path.parent.glob(pattern) if file != path)
+    folders = [path.parent / name for name in (".", *RESULT_FOLDERS)]
+    found = [file for folder in folders for file in folder.glob("[!.]*.json") if file != path]
     documents = {file.relative_to(path.parent).as_posix(): _read_dict(file) for file in found}
     documents |= {file.parent.name: _read_dict(file) for file in path.parent.glob("[!.]*/start.json") if file != path}
     sources, dependents = [path], set[str]()

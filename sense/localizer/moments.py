@@ -11,15 +11,15 @@ release::
     LATEST_WINDOWS                                       |1|0|
 
 Windows of the press and the release are complete one after the other, so that their number, 0 to N_TIMED, says how far
-a press is. K is the number of those windows that a localizer uses: N_TIMED, N_PRESS_WINDOWS, or 0. Each phase of a
-press has its own network (`PHASES`), since one network for both learns each of them less well::
+a press is. K is the number of those windows that a localizer uses: N_TIMED, N_PRESS_WINDOWS, or 0. The two phases of
+a press have a network each (`PHASES`), since one network for both learns each of them less well::
 
-    complete     phase            network
-    0            -                none: the press may be anywhere
-    1 .. 8       touch            "touched"
-    9            rest             "pressed"; from here on "touched" instead, if the finger slid since `EARLY_WINDOWS`
-    10 .. 17     release          "pressed"; from 12 on together with the Bayesian localizer of the last of
-                                  `BAYES_STAGES` that is complete, corrected by the network "residual"
+    complete     phase               network
+    0            -                   none: the press may be anywhere
+    1 .. 8       touch               "touched"
+    9 .. 17      rest and release    "pressed", from 12 on together with the Bayesian localizer of the last of
+                                     `BAYES_STAGES` that is complete, corrected by the network "residual"; or "touched"
+                                     alone, if the finger slid since `EARLY_WINDOWS`
 """
 
 from bisect import bisect_right
