@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from padforge.common.parallel import map_threads
 from padforge.common.progress import OnProgress, ignore_progress
 from padforge.sense.arrays import Array, Mask
 from padforge.sense.localizer.moments import BAYES_STAGES, LATEST_WINDOWS
@@ -184,13 +185,17 @@ def fit_stages(
     are as in `BayesianLocalizer.fit`, with an earlier localizer for each stage.
     """
     stages, numbers = [], BAYES_STAGES if n_timed else (0,)
-    for n_complete in numbers:
-        on_progress(len(stages), len(numbers), "Bayesian localizer")
-        unused = slice(n_complete, (n_timed + len(LATEST_WINDOWS)) if n_timed else 0)
+
+    def fit(stage: int) -> BayesianLocalizer:
+        unused = slice(numbers[stage], (n_timed + len(LATEST_WINDOWS)) if n_timed else 0)
         masked = table.copy()
         masked[:, :, :, unused] = 0
-        earlier_stage = earlier[len(stages)] if earlier else None
-        stages.append(BayesianLocalizer.fit(masked, inputs, fibre_mask, positions, earlier_stage))
+        earlier_stage = earlier[stage] if earlier else None
+        return BayesianLocalizer.fit(masked, inputs, fibre_mask, positions, earlier_stage)
+
+    for fitted in map_threads(fit, range(len(numbers))):
+        on_progress(len(stages), len(numbers), "Bayesian localizer")
+        stages.append(fitted)
     return tuple(stages)
 
 

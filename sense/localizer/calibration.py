@@ -6,7 +6,6 @@ early stopping.
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
 
 import numpy as np
 
@@ -314,11 +313,14 @@ def calibrate_uncertainty(
     uncalibrated = replace(model, interval_factors=np.ones_like(model.interval_factors))
     n_sets = MOMENT_SUBSETS if len(moments) > 1 else INTERVAL_SUBSETS
     subsets = [failure_subsets(model.fibres, n_failed, n_sets) for n_failed in range(levels)]
+
+    def predict(features: ScaledFeatures) -> list[list[Localization]]:
+        return [[uncalibrated.predict_features(features, failed) for failed in sets] for sets in subsets]
+
     predictions: list[list[list[Localization]]] = []  # by moment, then by number of failed fibres
-    for features in moments:
+    for of_moment in map_threads(predict, moments):
         on_progress(len(predictions), len(moments), "radii")
-        predict = partial(uncalibrated.predict_features, features)
-        predictions.append([list(map_threads(predict, sets)) for sets in subsets])
+        predictions.append(of_moment)
     prior_ratios = None
     if n_trained:
         failed_shares = np.arange(levels) / model.fibres
@@ -386,15 +388,14 @@ def _calibrate_scales(
     # expected ratio; the first axis of `outputs` and `ratios` holds the members of each of the networks `names` in turn
     ratios_of: dict[str, list[Array]] = {}  # by network
     n_presses = len(positions_mm)
-    first = int(len(moments) > 1)
-    for n_complete, features in enumerate(moments, first):
-        on_progress(n_complete - first, len(moments), "expected errors")
+
+    def ratios_at(moment: tuple[int, ScaledFeatures]) -> list[tuple[str, Array]]:
+        n_complete, features = moment
         growth = Experience.at_moment(n_complete).growth(n_trained) if n_trained else 1.0
         rows = np.flatnonzero(features.n_complete == n_complete)  # the next press cut others short
-        if not len(rows):
-            continue
-        names = active_networks(model.networks, n_complete, features.n_timed, bool(model.bayes))
-        for failed in subsets:
+        names = active_networks(model.networks, n_complete, features.n_timed, bool(model.bayes)) if len(rows) else []
+        pairs: list[tuple[str, Array]] = []
+        for failed in subsets if names else ():
             outputs = predict_members(model.networks, features[rows].without(failed), *model.corrected)
             predicted, log_error = (half[:, :, :2] for half in np.split(outputs, 2, axis=2))
             error = np.abs(predicted - positions[rows]).mean(axis=2)
@@ -404,8 +405,14 @@ def _calibrate_scales(
                 ratios *= growth / ratios.mean()
             ratios = (PRIOR_COUNT * growth + n_presses * ratios) / (PRIOR_COUNT + n_presses)
             n_members = [1 if name == RESIDUAL else len(model.networks[name]["last.b"]) for name in names]
-            for name, of_network in zip(names, np.split(ratios, np.cumsum(n_members)[:-1]), strict=True):
-                ratios_of.setdefault(name, []).append(of_network)
+            pairs += zip(names, np.split(ratios, np.cumsum(n_members)[:-1]), strict=True)
+        return pairs
+
+    numbered = list(enumerate(moments, int(len(moments) > 1)))
+    for done, pairs in enumerate(map_threads(ratios_at, numbered)):
+        on_progress(done, len(moments), "expected errors")
+        for name, of_network in pairs:
+            ratios_of.setdefault(name, []).append(of_network)
 
     # 2. Scale of each member
     log_scales = {name: np.log(np.mean(ratios, axis=0)) for name, ratios in ratios_of.items()}

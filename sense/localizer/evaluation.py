@@ -16,7 +16,7 @@ from padforge.design.objectives.fibre_loss import failure_subsets
 from padforge.sense.arrays import Array, Indices
 from padforge.sense.localizer.features import compute_features, interpolate_gaps, window_means
 from padforge.sense.localizer.model import Localization, LocalizerModel
-from padforge.sense.localizer.moments import MOMENTS, PRESS_WINDOWS
+from padforge.sense.localizer.moments import MOMENTS, PRESS_WINDOWS, Moment
 from padforge.sense.localizer.single_press import OTHER_PAD
 from padforge.sense.recording import doubts
 from padforge.sense.recording.frames import framed
@@ -247,17 +247,22 @@ def errors_by_moment(
     positions_mm = recording.presses_mm[presses]
     measures = {name: values[presses] for name, values in recording.measures.items()}
     history, rows, intact = model.raw_features(recording).history, [], []
-    for moment in MOMENTS:
-        on_progress(len(intact), len(MOMENTS), "moments of a press")
+
+    def evaluate_at(moment: Moment) -> tuple[dict[str, Any], Localization, list[dict[str, Any]]]:
         until = moment.until(touched, frames.up_command)
         raw = compute_features(frames.readings, *commands, until, history=history)
-        features = model.scaler.transform(raw[presses])
+        predict = partial(model.predict_features, model.scaler.transform(raw[presses]))
         at = {"since": moment.since, "readings": moment.readings, "time_s": round(moment.readings / frames.rate_hz, 3)}
-        intact.append((at, model.predict_features(features)))
+        by_loss = []
         for n_failed in levels:
-            subsets = failure_subsets(model.fibres, n_failed, MOMENT_SETS)
-            predictions = list(map_threads(partial(model.predict_features, features), subsets))
-            rows.append(at | error_row(n_failed, predictions, positions_mm, measures))
+            predictions = [predict(failed) for failed in failure_subsets(model.fibres, n_failed, MOMENT_SETS)]
+            by_loss.append(at | error_row(n_failed, predictions, positions_mm, measures))
+        return at, predict(), by_loss
+
+    for at, prediction, by_loss in map_threads(evaluate_at, MOMENTS):
+        on_progress(len(intact), len(MOMENTS), "moments of a press")
+        intact.append((at, prediction))
+        rows += by_loss
     errors = distances(intact[-1][1].positions_mm, positions_mm)
     press = int(np.argsort(errors)[len(errors) // 2])
     moments = [
