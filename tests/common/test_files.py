@@ -172,6 +172,7 @@ def test_find_unchanged_compares_digests_of_local_files_and_sha256_covers_folder
     (tmp_path / "a").write_text("2")
     assert files.sha256(tmp_path) != before
     files.write_json(tmp_path / "a", {})
+    (tmp_path / files.LOCK).touch()
     assert files.sha256(tmp_path) == before
     (tmp_path / "a").rename(tmp_path / os.fsdecode(b"\xff") if sys.platform == "linux" else tmp_path / "d")
     assert files.sha256(tmp_path) != before

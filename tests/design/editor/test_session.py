@@ -87,7 +87,8 @@ def test_save_replaces_neither_what_another_program_wrote_since_nor_a_pad_with_a
     assert Morphology.load(tmp_path / "out.json").provenance["inputs"] == {"pad.json": read}
     made = {"provenance": {"inputs": {"out.json": sha256(tmp_path / "out.json")}}}
     write_json(tmp_path / "fabrication.json", made)
-    editor.save(b"{}")  # as it is
+    editor.save(b"{}")
+    assert editor.out.name == "out.json"  # as it is
     before = (tmp_path / "out.json").read_bytes()
     ask(editor, do="add", fibre=1)
     assert editor.save(b"{}")["message"] == f"saved to {tmp_path / 'out-2.json'}"

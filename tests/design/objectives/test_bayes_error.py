@@ -45,6 +45,17 @@ def test_positions_cover_the_pressed_area_once_and_no_keep_out_and_are_a_sample_
     assert len(possible.centres) < module.MAX_FAR + 5000
 
 
+def test_blur_is_the_variance_of_a_response_over_a_cell() -> None:
+    size, pad, contact, scale = PadSettings(grid=2), Morphology.random(2, 3, seed=1), Contact(model="profile"), 0.5
+    centres, log_prior, _, blur = possible_positions(pad, contact, size, evaluation_windows(size.sensed)[0], scale)
+    shares = (np.arange(5) - 2) / 5
+    within = np.exp(log_prior[0] / 2) * np.stack(np.meshgrid(shares, shares), axis=-1).reshape(-1, 2)
+    responses = relative_stretch(pad, (centres[::7, None] + within).reshape(-1, 2), contact) / scale
+    variance, blur = responses.reshape(-1, 25, 4).var(axis=1) / (1 - 1 / 25), blur[::7]
+    large = blur > np.quantile(blur, 0.7)
+    assert np.median(blur[large] / variance[large]) == pytest.approx(1, rel=0.02)
+
+
 @pytest.mark.parametrize("scatter", [Scatter(0.2), Scatter(0.02, 0.3, 0.5)])
 def test_expected_errors_are_those_of_other_presses_located_by_explicit_covariances(scatter, monkeypatch):
     """And a share more, for learning: of presses and readings that are drawn otherwise, on a grid of its own."""

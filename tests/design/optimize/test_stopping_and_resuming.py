@@ -13,9 +13,11 @@ import pytest
 from padforge import InputError
 from padforge.common import parallel as computing
 from padforge.common.command_line import run_to_end
+from padforge.common.files import UNFINISHED
 from padforge.common.parallel import Checkpoints
 from padforge.design import PadSettings, RulesSettings, SearchOptions, SearchSettings, design_run, search
 from padforge.design.optimize import search as stopping
+from padforge.design.optimize.problem import build_problem
 from tests.helpers.door import called, refused
 
 PAD = PadSettings(grid=1)
@@ -35,6 +37,7 @@ def test_checkpoints_of_other_searches_and_files_of_others_are_refused_and_stay(
     assert search(PAD, None, quick, FREE, run=run).morphology == first.morphology
     with pytest.raises(InputError, match="begun with search seed 0, now 5"):
         search(PAD, None, quick.model_copy(update={"seed": 5}), FREE, run=run)
+    (folder / f"{UNFINISHED}killed").mkdir()  # left by a save that was killed
     Checkpoints(folder, {}).clear()
     assert not list(tmp_path.iterdir())
     names = ["search.json", "start_0.npz", "start_0_notes.npz", "other"]
@@ -47,6 +50,14 @@ def test_checkpoints_of_other_searches_and_files_of_others_are_refused_and_stay(
     (tmp_path / "own" / "start_0_notes.npz").write_text("notes")
     Checkpoints(tmp_path / "own", {}).begin(resume=False)
     assert [path.name for path in (tmp_path / "own").iterdir()] == ["start_0_notes.npz"]
+
+
+def test_stopped_search_repairs_the_start_that_is_best_now(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(stopping, "_finish_start", lambda problem, start, state, until: start)
+    histories = {0: [(1, 3.0), (9, 1.0)], 1: [(1, 2.0), (9, 1.5)]}  # step and objective
+    states = {start: {"history": np.array(history)} for start, history in histories.items()}
+    problem = build_problem(PAD, SMALL.default_contact, SMALL, FREE)
+    assert stopping._finish_starts(problem, states, stopping.Stop(0.0, 0.0)) == [("start 1", 0)]
 
 
 @pytest.mark.parametrize("method", ["descent", "genetic"])

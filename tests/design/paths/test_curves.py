@@ -47,6 +47,15 @@ def test_flatten_keeps_the_tolerance(pad, tolerance):
         assert np.linalg.norm(fine - a - along[:, None] * way, axis=1).max() <= tolerance * 1.02
 
 
+def test_tightest_bend_starts_or_ends_at_a_point() -> None:
+    """By headings: 0.45 rad within 1.5, of which 0.05 before the third point; the same from the other end."""
+    line, turned = np.column_stack([np.arange(5.0), np.zeros(5)]), np.array([0, 0, 0.1, 0.5, 0.5])
+    ending, starting = (curves.bend_radius(sign * line[::sign], turned[::sign], 1.5) for sign in (1, -1))
+    for (radius, place), sign in ((ending, 1), (starting, -1)):
+        assert radius == pytest.approx(1.5 / 0.45)
+        np.testing.assert_allclose(place, [sign * (2 + 0.175 / 0.4), 0])  # half of the turn lies before it
+
+
 def test_common_stretches_of_one_line_with_two_others_stay_two() -> None:
     """One runs beside its end and the other beside its beginning, 0.5 from it: near within sqrt(1 - 0.25)."""
     line, beside = np.array([[0.0, 0.0], [10.0, 0.0]]), np.sqrt(0.75)

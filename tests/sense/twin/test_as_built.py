@@ -288,6 +288,18 @@ def test_fit_contact_states_shares_of_the_sum_that_was_stated() -> None:
     assert small.scale_std == pytest.approx(2 * double.scale_std, rel=0.05)
 
 
+def test_fit_contact_scatters_as_it_states() -> None:
+    quiet, rng, fits = press(Contact(), PlanTransform(), 24), np.random.default_rng(3), []
+    pad = AsBuiltPad.from_plan(PadPlan.from_morphology(PLAN), (0, 1, 2, 3), PlanTransform(), 0.5)
+    noise_v = 0.05 * np.sqrt(quiet.variance)
+    for _ in range(16):
+        noisy = replace(quiet, volts=quiet.volts + noise_v * rng.standard_normal(quiet.volts.shape))
+        fits.append(fit_contact(pad, Contact(), noisy, quiet, noise_v))
+    for name, stated in ("scale", "scale_std"), ("squeeze", "shares_std"), ("stretch", "shares_std"):
+        measured = np.std([getattr(fit, name) for fit in fits], ddof=1)
+        assert 0.65 < measured / np.mean([getattr(fit, stated) for fit in fits]) < 1.5
+
+
 def test_elements_of_a_pad_sum_to_its_lengths_and_follow_its_offsets() -> None:
     plan = PadPlan.from_morphology(PLAN)
     pad = AsBuiltPad.from_plan(plan, (2, 0), PlanTransform(), 0.5)

@@ -170,6 +170,23 @@ def test_read_raises_when_board_stalls_or_nobody_reads_and_connect_recovers(monk
         fault_of(driver.read, "data", "nobody has read")
 
 
+def test_reader_blames_the_board_for_its_silence_alone_and_not_for_the_hosts_sleep(monkeypatch) -> None:
+    """A host that sleeps for an hour of 0.5 s without a sample; later, 1 s in which the board does send nothing."""
+    times_s = iter([*np.arange(0, 0.5, 0.1), 3600.0, *np.arange(3600.1, 3600.3, 0.1), *np.arange(3601, 3604, 0.1)])
+    monkeypatch.setattr(clock, "now", lambda: 0.0)
+    received = []
+
+    def receive() -> tuple[float, list[list[int]]]:
+        received.append(float(next(times_s)))
+        return received[-1], [[7]] if received[-1] == 3601.0 else []
+
+    reader = board_reader.BlockReader("COM7", receive, 100.0)
+    reader.run()
+    assert reader.drain() == [(3601.0, [7])]
+    fault_of(reader.drain, "stale", "no sample for 1.1 s")
+    assert received[-1] == pytest.approx(3602.1)
+
+
 @pytest.mark.parametrize("garbled", [0.0, pytest.param(2e-2, marks=pytest.mark.slow)], ids=["its header", "its times"])
 def test_read_raises_when_line_board_resets(garbled: float) -> None:
     """A header among so many damaged bytes is hardly ever read, nor is every other line: the times show it."""
