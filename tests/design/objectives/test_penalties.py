@@ -8,6 +8,7 @@ from scipy.interpolate import PchipInterpolator
 
 from padforge.design import Morphology, check_rules
 from padforge.design.contact import fibre_axes
+from padforge.design.kernels.rule_penalties import sum_closeness
 from padforge.design.objectives.penalties import COMMON_WEIGHT, penalties
 from padforge.design.paths.curves import crossings, lengths, refine
 from padforge.design.settings import PadSettings, RulesSettings
@@ -107,6 +108,20 @@ def test_penalties_of_plain_pads_have_closed_forms(margin):
     pad = bent(3.0)
     over = lengths(pad)[0] * pad.unit_mm / 57.0 - 1
     assert found(pad, only(max_length_mm=57.0 * margin), margin)["max_length_mm"] == pytest.approx(over / 8, rel=0.02)
+
+
+def test_closeness_is_to_all_that_a_sample_stands_for() -> None:
+    """The nearest sample is 2.5 away along the fibre, but its piece of the tangent begins 0.5 beside the point."""
+    points, flat, shares = (
+        np.array([[[0.0, 0.0]] * 2, [[-9.0, 0.5], [2.5, 0.5]]]),
+        np.zeros((2, 2)),
+        [[0.1] * 2, [0.1, 2]],
+    )
+    gradient, close = np.zeros_like(points), 1 - np.hypot(0.5, 0.5)
+    cost = sum_closeness(points, flat, flat, np.array(shares), np.array([[0, 1]]), 1.0, 0.0, 1.0, gradient)
+    assert cost == pytest.approx(2 * (close + 10 * close**2))
+    np.testing.assert_allclose(gradient[0], -gradient[1, 1] / 2 * [[1], [1]])
+    assert (gradient[0] > 0).all()
 
 
 def test_penalties_vanish_just_within_the_limits():
