@@ -195,11 +195,13 @@ def check_run(run: Run) -> None:
     check_design(run.spec, run.out, {"seed": run.seed}, _regenerated_files(), run.force)
     path = run.out / "localizer.json"
     if path.exists() and not run.force:
-        with reraise_as_input_error(path):
-            kind = read_json(path, LOCALIZER_FORMAT)["provenance"].get("recording_kind")
-        if kind != "simulated":
-            advice = "choose another --out, or replace it with --force"
-            raise InputError(f"{path}: trained on a recording of kind {kind!r}, not a simulated one; {advice}")
+        try:
+            with reraise_as_input_error(path):
+                kind = read_json(path, LOCALIZER_FORMAT)["provenance"].get("recording_kind")
+            if kind != "simulated":
+                raise InputError(f"{path}: trained on a recording of kind {kind!r}, not a simulated one")
+        except InputError as error:
+            raise InputError(f"{error}; choose another --out, or replace it with --force") from error
 
 
 def _regenerated_files() -> set[str]:

@@ -88,12 +88,16 @@ def test_refused_search_keeps_checkpoints(pad: Path) -> None:
     assert not (pad / "pad" / "search").exists()
 
 
-@pytest.mark.parametrize("told", [{}, {"recording_kind": "ur5"}])
-def test_run_does_not_replace_localizer_of_measured_presses(tmp_path: Path, told: dict[str, str]) -> None:
+@pytest.mark.parametrize(("version", "kind"), [(2, None), (2, "ur5"), (1, "simulated")])
+def test_run_does_not_replace_localizer_of_measured_presses(tmp_path: Path, version: int, kind: str | None) -> None:
+    """Nor one of another version, which does not tell."""
     (tmp_path / "pad").mkdir()
-    write_json(tmp_path / "pad" / "localizer.json", {"format": "padforge-localizer/2", "provenance": told})
+    document = {"format": f"padforge-localizer/{version}", "provenance": {"recording_kind": kind} if kind else {}}
+    write_json(tmp_path / "pad" / "localizer.json", document)
+    why = f"trained on a recording of kind {kind!r}" if version == 2 else "expected 'padforge-localizer/2'"
     said = refused("run", "--out", "pad", cwd=tmp_path)
-    assert f"of kind {told.get('recording_kind')!r}, not a simulated one" in said
+    assert why in said
+    assert said.endswith("; choose another --out, or replace it with --force\n")
 
 
 def test_run_does_not_replace_measured_recording(folder: Path) -> None:

@@ -15,7 +15,7 @@ from padforge.common import parallel as computing
 from padforge.common.command_line import run_to_end
 from padforge.common.files import UNFINISHED
 from padforge.common.parallel import Checkpoints
-from padforge.design import PadSettings, RulesSettings, SearchOptions, SearchSettings, design_run, search
+from padforge.design import Morphology, PadSettings, RulesSettings, SearchOptions, SearchSettings, design_run, search
 from padforge.design.optimize import search as stopping
 from padforge.design.optimize.problem import build_problem
 from tests.helpers.door import called, refused
@@ -52,12 +52,14 @@ def test_checkpoints_of_other_searches_and_files_of_others_are_refused_and_stay(
     assert [path.name for path in (tmp_path / "own").iterdir()] == ["start_0_notes.npz"]
 
 
-def test_stopped_search_repairs_the_start_that_is_best_now(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(stopping, "_finish_start", lambda problem, start, state, until: start)
-    histories = {0: [(1, 3.0), (9, 1.0)], 1: [(1, 2.0), (9, 1.5)]}  # step and objective
-    states = {start: {"history": np.array(history)} for start, history in histories.items()}
-    problem = build_problem(PAD, SMALL.default_contact, SMALL, FREE)
-    assert stopping._finish_starts(problem, states, stopping.Stop(0.0, 0.0)) == [("start 1", 0)]
+def test_stopped_search_repairs_the_start_that_is_best_now(tmp_path, monkeypatch: pytest.MonkeyPatch) -> None:
+    kept, repaired = Checkpoints(tmp_path, build_problem(PAD, SMALL.default_contact, SMALL, FREE).settings()), []
+    for start, history in enumerate([[(1, 3.0), (9, 1.0)], [(1, 2.0), (9, 1.5)]]):  # steps and objectives
+        kept.save(start, {"history": np.array(history), "done": np.array(False)})
+    straight = Morphology.straight(PAD.layout)
+    monkeypatch.setattr(stopping, "_finish_start", lambda problem, start, *_: repaired.append(start) or straight)
+    search(PAD, None, SMALL, FREE, run=SearchOptions(keep_in=tmp_path, resume=True, time_budget=0))
+    assert repaired == [0]
 
 
 @pytest.mark.parametrize("method", ["descent", "genetic"])
