@@ -131,7 +131,7 @@ ON_PAGE = (
     *((key, "pad keydown", key) for key in ("Delete", "-", "Insert")),
     ("a click on a line", "lines 1 2 pointerdown", {}),
     ("a double click on it", "lines 1 2 dblclick", pointer(-5, 3.5)),
-    *((action, action, {}) for action in ("knots 2 focus", "remove click")),
+    *((action, action, {}) for action in ("knots 2 focus", "remove click", "save click", "beforeunload")),
     ("a fibre of the list", "fibre change", 0),
     ("a knot is held beside its middle", "knots 1 pointerdown", pointer(8, -2.75)),
     ("dragged", "pad pointermove", [pointer(8, -3), pointer(0, 0), pointer(7.5, -2.5)]),
@@ -139,7 +139,7 @@ ON_PAGE = (
     ("moved without a button", "pad pointermove", pointer(0, 0)),
     ("no room beside it", "lines 0 2 dblclick", pointer(12, -5)),
     ("a failed fibre", "failed change", 1),
-    *(("leave", "beforeunload", {}), ("save", "keydown", "Ctrl+s"), ("leave what is saved", "beforeunload", {})),
+    ("leave what is not saved", "beforeunload", {}),
 )
 
 
@@ -163,7 +163,8 @@ def test_page_shows_this_of_a_pad_and_sends_these_edits(tmp_path, golden: Golden
             *(("begins", "view", views[0]), ("a pad", "view", views[-1]), ("its server", "server", page.url[:-1])),
             *ON_PAGE,
             *(("a view that comes late", "view", views[1]), ("no server", "server", "")),
-            *(("no response", "save click", {}), ("the end", "view", views[0] | {"ended": "ended in the terminal"})),
+            *(("no response", "keydown", "Ctrl+s"), ("the end", "view", views[0] | {"ended": "ended in the terminal"})),
+            ("leave after the end", "beforeunload", {}),
             *(("another", "server", other_page.url[:-1]), ("its pad, mirrored", "view", other_views[-1] | mirrored)),
             ("right", "pad keydown", "ArrowRight"),
         )
