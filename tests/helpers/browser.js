@@ -3,9 +3,8 @@ const said = [], listeners = {}, parts = {}, before = {}, frames = [], post = gl
 let focused = null, server = "", waiting = 0, given = {}, size = {width: 600, height: 300}
 
 class Part {
-  constructor(name, attributes = {}) {
-    Object.assign(this, {name, children: [], attributes, dataset: {do: attributes["data-do"]}})
-  }
+  constructor(name, attributes = {}) { Object.assign(this, {name, children: [], attributes}) }
+  get dataset() { return {do: this.attributes["data-do"]} }
   setAttribute(name, value) { this.attributes[name] = value }
   append(...children) { this.children.push(...children) }
   replaceChildren(...children) { this.children = children }
@@ -69,8 +68,8 @@ function line(part, k, row) {
   for (const name of ["value", "selectedIndex", "width", "height"])
     if (name in part) texts.push(`${name} ${part[name]}`)
   for (const name of ["disabled", "hidden"]) if (part[name]) texts.push(name)
-  for (const [name, value] of Object.entries(part.attributes))
-    texts.push(`${name}=${value.length > 20 && value === former?.[name] ? "..." : round(value)}`)
+  texts.push(...Object.entries(part.attributes).map(([name, value]) =>
+    `${name}=${value.length > 20 && value === former?.[name] ? "..." : round(value)}`))
   return texts.join(" ") + (row && part.children.length ? ` (${part.children.map(line).join(", ")})` : "")
 }
 
@@ -137,18 +136,13 @@ Object.assign(globalThis, {
     said.push(`${method} ${path} ${body}`)
     if (!server) return
     waiting += 1
-    try {
-      const response = await post(server + path, {method, body, headers: {Origin: server}})
-      const text = await response.text()
-      return {ok: response.ok, text: async () => text, json: async () => JSON.parse(text)}
-    } finally { waiting -= 1 }
+    const [{ok}, text] = await post(server + path, {method, body, headers: {Origin: server}})
+      .then(async response => [response, await response.text()]).finally(() => { waiting -= 1 })
+    return {ok, text: async () => text, json: async () => JSON.parse(text)}
   },
   DOMPoint: function (x, y) { this.matrixTransform = transform => transform({x, y}) },
   Option: class extends Part { constructor(text) { super("option").text = text } },
-  ResizeObserver: function (listen) {
-    listeners.size = [listen]
-    this.observe = () => {}
-  },
+  ResizeObserver: function (listen) { this.observe = () => { listeners.size = [listen] } },
   EventSource: class { constructor() { globalThis.source = this } },
   AudioContext: class {
     createOscillator() { return new Part("oscillator") }
