@@ -2,7 +2,7 @@
 const STEP_MM = .5, FINE_MM = .05
 const selected = {fibre: 0, knot: 1}
 const queue = [] // edits to send
-let view = null, busy = false, drag = null, gestures = 0, failure = ""
+let view = null, busy = false, sent = null, drag = null, gestures = 0, failure = ""
 
 const knotCount = fibre => view.fibres[fibre].knots.length - 2
 const selectedKnot = () => layers.knots[selected.fibre]?.[selected.knot - 1]
@@ -37,7 +37,8 @@ async function send() {
   if (busy) return
   busy = true
   while (queue.length) {
-    const edit = queue.shift(), fibre = selected.fibre, next = await post("/edit", edit)
+    const edit = sent = queue.shift(), fibre = selected.fibre, next = await post("/edit", edit)
+    sent = null
     if (!next) continue
     const changed = edit.do === "add" || edit.do === "remove"
     const isStillSelected = selected.fibre === fibre // the user may have selected another one since
@@ -96,7 +97,8 @@ byId("pad").addEventListener("keydown", event => {
   if (ARROWS[event.key]) {
     const step = event.shiftKey ? FINE_MM : STEP_MM, [right, up] = ARROWS[event.key]
     const gesture = `key ${selected.fibre} ${selected.knot} ${stepping} ${performance.timeOrigin.toFixed(0)}`
-    const last = queue.at(-1), [px, py] = view.fibres[selected.fibre].knots[selected.knot]
+    // a step goes on from the last one, also before the response to it
+    const last = queue.at(-1) ?? sent, [px, py] = view.fibres[selected.fibre].knots[selected.knot]
     const from = last?.gesture === gesture ? last : {x_mm: px, y_mm: py}
     moveTo({x_mm: from.x_mm + right * step * (view.mirrored ? -1 : 1), y_mm: from.y_mm + up * step}, gesture)
   } else if (event.key === "PageDown" || event.key === "PageUp") {

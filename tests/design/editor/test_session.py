@@ -7,9 +7,12 @@ import pytest
 
 from padforge import InputError, Spec
 from padforge.common.files import sha256, write_json
-from padforge.design import Morphology
+from padforge.common.server import LocalPage, page_text
+from padforge.design import Morphology, editor
+from padforge.design.contact import grid_positions
 from padforge.design.editor import EditSession
 from tests.helpers.golden import Golden
+from tests.helpers.page_script import shown
 from tests.helpers.refusals import refusal_table
 
 
@@ -110,3 +113,60 @@ def test_invalid_edits_are_refused_and_change_nothing(tmp_path, golden: Golden) 
     with pytest.raises(InputError, match=r"out.json: cannot be written"):
         editor.save(b"{}")
     assert editor.unsaved
+
+
+def pointer(x_mm, y_mm):
+    """Over a position of the pad of 17 px of the drawing a millimetre, which is shown twice as large."""
+    return {"clientX": 100 + 2 * (240 + 17 * x_mm), "clientY": 50 + 2 * (240 - 17 * y_mm), "pointerId": 5}
+
+
+ON_PAGE = (
+    ("up", "pad keydown", "ArrowUp"),
+    ("three fine steps at once", "pad keydown", "Shift+ArrowRight Shift+ArrowRight Shift+ArrowRight"),
+    *((name, name, {"key": "ArrowRight"}) for name in ("keyup", "knots 1 focus")),
+    ("left, and finely down", "pad keydown", "ArrowLeft Shift+ArrowDown"),
+    ("keys of the browser, or of nobody", "pad keydown", "Alt+ArrowUp x"),
+    *((name, name, {}) for name in ("undo click", "redo click")),
+    ("undo, redo, undo, redo", "keydown", "Ctrl+z Ctrl+Shift+Z Ctrl+z Ctrl+y"),
+    ("the next fibre, and over the first to the last", "pad keydown", "PageDown PageUp PageUp"),
+    *((key, "pad keydown", key) for key in ("Delete", "-", "Insert PageUp")),
+    ("a click on a line", "lines 2 2 pointerdown", {}),
+    ("a double click on another", "lines 1 2 dblclick", pointer(-5, 3.5)),
+    *((name, name, {}) for name in ("knots 2 focus", "remove focus", "remove click", "save click", "beforeunload")),
+    ("a fibre of the list", "fibre change", 0),
+    ("a knot is held beside its middle", "knots 1 pointerdown", pointer(8, -2.75)),
+    ("dragged", "pad pointermove", [pointer(8, -3), pointer(0, 0), pointer(7.5, -2.5)]),
+    ("released", "pad pointerup", pointer(40, -4.75)),
+    ("moved without a button", "pad pointermove", pointer(0, 0)),
+    ("no room beside it", "lines 0 2 dblclick", pointer(12, -5)),
+    ("a failed fibre", "failed change", 1),
+    ("leave what is not saved", "beforeunload", {}),
+)
+
+
+def test_page_shows_this_of_a_pad_and_sends_these_edits(tmp_path, golden: Golden, monkeypatch) -> None:
+    """All parts of the page that change, and what is sent to a session, which answers."""
+    monkeypatch.setattr(editor, "free_presses", lambda settings: grid_positions(settings.sensed, side=3)[:6])
+    size = {"horizontals": 2, "verticals": 1, "size_mm": [24, 18], "sensed_mm": [14, 9]}
+    drawn, views = session(tmp_path, **size, keep_out_mm=[[[6, -9], [12, -9], [12, -5]]])
+    other, other_views = session(tmp_path, **size, deep_family="vertical")
+    for fibre in (1, 1, 1, 2, 2, 2, 2, 3, 3, 3, 3):
+        ask(drawn, do="remove", fibre=fibre, knot=2)
+        ask(other, do="remove", fibre=fibre, knot=2)
+    move(drawn, 1, 1, -8, 2.3)
+    mirrored = {"mirrored": True}
+    text = page_text("padforge.design.editor", "editor.html", "editor.css", "drawing.js", "editor.js")
+    with (
+        LocalPage(0, text, {"/edit": drawn.edit, "/save": drawn.save}) as page,
+        LocalPage(0, text, {"/edit": lambda body: {**other.edit(body), **mirrored}}) as other_page,
+    ):
+        actions = (
+            *(("begins", "view", views[0]), ("a pad", "view", views[-1]), ("its server", "server", page.url[:-1])),
+            *ON_PAGE,
+            *(("a view that comes late", "view", views[1]), ("no server", "server", "")),
+            *(("no response", "keydown", "Ctrl+s"), ("the end", "view", views[0] | {"ended": "ended in the terminal"})),
+            ("leave after the end", "beforeunload", {}),
+            *(("another", "server", other_page.url[:-1]), ("its pad, mirrored", "view", other_views[-1] | mirrored)),
+            ("right", "pad keydown", "ArrowRight"),
+        )
+        golden("design/editor_page.txt", shown(text, actions))

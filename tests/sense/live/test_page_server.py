@@ -180,7 +180,7 @@ LIFT = HAND | {"phase": "lift", "prompt": "lift", "progress": 0.75}
 BY_HAND = [
     ("asked to press", "view", HAND),
     ("asked to lift, but sounds need a key", "view", LIFT),
-    ("a button", "click", 0),
+    ("a button", "buttons 0 click", None),
     *((f"{key} {held}", "keydown", {"key": key} | held) for key in "sx" for held in ({}, {"repeat": True})),
     ("with Ctrl", "keydown", {"key": "s", "ctrlKey": True}),
     ("held", "view", HAND | {"phase": "hold", "mirrored": True}),
