@@ -221,7 +221,6 @@ class EditSession:
             "centre_mm": [0, 0],
             "half_mm": [side / 2 for side in self._layout.size_mm],
             "unit_mm": self._layout.unit_mm,
-            "mirrored": False,
             "deep_family": int(self._pad_settings.deep_family == "vertical"),
             "sensed_mm": sensed_mm.ravel().tolist(),
             "keep_out_mm": self._pad_settings.keep_out_corners_mm,

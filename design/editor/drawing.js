@@ -6,30 +6,27 @@ function layerKey(view) {
   return JSON.stringify([view.session, view.positions_mm.length, view.fibres.map(fibre => fibre.knots.length)])
 }
 
-// A rectangle on the pad, mm; on a mirrored one its left side is drawn on the right.
-function rectangle(view, left, low, right, top, attributes = {}) {
-  const {scale, x, y} = frame(view)
-  const width = (right - left) * scale, height = (top - low) * scale
-  return svgElement("rect", {...attributes, x: Math.min(x(left), x(right)), y: y(top), width, height})
-}
-
 function setChildren(group, parts) { byId(group).replaceChildren(...parts) }
 
 // Create all elements, for another pad or after a knot was added or removed.
 function build(view, handlers) {
-  const {x, y} = frame(view), [wide, high] = view.cell_mm
+  const {scale, x, y} = frame(view), [wide, high] = view.cell_mm
   layers = {key: layerKey(view), cells: [], fibres: [], knots: []}
-  layers.cells = view.positions_mm.map(([px, py]) =>
-    rectangle(view, px - wide / 2, py - high / 2, px + wide / 2, py + high / 2))
+  layers.cells = view.positions_mm.map(([px, py]) => svgElement("rect", {
+    x: x(px - wide / 2), y: y(py + high / 2), width: wide * scale, height: high * scale,
+  }))
   setChildren("map", layers.cells)
-  setChildren("grid", [...gridElements(view), rectangle(view, ...view.sensed_mm, {class: "sensed"})])
+  const [left, low, right, top] = view.sensed_mm
+  setChildren("grid", [...gridElements(view), svgElement("rect", {
+    class: "sensed", x: x(left), y: y(top), width: (right - left) * scale, height: (top - low) * scale,
+  })])
   setChildren("keep-outs", view.keep_out_mm.map(corners => svgElement("polygon", {
     class: "keep-out", points: corners.map(([px, py]) => `${x(px)},${y(py)}`).join(" "),
   })))
   layers.fibres = view.fibres.map((fibre, index) => {
     const group = svgElement("g", {class: `f${fibre.family}`})
     const parts = ["halo", "path", "hit"].map(name => svgElement("path", {class: name}))
-    const horizontal = fibre.family === 0, [sx, sy] = fibre.knots.at(horizontal && view.mirrored ? -1 : 0)
+    const [sx, sy] = fibre.knots[0], horizontal = fibre.family === 0
     // horizontals are labelled inside the left edge, since the scale of y is outside
     const label = svgElement("text", {
       x: x(sx) + (horizontal ? 4 : 0), y: y(sy) + (horizontal ? -5 : 12), "text-anchor": horizontal ? "start" : "middle",

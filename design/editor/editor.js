@@ -100,7 +100,7 @@ byId("pad").addEventListener("keydown", event => {
     // a step goes on from the last one, also before the response to it
     const last = queue.at(-1) ?? sent, [px, py] = view.fibres[selected.fibre].knots[selected.knot]
     const from = last?.gesture === gesture ? last : {x_mm: px, y_mm: py}
-    moveTo({x_mm: from.x_mm + right * step * (view.mirrored ? -1 : 1), y_mm: from.y_mm + up * step}, gesture)
+    moveTo({x_mm: from.x_mm + right * step, y_mm: from.y_mm + up * step}, gesture)
   } else if (event.key === "PageDown" || event.key === "PageUp") {
     const count = view.fibres.length
     select((selected.fibre + (event.key === "PageDown" ? 1 : count - 1)) % count)
