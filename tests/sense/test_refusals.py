@@ -73,7 +73,7 @@ def test_what_programs_ask_of_signals_and_localizers_in_vain(
         "as many failed fibres as there are": lambda: sense.evaluate(localizer, recording, [4]),
         "no number of failed fibres": lambda: sense.evaluate(localizer, recording, []),
         "a recording of the recalibration": lambda: sense.evaluate(
-            replace(localizer, recalibrated_by=(recording.digest,)), recording
+            replace(localizer, recalibrated_by=(recording.digest, "of later")), recording
         ),
         "few presses to recalibrate by": lambda: sense.recalibrate(localizer, known(recording, 9)),
         "a fibre that is not there": lambda: localizer.predict_features(presses, [4]),
