@@ -120,6 +120,8 @@ def test_depth_force_and_losses_of_six_fibres_are_kept_whole(golden: Any, tmp_pa
     }
     golden("sense/calibration/lines_of_a_rig.txt", "\n".join(calibration_lines(document)))
     sections = calibration_sections(tmp_path, document)
+    for rows in ([make_row(0, 1), make_row(1, 6)], [make_row(0, 1)]):  # less is known of less
+        sections += calibration_sections(tmp_path, document | {"errors": rows, "by_subset": []})
     golden("sense/calibration/page_of_a_rig.md", sections_text(sections))
     [section] = fibre_loss_sections(tmp_path, document)
     shades = {float(share): error for share, error in re.findall(r'--shade: ([\d.]+)">([\d.]+)<', str(section.body))}

@@ -17,10 +17,7 @@ from padforge.sense.settings import IDEAL_RIG
 from padforge.sense.simulation import pad_model
 from padforge.sense.simulation.built_pad import BuiltPad, PressParts, build_pad, press_contacts
 from padforge.sense.simulation.pad_model import ADC_STEPS, RETURNED, SUPPLY_V, Strain, Viscoelasticity
-from padforge.sense.simulation.simulated_recording import (
-    measure_rig_settings,
-    model_twin,
-)
+from padforge.sense.simulation.simulated_recording import measure_rig_settings, model_twin
 from padforge.sense.simulation.strokes import simulate_strokes
 from tests.helpers.golden import Golden, json_text
 from tests.helpers.rigs import KEEP_OUT, ideal_rig, quiet_rig
