@@ -20,8 +20,8 @@ from padforge.sense.localizer.response_model import interpolate_grid
 from padforge.sense.settings import RigSettings
 from padforge.sense.simulation.built_pad import build_pad
 from tests.helpers.constants import with_constants
-from tests.helpers.documents import document_text
 from tests.helpers.door import called
+from tests.helpers.golden import json_text
 from tests.helpers.presses import changed
 
 
@@ -327,4 +327,4 @@ def test_recalibration_is_told_whole(golden: Any) -> None:
     same = replace(corrected, change=None, after=before, gain_mm=0.0, standard_error_mm=0.0)
     texts = ["\n".join(recalibration.recalibration_lines(each)) for each in (refitted, corrected, same)]
     golden("sense/recalibration/lines.txt", "\n\n".join(texts))
-    golden("sense/recalibration/recalibration.json", document_text(refitted.to_dict()))
+    golden("sense/recalibration/recalibration.json", json_text(refitted.to_dict()))
