@@ -86,6 +86,13 @@ def golden(request: pytest.FixtureRequest, tmp_path: Path) -> Golden:
 
 
 @pytest.fixture
+def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The folder of the test, in which it works."""
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.fixture
 def figures(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
     """All figures that the test has drawn, in the order in which they were begun."""
     from matplotlib.figure import Figure

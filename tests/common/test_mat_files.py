@@ -41,12 +41,10 @@ def test_load_mat_reads_every_version_and_refuses_torn_files(tmp_path: Path) -> 
     pads = [Morphology.load(tmp_path / name) for name in ("old.mat", "new.mat")]
     assert np.array_equal(pads[0].knots, pads[1].knots)
     content = newer(tmp_path / "new.mat", CONTENT).read_bytes()
-    (tmp_path / "torn.mat").write_bytes(content[:2000])
-    with pytest.raises(InputError, match=r"torn\.mat: not a readable HDF5 file"):
-        load_mat(tmp_path / "torn.mat", ())
-    (tmp_path / "torn.mat").write_bytes((tmp_path / "old.mat").read_bytes()[:300])
-    with pytest.raises(InputError, match=r"torn\.mat: not a readable MATLAB file"):
-        load_mat(tmp_path / "torn.mat", ())
+    for torn, kind in ((content[:2000], "HDF5"), ((tmp_path / "old.mat").read_bytes()[:300], "MATLAB")):
+        (tmp_path / "torn.mat").write_bytes(torn)
+        with pytest.raises(InputError, match=rf"torn\.mat: not a readable {kind} file"):
+            load_mat(tmp_path / "torn.mat", ())
     scipy.io.savemat(tmp_path / "old.mat", {"para": CONTENT["para"]}, format="4")
     assert np.array_equal(load_mat(tmp_path / "old.mat", ("para",))["para"], CONTENT["para"])
 

@@ -25,12 +25,6 @@ def max_distance_mm(one: Morphology, other: Morphology) -> float:
     return max(a.hausdorff_distance(b) for a, b in zip(*lines, strict=True))
 
 
-@pytest.fixture
-def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.chdir(tmp_path)
-    return tmp_path
-
-
 @pytest.fixture(scope="session")
 def bent_pad() -> Morphology:
     """2 + 3 fibres of two knots each, some of which break rules."""

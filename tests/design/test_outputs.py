@@ -10,22 +10,13 @@ import pytest
 
 from padforge import InputError, Spec
 from padforge.common.server import page_text as served_page
-from padforge.design import (
-    Contact,
-    Morphology,
-    PadSettings,
-    RulesSettings,
-    SearchOptions,
-    SearchResult,
-    draw_plan,
-    search,
-)
+from padforge.design import Contact, Morphology, SearchOptions, SearchResult, draw_plan, search
 from padforge.design import compare as comparison
 from padforge.design.contact_comparison import compare_contacts
 from padforge.design.design_run import load_result, summary_lines
 from padforge.design.editor import EditSession
 from padforge.design.objectives.rules import Violation
-from padforge.design.settings import SearchSettings
+from padforge.design.settings import PadSettings, RulesSettings, SearchSettings
 from tests.design.conftest import max_distance_mm
 from tests.helpers.door import call
 from tests.helpers.folders import files_in

@@ -15,6 +15,8 @@ from padforge.fabricate.outputs.pictures import draw_crossing, draw_orientation
 from tests.fabricate.planted import level_pad
 from tests.helpers.golden import json_text
 
+pytestmark = pytest.mark.usefixtures("here")  # a pad.toml in the current folder is taken for the settings
+
 CROSSED = """
 [pad]
 keep_out_mm = [[-12.0, 11.0, 3.2, 6.0], [[8, 8], [9, 8], [9, 9], [8, 9]]]
@@ -59,12 +61,6 @@ PADS = {
 PICTURES = ("mould", "tracks", "toolpath", "orientation", "crossing")
 VERSIONS = r'(?<="versions": \{)[^}]*'
 """What differs between releases of libraries."""
-
-
-@pytest.fixture(autouse=True)
-def elsewhere(tmp_path_factory, monkeypatch):
-    """Run in an empty folder, since a pad.toml in the current one is taken for the settings."""
-    monkeypatch.chdir(tmp_path_factory.mktemp("elsewhere"))
 
 
 def invoke(*arguments: object) -> Any:

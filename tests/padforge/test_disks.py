@@ -1,6 +1,5 @@
 import json
 import os
-import resource
 from pathlib import Path
 
 import pytest
@@ -8,6 +7,7 @@ import pytest
 from padforge.common.files import write_json
 from padforge.design.morphology import Morphology
 from tests.helpers.door import called
+from tests.helpers.full_disk import full_disk
 from tests.padforge.conftest import SMALLEST
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="limits as POSIX has them")
@@ -28,12 +28,8 @@ def test_full_disk_leaves_whole_files_and_no_temporary_ones(tmp_path: Path, comm
         Morphology.random(2, 1, 3).save(tmp_path / folder / "morphology.json")
     write_json(tmp_path / "pad" / "fabrication.json", {"format": "padforge-fabrication/1"})
     before = (tmp_path / "pad" / "morphology.json").read_bytes()
-    allowed = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (limit, allowed[1]))
-    try:
+    with full_disk(limit):
         ended = called(*command.split(), cwd=tmp_path)
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, allowed)
     assert (ended.code, ended.err.count("\n")) == (2, 1), ended
     assert ended.err.startswith("padforge: "), ended
     assert not [path for path in tmp_path.rglob("*") if path.name.startswith(".unfinished-")]

@@ -31,6 +31,7 @@ from padforge.sense.twin.identification import Identification, identify_pad
 from tests.emulators import rigs
 from tests.emulators.ur5 import EmulatedUR5
 from tests.emulators.ur5_controller import Series
+from tests.helpers.less import blank_pictures
 from tests.helpers.once import Once
 from tests.helpers.rigs import ideal_rig
 from tests.helpers.steady_clock import SteadyClock, steady_clock
@@ -183,17 +184,9 @@ def steady() -> Iterator[SteadyClock]:
         yield clock
 
 
-@contextmanager
-def blank_pictures() -> Iterator[None]:
-    """Pictures are made and saved, but with nothing drawn, which takes longest."""
-    with patch("matplotlib.figure.Figure.draw", lambda figure, renderer: None):
-        yield
-
-
 @pytest.fixture
-def blank() -> Iterator[None]:
-    with blank_pictures():
-        yield
+def blank(monkeypatch: pytest.MonkeyPatch) -> None:
+    blank_pictures(monkeypatch)
 
 
 WAIT_S = 180.0

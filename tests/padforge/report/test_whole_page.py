@@ -1,26 +1,15 @@
 import json
 import re
 from pathlib import Path
-from typing import Any
 
 from padforge.common.files import provenance
-from padforge.common.page import PageSection
 from padforge.report import write_report
-from padforge.sense.report.sections import calibration_sections, recording_sections
+from padforge.sense.report.sections import recording_sections
 from tests.helpers.golden import page_text
 from tests.padforge.report.conftest import errors, written
 
 VERSIONS = r"python \d[^|]*(?= \|)"
 MAX_PAGE_BYTES = 8_000_000
-
-
-def section_text(sections: list[PageSection]) -> str:
-    """The sections as a reader meets them, each with its key figures."""
-    texts = []
-    for section in sections:
-        tiles = [f"tile: {value} {name}" for value, name in section.figures]
-        texts += [f"## {section.title}", *tiles, page_text(f"<div>{''.join(section.body)}</div>")]
-    return "\n".join(texts)
 
 
 def test_page_of_all_stages(page: Path, golden) -> None:
@@ -52,25 +41,7 @@ def test_page_with_a_study_of_lost_fibres_and_presses_of_known_force(pad: Path, 
     golden("padforge/report_of_losses.txt", text[text.index("## Recording") : text.index("## Contact model")])
 
 
-def make_calibration_document() -> dict[str, Any]:
-    names = ("mean_mm", "std_mm", "max_mm", "median_mm", "p95_mm")
-    rows = [
-        {"n_failed": n, "subsets": 1 + 3 * n}
-        | {name: 1.0 + n + 0.1 * k for k, name in enumerate(names)}
-        | {"within_r50": 0.51 + 0.01 * n, "within_r90": 0.91 + 0.01 * n}
-        | {"depth_mean_mm": 0.21 + n, "depth_p95_mm": 0.43 + n, "depth_within_r90": 0.87 + 0.01 * n}
-        | {"force_mean_n": 3.1 + n, "force_p95_n": 6.2 + n, "force_within_r90": 0.77 + 0.01 * n}
-        for n in (0, 1)
-    ]
-    moments = [
-        {"since": since, "time_s": time_s, "n_failed": n, "mean_mm": time_s + n, "within_r90": 0.9 + 0.01 * n}
-        for since, time_s in (("touch", 0.25), ("lift", 0.5))
-        for n in (0, 1)
-    ]
-    return {"errors": rows, "by_moment": moments, "by_subset": [], "idle_share": [0.1, 0.256], "test_presses": 12}
-
-
-def test_sections_on_documents(golden) -> None:
+def test_sections_on_recordings(golden) -> None:
     sections = []
     for source in (
         {"kind": "simulated", "rig": {"rate_hz": 13.3, "depth_mm": 5.0}},
@@ -80,9 +51,5 @@ def test_sections_on_documents(golden) -> None:
         {"kind": "simulated", "twin": {}},
     ):
         sections += recording_sections(Path("none"), {"source": source, "fibres": 7})
-    document = make_calibration_document()
-    rig = {"provenance": {"recording_kind": "rig"}, "split": "chronological"}
-    simulated = {"provenance": {"recording_kind": "simulated"}, "split": "random", "by_moment": []}
-    for more in (rig, simulated | {"errors": document["errors"][:1]}):
-        sections += calibration_sections(Path("none"), document | more)
-    golden("padforge/sections.txt", section_text(sections))
+    body = "".join(part for section in sections for part in section.body)
+    golden("padforge/recordings.txt", page_text(f"<div>{body}</div>"))

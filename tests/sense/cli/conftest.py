@@ -7,7 +7,6 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
-from unittest import mock
 
 import pytest
 
@@ -21,8 +20,9 @@ from padforge.sense.report.calibration import calibrate_into
 from padforge.sense.rig.operation import record_simulated
 from padforge.sense.settings import LocalizerSettings, RigSettings
 from padforge.sense.simulation.simulated_recording import simulate
+from tests.helpers.less import blank_pictures
 from tests.helpers.once import Once
-from tests.sense.conftest import blank_pictures, few_moments
+from tests.sense.conftest import few_moments
 
 SPEC = "[localizer]\nmembers = 1\nhidden = 24\nlayers = 1\nepochs = 4\n[rig]\npresses = 60\n[pad]\ngrid = 2\n"
 
@@ -51,7 +51,9 @@ def make_model(folder: Path, presses: int) -> Path:
     (folder / "pad.toml").write_text(SPEC)
     spec = Spec.load(folder / "pad.toml")
     recording = record_simulated(spec, Morphology.straight(2), folder / "rec", {"presses": presses})
-    with mock.patch.object(trace_model, "MAX_STEPS", 80), blank_pictures(), few_moments():
+    with pytest.MonkeyPatch.context() as patch, few_moments():
+        patch.setattr(trace_model, "MAX_STEPS", 80)
+        blank_pictures(patch)
         calibrate_into(recording, folder / "model", spec.section(LocalizerSettings))
     return folder
 

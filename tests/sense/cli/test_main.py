@@ -4,8 +4,6 @@ import json
 import os
 import subprocess
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -14,6 +12,7 @@ from padforge import sense
 from padforge.sense import Recording
 from padforge.sense.cli.options import typed_keys
 from tests.helpers.folders import files_in
+from tests.helpers.full_disk import full_disk
 from tests.sense.conftest import first_presses
 
 BARE = """
@@ -110,19 +109,6 @@ COMMANDS = {
     "export": "export rec out/table.csv",
     "locate": "locate --model model rec --out out/places.csv",
 }
-
-
-@contextmanager
-def full_disk(limit: int) -> Iterator[None]:
-    """No file gets longer than `limit` bytes."""
-    import resource  # not on Windows
-
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (limit, before[1]))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, before)
 
 
 @pytest.mark.usefixtures("blank", "calibrate_once")

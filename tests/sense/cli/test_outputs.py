@@ -129,9 +129,8 @@ def test_session_of_a_fibre_that_was_dead_from_the_start(few: Run, golden: Golde
     """The fourth; the second one is stuck, and all respond less than at the calibration."""
     fault = FibreFault(press=7, since=5, fibres=(1,), kind="stuck", score=4.0)
     shifts = [DomainShift("gain", (0, 1, 2, 3), 0.714, (0.9, 1.1)), DomainShift("rest", (0,), 1.5, (1.75, 2.25))]
-    said = Prediction(
-        Localization(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0), np.zeros(0)), [fault], shifts, None, False
-    )
+    nothing = Localization(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0), np.zeros(0))
+    said = Prediction(nothing, [fault], shifts, None, False)
     monkeypatch.setattr("padforge.sense.cli.localizer.predict_despite_faults", lambda *_: said)
     monkeypatch.setattr(FaultDetector, "load", lambda folder: SimpleNamespace(model_=SimpleNamespace(dead=(3,))))
     session = Session(few)

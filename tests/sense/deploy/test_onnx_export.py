@@ -160,8 +160,7 @@ def test_a_graph_that_differs_is_not_written(localizer, brief, exported, tmp_pat
     assert not list(tmp_path.iterdir())
 
 
-def test_script_of_the_tutorial_predicts_positions(localizer, brief, exported, tmp_path, monkeypatch) -> None:
-    monkeypatch.chdir(tmp_path)
+def test_script_of_the_tutorial_predicts_positions(localizer, brief, exported, here: Path) -> None:
     Path("localizer.onnx").write_bytes(exported[0].read_bytes())
     export_csv(brief, "presses.csv")
     names: dict[str, np.ndarray] = {}

@@ -1,5 +1,6 @@
 """Files as other labs' programs write them, by the mapping that their page of errors suggests."""
 
+import re
 import struct
 from collections.abc import Callable, Mapping, Sequence
 from datetime import datetime, timedelta
@@ -23,6 +24,7 @@ N = 156
 TIMES = np.arange(N) / 20
 PRESSED = np.arange(N) % 24 // 12 * (np.arange(N) < 144)
 """6 presses of 12 readings, after 12 without."""
+BEGIN = np.flatnonzero(np.diff(PRESSED, prepend=0) == 1)
 SPOTS = np.array([[-10, -10], [10, -10], [10, 10], [-10, 10], [0, 5], [5, 0]])[np.minimum(np.arange(N) // 24, 5)]
 VOLTS = 1.8 + 0.1 * PRESSED[:, None] * [1.0, 0.7, 0.4, 0.2] + np.random.default_rng(0).normal(0, 0.002, (N, 4))
 VOLTS = VOLTS.round(4)
@@ -70,6 +72,15 @@ def with_commas(text: str) -> str:
     return text.replace(",", ";").replace(".", ",")
 
 
+def quoted(text: str, separator: str = ",") -> str:
+    return re.sub(rf"[^\n{separator}]+", r'"\g<0>"', text).replace(separator, ",")
+
+
+def with_columns(names: str, cells: Callable[[int], str]) -> str:
+    """The table with more columns, and their cells."""
+    return table(f"t,c0,c1,c2,c3,{names}", [f"{line},{cells(i)}" for i, line in enumerate(rows())])
+
+
 def clock(seconds: float) -> str:
     return f"{int(seconds // 3600) % 24:02d}:{int(seconds // 60) % 60:02d}:{seconds % 60:06.3f}"
 
@@ -78,13 +89,12 @@ def clocked(i: int) -> str:
     return clock(36000 + i / 20)
 
 
+RECEIVED = [line.replace(",", " -> ", 1) for line in rows(clocked)]
+"""Lines as the monitor of an IDE keeps them, each behind the time at which it came."""
 EVENLY: dict[str, tuple[str | bytes, str]] = {
     "blanks": (table().replace(",", " "), MAPPING),
     "UTF-8 with a mark": ("\ufeff" + table(), MAPPING),
-    "all cells in quotes": (
-        "\n".join(",".join(f'"{c}"' for c in line.split(",")) for line in table().split()),
-        MAPPING,
-    ),
+    "all cells in quotes": (quoted(table()), MAPPING),
     "blanks, CR and LF": (table().replace(",", " , ").replace("\n", "\r\n") + "\r\n\r\n", MAPPING),
     "comments": ("# of a probe\n\n# spring; warm\n" + table().replace("\n3.000", "\n# knocked at\n\n3.000"), MAPPING),
     "tabs, names in a comment": ("# by hand\n#" + table().replace(",", "\t"), MAPPING),
@@ -102,12 +112,9 @@ EVENLY: dict[str, tuple[str | bytes, str]] = {
     "ISO dates": (table(lines=rows(lambda i: f"2026-03-01 {clocked(i)}")), MAPPING),
     "ISO dates of UTC": (table(lines=rows(lambda i: f"2026-03-01T{clocked(i)}Z")), MAPPING),
     "over midnight": (table(lines=rows(lambda i: clock(86397.45 + i / 20))), MAPPING),
-    "IDE monitor": (table("", [line.replace(",", " -> ", 1) for line in rows(clocked)]), "time=1,fibres=2-5"),
+    "IDE monitor": (table("", RECEIVED), "time=1,fibres=2-5"),
     "no time": (table("c0,c1,c2,c3", [line.split(",", 1)[1] for line in rows()]), "rate=20,fibres=c*"),
-    "decimal commas in quotes": (
-        table(lines=[",".join(f'"{cell}"' for cell in with_commas(line).split(";")) for line in rows()]),
-        MAPPING,
-    ),
+    "decimal commas in quotes": (quoted(with_commas(table()), ";"), MAPPING),
     "thousands": (table(lines=rows(lambda i: f'"{1000 + i * 50:,}"')), "time=t:ms,fibres=c*"),
     "comma at the end": (table(lines=[f"{line}," for line in rows()]), MAPPING),
     "power cut": (table(lines=[*rows()[:70], "\0\0\0" + rows()[70], *rows()[71:]]), MAPPING),
@@ -117,24 +124,14 @@ EVENLY: dict[str, tuple[str | bytes, str]] = {
     "torn end": (table() + "7.80,1.8,1.", MAPPING),
     "clock wraps": (table(lines=rows(lambda i: str((4294000000 + 50000 * i) % 2**32))), "time=t:us,fibres=c*"),
     "equal times": (table(lines=rows(lambda i: f"{TIMES[i - i % 4]:.3f}")), MAPPING),
-    "booleans": (
-        table("t,c0,c1,c2,c3,on", [f"{line},{bool(on)}" for line, on in zip(rows(), PRESSED, strict=True)]),
-        f"{MAPPING},press=on",
-    ),
-    "names in the header of a monitor": (
-        table("10:00:00.000 -> c0,c1,c2,c3", [line.replace(",", " -> ", 1) for line in rows(clocked)]),
-        "time=received,fibres=c*",
-    ),
+    "booleans": (with_columns("on", lambda i: str(PRESSED[i] == 1)), f"{MAPPING},press=on"),
+    "names in the header of a monitor": (table("10:00:00.000 -> c0,c1,c2,c3", RECEIVED), "time=received,fibres=c*"),
 }
 
 
 def changed(row: int, line: str, header: str = "t,c0,c1,c2,c3", instead_of: int = 1) -> str:
     """The table with another line in place of one or two."""
     return table(header, [*rows()[:row], line, *rows()[row + instead_of :]])
-
-
-def with_force(newtons: Callable[[int], float]) -> str:
-    return table("t,c0,c1,c2,c3,fz", [f"{line},{newtons(i)}" for i, line in enumerate(rows())])
 
 
 def positioned(scale: float = 1.0, jitter: float = 0.0, late: int = 0, held: bool = False, time: str = "") -> str:
@@ -170,11 +167,13 @@ def dated(form: str) -> str:
 
 
 WITH_PLACES, WITH_FORCE = f"{MAPPING},x=px,y=py", f"{MAPPING},force=fz"
-TURNED = with_force(lambda _: -2.5)
+TURNED = with_columns("fz", lambda _: "-2.5")
 MERGED = [[f"{line},,", f"{TIMES[i] + 0.013:.3f},,,,,{SPOTS[i, 0]},{SPOTS[i, 1]}"] for i, line in enumerate(rows())]
-TIME_LAST = [",".join([*line.split(",")[1:], line.split(",")[0]]) for line in rows()]
+TORN = [",".join([*line.split(",")[1:], line.split(",")[0]]) for line in rows()]
+TORN[70:72] = [TORN[70][:9] + TORN[71]]
 OWN = ["0,1,2,,", "1,1,2,3,4", "2,1,2,3,4", "3,1,2,,", "4,1,2,-1,0", "5,1,2,,"]
 """Lines of the program's own format, with two presses."""
+NO_NUMBERS = {cell: [*OWN[:2], f"2,1,{cell},3,4", *OWN[3:]] for cell in ("1_0", "1 2", "1e", "?")}
 PARTLY = ["0,1,2,,", "1,,2,?,?", "2,nan,2,?,?", "3,1,2,,", "4,1,2,-1,0", "5,1,,,", "6,1,2,?,?", "7,1,2,,", ""]
 LAB = """# bench 2
 t_ms;ch1;ch2;note;px;py;contact;f
@@ -204,10 +203,7 @@ REMARKABLE: dict[str, tuple[str, str]] = {
     "a word": (changed(30, "1.500,what,1.8,1.8,1.8"), MAPPING),
     "words for what is missing": (changed(30, "1.500,#N/A,ovf,inf,1.8"), MAPPING),
     "a line torn, and one of a later time": (changed(70, rows()[70][:12] + rows()[80], instead_of=2), MAPPING),
-    "a line torn, time in the last column": (
-        table("c0,c1,c2,c3,t", [*TIME_LAST[:70], TIME_LAST[70][:9] + TIME_LAST[71], *TIME_LAST[72:]]),
-        MAPPING,
-    ),
+    "a line torn, time in the last column": (table("c0,c1,c2,c3,t", TORN), MAPPING),
     "two runs": (table(lines=rows() + rows()), MAPPING),
     "merged sources": (table("t,c0,c1,c2,c3,x,y", [line for pair in MERGED for line in pair]), f"{MAPPING},x=x,y=y"),
     "positions that are measured": (positioned(jitter=0.02), WITH_PLACES),
@@ -217,8 +213,8 @@ REMARKABLE: dict[str, tuple[str, str]] = {
     "times in ms, without positions": (table(lines=rows(lambda i: str(50 * i))), MAPPING),
     "counts of 10 bits": (table(), f"{MAPPING}:310"),
     "counts of 14 bits": (table(), f"{MAPPING}:5000"),
-    "force": (with_force(lambda _: 2.5), WITH_FORCE),
-    "force a little below 0": (with_force(lambda i: -0.02 if 78 < i < 98 else 2.5), WITH_FORCE),
+    "force": (with_columns("fz", lambda _: "2.5"), WITH_FORCE),
+    "force a little below 0": (with_columns("fz", lambda i: "-0.02" if 78 < i < 98 else "2.5"), WITH_FORCE),
     "force that points the other way": (TURNED, WITH_FORCE),
     "force in mN that points the other way": (TURNED, f"{WITH_FORCE}:mN"),
     "force that is turned": (TURNED, f"{WITH_FORCE}:-1"),
@@ -227,7 +223,7 @@ REMARKABLE: dict[str, tuple[str, str]] = {
     "own, one of x and y": (own(*OWN, "# here", "6,1,2,3,"), ""),
     "own, lines torn": (own(*OWN, *["6,1"] * 4), ""),
     "other units": (
-        table("t,c0,c1,c2,c3,on,y", [f"{line},{int(PRESSED[i])},{1000 * i}" for i, line in enumerate(rows())]),
+        with_columns("on,y", lambda i: f"{int(PRESSED[i])},{1000 * i}"),
         "time=t:min,fibres=c0:uV,fibres=c1:0.5,x=c2:m,y=y:um,depth=c3:cm,press=on",
     ),
     "own, presses detected": (table("time_s,a,b,c,d"), ""),
@@ -239,10 +235,7 @@ REMARKABLE: dict[str, tuple[str, str]] = {
     "a column twice": (table(), "time=c1,fibres=c1"),
     "no such column": (table(), "time=t_ms,fibres=c*"),
     "own, no press": (own("0,1", "1,1", header="time_s,a"), ""),
-    **{
-        f"own, {cell!r} for a number": (own(*OWN[:2], f"2,1,{cell},3,4", *OWN[3:]), "") for cell in ("1_0", "1 2", "1e")
-    },
-    "own, ? for a number": (own(*OWN[:2], "2,1,?,3,4", *OWN[3:]), ""),
+    **{f"own, {cell!r} for a number": (own(*lines), "") for cell, lines in NO_NUMBERS.items()},
     "semicolons and all quantities": (LAB, "time=t_ms:ms,fibres=ch*:mV,x=px:cm,y=py:cm,press=contact,force=f:mN"),
 }
 """Tables of which something is to be said, or which are refused."""
@@ -277,8 +270,7 @@ def test_import_csv_reads_the_line_that_follows_a_torn_one_in_its_line(tmp_path,
 
 
 def test_presses_of_a_table_of_their_own(tmp_path: Path) -> None:
-    begin = np.flatnonzero(np.diff(PRESSED, prepend=0) == 1)
-    lines = [f"{TIMES[i]:.3f},{SPOTS[i, 0]},{SPOTS[i, 1]}" for i in begin]
+    lines = [f"{TIMES[i]:.3f},{SPOTS[i, 0]},{SPOTS[i, 1]}" for i in BEGIN]
     (tmp_path / "lab.csv").write_text(table())
     for names, mapping, more in (
         ("down_s,x_mm,y_mm,duration_s,force_n", "", "0.6,2.5"),
@@ -287,20 +279,18 @@ def test_presses_of_a_table_of_their_own(tmp_path: Path) -> None:
         (tmp_path / "presses.csv").write_text(table(names, [f"{line},{more}" for line in (*lines, "99,0,0")]))
         recording = import_file(tmp_path / "lab.csv", MAPPING, presses=tmp_path / "presses.csv", press_columns=mapping)
         check(recording)
-        assert recording.down_command.tolist() == begin.tolist()
-        assert recording.up_command.tolist() == (begin + 12).tolist()
-        assert recording.presses_mm.tolist() == SPOTS[begin].tolist()
+        assert recording.down_command.tolist() == BEGIN.tolist()
+        assert recording.up_command.tolist() == (BEGIN + 12).tolist()
+        assert recording.presses_mm.tolist() == SPOTS[BEGIN].tolist()
         assert (recording.forces_n == 2.5).all()
         assert recording.source["note"] == "1 of 7 presses lie outside of the readings, and are left out"
 
 
 def test_recording_from_arrays(tmp_path: Path) -> None:
-    begin = np.flatnonzero(np.diff(PRESSED, prepend=0) == 1)
-    recording = Recording.from_arrays(
-        VOLTS, TIMES, down_s=TIMES[begin], up_s=TIMES[begin + 12], presses_mm=SPOTS[begin], forces_n=np.ones(6)
-    )
+    presses = {"presses_mm": SPOTS[BEGIN], "forces_n": np.ones(6)}
+    recording = Recording.from_arrays(VOLTS, TIMES, down_s=TIMES[BEGIN], up_s=TIMES[BEGIN + 12], **presses)
     check(recording)
-    assert recording.down_command.tolist() == begin.tolist()
+    assert recording.down_command.tolist() == BEGIN.tolist()
     recording.save(tmp_path / "run")
     assert Recording.open(tmp_path / "run") == recording
     check(Recording.from_arrays(VOLTS, TIMES))
@@ -363,11 +353,7 @@ def test_what_is_said_of_files_of_matlab(golden: Golden, tmp_path: Path) -> None
         "partly": {"pos": np.where([True, False, True], positions, np.nan)},
     }.items():
         scipy.io.savemat(tmp_path / f"{name}.mat", published_variables(**changes))
-    columns = (
-        "time=x[0],fibres=x[1:5],press=x[5]",
-        "time=x[:,0],fibres=x[:,1:5]",
-        "time=x[0],fibres=x[1:5],press=x[7]",
-    )
+    columns = (*(f"time=x[0],fibres=x[1:5],press=x[{at}]" for at in (5, 7)), "time=x[:,0],fibres=x[:,1:5]")
     structure = ("time=data.t,fibres=data.in.v", "time=/data/t,fibres=/data/in/v", *columns, "")
     table = ("", "rate=20,fibres=data", "time=data.Time,fibres=data.v")
     mappings = dict.fromkeys(("old", "new"), structure) | dict.fromkeys(("opaque", "timetable"), table)
@@ -385,15 +371,14 @@ def outcomes(folder: Path, pattern: str, mappings: Mapping[str, Sequence[str]]) 
 
 def test_what_is_said_of_hdf5_files(golden: Golden, tmp_path: Path) -> None:
     """Columns of tables, frames along either axis, and commands as indices or as times."""
-    begin = np.flatnonzero(np.diff(PRESSED, prepend=0) == 1)
     with h5py.File(tmp_path / "lab.h5", "w") as file:
         kinds = [("t", "f8"), *((f"c{i}", "f4" if i else "f8") for i in range(4)), ("on", "u1")]
         file["log/table"] = np.array([tuple(row) for row in MATRIX], kinds)
         file["data"], file["t_ns"], file["note"] = MATRIX, (TIMES * 1e9).astype(np.int64), "bench 2"
         file["frames"], file["last"] = VOLTS.reshape(N, 2, 2), np.moveaxis(VOLTS.reshape(N, 2, 2), 0, -1)
-        file["tenths_of_mv"], file["xy"] = (1e4 * VOLTS.T).round().astype(np.int16), SPOTS[begin] / 10
-        file["on"], file["off"] = begin, begin + 12
-        file["on_ms"], file["off_ms"] = 50 * begin, 50 * begin + 600
+        file["tenths_of_mv"], file["xy"] = (1e4 * VOLTS.T).round().astype(np.int16), SPOTS[BEGIN] / 10
+        file["on"], file["off"] = BEGIN, BEGIN + 12
+        file["on_ms"], file["off_ms"] = 50 * BEGIN, 50 * BEGIN + 600
     with h5py.File(tmp_path / "other.h5", "w") as file:
         file["x"] = np.arange(3)
     pressed = "time=/t_ns:ns,fibres=/tenths_of_mv:1e-4,positions=/xy:cm,down_command=/on{0},up_command=off{0}"

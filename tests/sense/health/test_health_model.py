@@ -129,8 +129,7 @@ def test_other_rests_are_detected(model: HealthModel, localizer: LocalizerModel,
     assert shift.usual == pytest.approx((low - (high - low) / 4, high + (high - low) / 4))
     every = changed(later, list(range(6)), offset_v=0.33)
     assert detect(localizer, model, every) == [("rest", (fibre,)) for fibre in range(6)]
-    detector = FaultDetector()
-    detector.model_ = detector.live_model_ = model
+    detector = make_detector(model)
     detector.include_rests(recording)
     detector.include_rests(every)
     for each in (recording, every, later):  # all of these rests are usual now

@@ -11,7 +11,6 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
-from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import Any
 
@@ -31,6 +30,7 @@ from tests.helpers.presses import changed
 from tests.sense.conftest import first_presses
 from tests.sense.recording.test_recording import repeated
 
+pytestmark = pytest.mark.usefixtures("here")
 PAGE = (ROOT / "docs" / "howto-program.md").read_text(encoding="utf-8")
 PROGRAMS = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
 PLACE = re.compile(r"press (\d+): (-?[\d.]+), (-?[\d.]+) mm, within")
@@ -43,11 +43,6 @@ def check_places(printed: str, recording: Recording) -> int:
     pressed_mm = recording.presses_mm[places[:, 0].astype(int)]
     assert np.median(np.hypot(*(places[:, 1:] - pressed_mm).T)) < 6
     return len(places)
-
-
-@pytest.fixture(autouse=True)
-def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
 
 
 def test_program_prints_each_press(localizer: LocalizerModel, recording: Recording, capsys) -> None:

@@ -136,9 +136,8 @@ def test_live_estimates_are_those_of_the_whole_recording(recording, hasty, delay
         down, up = int(part.down_command[press]), int(part.up_command[press])
         end = min(up + RELEASE, int(part.down_command[press + 1]))
         assert [each.final for each in estimates] == [False] * (len(estimates) - 1) + [True]
-        np.testing.assert_array_equal(
-            until[[each.press == press for each in events]], np.arange(down + delays[0] + 1, end + 1)
-        )
+        of_press = until[[each.press == press for each in events]]
+        np.testing.assert_array_equal(of_press, np.arange(down + delays[0] + 1, end + 1))
         np.testing.assert_allclose([each.time_s for each in estimates], part.times_s[down])
         for each, index in zip(estimates, range(down + delays[0], end), strict=True):
             first = down if index < up + delays[1] else up

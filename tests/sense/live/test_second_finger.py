@@ -107,10 +107,9 @@ def error_mm(estimate: Estimate, touch: Touch) -> float:
 @pytest.fixture(scope="module")
 def example(once: Once) -> LocalizerModel:
     options = QUICK.model_copy(update={"members": 1, "max_failures": 1, "epochs": 10})
+    recording = simulate(Morphology.load(PLAN), RIG)
     with few_moments():
-        return once(
-            "second-finger", lambda _: calibrate(simulate(Morphology.load(PLAN), RIG), options, by_moment=False)[0]
-        )
+        return once("second-finger", lambda _: calibrate(recording, options, by_moment=False)[0])
 
 
 @pytest.mark.parametrize("ups", [(LIFT, LAST), (LAST, LIFT), (LIFT, LIFT)])

@@ -20,8 +20,8 @@ from padforge.sense.localizer.response_model import interpolate_grid
 from padforge.sense.settings import RigSettings
 from padforge.sense.simulation.built_pad import build_pad
 from tests.helpers.constants import with_constants
-from tests.helpers.documents import document_text
 from tests.helpers.door import called
+from tests.helpers.golden import json_text
 from tests.helpers.presses import changed
 
 
@@ -93,17 +93,13 @@ def test_predict_gives_intervals_of_depth_and_force(deep_localizer: LocalizerMod
     assert depth.r90 == pytest.approx(2.25, abs=0.05)
 
 
-def test_write_localization_writes_one_line_a_press(tmp_path: Path) -> None:
+def test_write_localization_writes_one_line_a_press(golden: Any, tmp_path: Path) -> None:
     places, sd = np.array([[1.23456, -2.0], [0.0, 3.5]]), np.array([[0.5, 0.25], [1.0, 2.0]])
     measures = {"depth_mm": MeasureEstimate(np.array([1.25, 2]), np.array([0.5, 1]))}
     measures |= {"force_n": MeasureEstimate(np.array([7.0, 8.0]), np.ones(2))}
     found = Localization(places, sd, np.array([0.4, 1.5]), np.ones(2) * 3, measures, np.array([True, False]))
     write_localization(found, tmp_path / "places.csv")
-    assert (tmp_path / "places.csv").read_text().splitlines() == [
-        "press,x_mm,y_mm,std_x_mm,std_y_mm,r50_mm,r90_mm,unlike,depth_mm,depth_r90_mm,force_n,force_r90_n",
-        "0,1.2346,-2.0000,0.5000,0.2500,0.4000,3.0000,1,1.2500,0.5000,7.0000,1.0000",
-        "1,0.0000,3.5000,1.0000,2.0000,1.5000,3.0000,0,2.0000,1.0000,8.0000,1.0000",
-    ]
+    golden("sense/places.csv", (tmp_path / "places.csv").read_text())
 
 
 @pytest.mark.parametrize("fixture", ["localizer", "deep_localizer"])
@@ -271,9 +267,8 @@ def test_fit_correction_recovers_gains_and_pose(localizer: LocalizerModel, recor
     moved = moved * scaling.scale_mm + scaling.origin_mm
     found = recalibration.fit_correction(localizer, localizer.raw_features(pad), moved)
     np.testing.assert_allclose(found.scaler.scale_v[:, 0] / scaling.scale_v[:, 0], gains, rtol=0.02)
-    np.testing.assert_allclose(
-        found.scaled_features(pad).inputs, localizer.scaled_features(recording).inputs, atol=0.15
-    )
+    expected = localizer.scaled_features(recording).inputs
+    np.testing.assert_allclose(found.scaled_features(pad).inputs, expected, atol=0.15)
     before, after = (distances(each.predict(pad).positions_mm, moved).mean() for each in (localizer, found))
     assert after < 0.1 * before
     # The table is turned with the pad.
@@ -327,4 +322,4 @@ def test_recalibration_is_told_whole(golden: Any) -> None:
     same = replace(corrected, change=None, after=before, gain_mm=0.0, standard_error_mm=0.0)
     texts = ["\n".join(recalibration.recalibration_lines(each)) for each in (refitted, corrected, same)]
     golden("sense/recalibration/lines.txt", "\n\n".join(texts))
-    golden("sense/recalibration/recalibration.json", document_text(refitted.to_dict()))
+    golden("sense/recalibration/recalibration.json", json_text(refitted.to_dict()))

@@ -210,10 +210,8 @@ N_WINDOWS, N_PRESSES, N_FIBRES = 3, 40, 4
 def make_maps(n_maps: int, seed: int) -> np.ndarray:
     """Random plane waves over the grid; shape (S, S, C, n)."""
     rng = np.random.default_rng(seed)
-    waves = grid_positions(SIDE) @ rng.normal(0, 2, (2, N_FIBRES * n_maps)) + rng.uniform(
-        0, 2 * np.pi, N_FIBRES * n_maps
-    )
-    return np.cos(waves).reshape(SIDE, SIDE, N_FIBRES, n_maps)
+    waves = grid_positions(SIDE) @ rng.normal(0, 2, (2, N_FIBRES * n_maps))
+    return np.cos(waves + rng.uniform(0, 2 * np.pi, N_FIBRES * n_maps)).reshape(SIDE, SIDE, N_FIBRES, n_maps)
 
 
 @pytest.fixture

@@ -218,9 +218,8 @@ def test_retrain_follows_another_response_from_where_networks_are(monkeypatch: p
     assert (list(retrained), residual) == (["pressed"], {})
     mask = np.ones((60, 3), bool)
     x = network.network_inputs(inputs.astype(np.float32), mask, np.ones((60, N_TIMED), bool))
-    before, after = (
-        np.abs(network.forward(each, x)[:, :, :2] - positions).mean() for each in (old, retrained["pressed"])
-    )
+    found = (network.forward(each, x)[:, :, :2] for each in (old, retrained["pressed"]))
+    before, after = (np.abs(each - positions).mean() for each in found)
     assert after < 0.5 * before
 
 

@@ -26,9 +26,8 @@ from padforge.sense.report.sections import calibration_sections, fibre_loss_sect
 from padforge.sense.twin.contact_fit import ContactFit
 from padforge.sense.twin.identification import Identification, MeasuredContact
 from padforge.sense.twin.wiring import Wiring
-from tests.helpers.documents import document_text
 from tests.helpers.folders import files_in
-from tests.helpers.golden import page_text
+from tests.helpers.golden import json_text, page_text
 from tests.sense.conftest import first_presses
 
 TEST = (1, 2, 4, 5, 7)
@@ -80,7 +79,7 @@ def test_calibration_is_kept_whole(
     monkeypatch.setattr(calibration, "calibrate", lambda *_, **__: kept)
     document = calibration.calibrate_into(few, tmp_path, LocalizerSettings(), without={"health"})
     assert files_in(tmp_path).keys() == {name for name in calibration.FILES if "health" not in name}
-    golden("sense/calibration/calibration.json", document_text(document), rtol=1e-3)
+    golden("sense/calibration/calibration.json", json_text(document), rtol=1e-3)
     lines = [*calibration_lines(document), *moment_lines(document["by_moment"])]
     golden("sense/calibration/lines.txt", "\n".join(lines), rtol=1e-3)
     golden("sense/calibration/page.md", sections_text(calibration_sections(tmp_path, document)), rtol=1e-3)
@@ -120,6 +119,8 @@ def test_depth_force_and_losses_of_six_fibres_are_kept_whole(golden: Any, tmp_pa
     }
     golden("sense/calibration/lines_of_a_rig.txt", "\n".join(calibration_lines(document)))
     sections = calibration_sections(tmp_path, document)
+    for rows in ([make_row(0, 1), make_row(1, 6)], [make_row(0, 1)]):  # less is known of less
+        sections += calibration_sections(tmp_path, document | {"errors": rows, "by_subset": []})
     golden("sense/calibration/page_of_a_rig.md", sections_text(sections))
     [section] = fibre_loss_sections(tmp_path, document)
     shades = {float(share): error for share, error in re.findall(r'--shade: ([\d.]+)">([\d.]+)<', str(section.body))}
@@ -161,7 +162,7 @@ def test_identification_is_kept_whole(
     shares |= {"explained_on_plan": 0.551, "noise": 0.0123, "noise_v": 1.1e-3 * np.arange(1, 6)}
     live = np.array([0, 2, 3, 4])
     document, drawn = identify(alternatives=[swapped], contact=make_contact(), live=live, **shares)
-    golden("sense/identification/identification.json", document_text(document), forget=_VERSIONS, rtol=2e-2)
+    golden("sense/identification/identification.json", json_text(document), forget=_VERSIONS, rtol=2e-2)
     golden("sense/identification/lines.txt", "\n".join(identification_lines(document, tmp_path)), rtol=2e-2)
     sections = identification_sections(tmp_path, document)
     page = page_text("<main>" + "".join(sections[0].body) + "</main>")

@@ -107,9 +107,8 @@ def scripted_arm(*script: ArmState | BaseException) -> tuple[mock.Mock, Time]:
 
 
 def test_wait_until_still_waits_for_the_tip_to_rest() -> None:
-    arm, clock = scripted_arm(
-        replace(STILL, moving=True), replace(STILL, speed_mm_s=1.1), replace(STILL, speed_mm_s=1.0)
-    )
+    changes = {"moving": True}, {"speed_mm_s": 1.1}, {"speed_mm_s": 1.0}
+    arm, clock = scripted_arm(*(replace(STILL, **change) for change in changes))
     with clock.of_all():
         assert safety.wait_until_still(arm, LIMITS).speed_mm_s == 1
     assert not arm.stop.called

@@ -78,9 +78,8 @@ def test_readings_show_presses_when_tip_goes_down(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_killed_recording_resumes_to_complete_plan(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_killed_recording_resumes_to_complete_plan(here: Path) -> None:
     """Killed again and again; the arm stays on, pressed where the watchdog stopped it."""
-    monkeypatch.chdir(tmp_path)
     PAD.save("pad.json")
     command = [sys.executable, "-m", "padforge", "sense", "record", "--rig", "ur5", "--morphology", "pad.json"]
     command += ["--presses", "5", "--out", "run", "--mcap", "--resume"]
@@ -108,5 +107,5 @@ def test_killed_recording_resumes_to_complete_plan(tmp_path: Path, monkeypatch: 
     assert len(recording.presses_mm) == 5
     assert read_journal(journal).items() >= presses_before_kill.items()
     assert import_bag("run.mcap") == recording
-    left = {path.name for path in tmp_path.iterdir() if not path.name.startswith(UNFINISHED)}  # those go a day later
+    left = {path.name for path in here.iterdir() if not path.name.startswith(UNFINISHED)}  # those go a day later
     assert left == {"pad.json", "pad.toml", "run", "run.mcap"}

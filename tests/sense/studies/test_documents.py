@@ -27,6 +27,7 @@ from padforge.sense.studies.strokes import SPEEDS_MM_S, strokes_study
 from padforge.sense.studies.study import Study, Task, draw_error_map, run, study_lines
 from tests.helpers.golden import Golden, json_text
 
+pytestmark = pytest.mark.usefixtures("blank")
 PADS = {"square": Morphology.straight(2), "wide": Morphology.straight((1, 3), 8.0)}
 Results = tuple[Study, list[dict[str, Any]]]
 """A study, and a result for each of its tasks, in their order."""
@@ -155,7 +156,6 @@ def shortened(value: Any) -> Any:
     return f"{' x '.join(map(str, numbers.shape))} numbers, {first} ... {last}{corners}, mean {mean}"
 
 
-@pytest.mark.usefixtures("blank")
 @pytest.mark.parametrize("name", STUDIES)
 def test_files_and_figure_of_a_study(name: str, golden: Golden, figures: list[Figure], tmp_path: Path) -> None:
     study, states = STUDIES[name]()
@@ -203,14 +203,12 @@ def fibre_loss() -> FibreLoss:
     return FibreLoss("random", 255, 45, methods, {})
 
 
-@pytest.mark.usefixtures("blank")
 def test_lines_and_figure_of_fibre_loss(golden: Golden, figures: list[Figure], tmp_path: Path) -> None:
     draw_fibre_loss(fibre_loss(), tmp_path / "none.png")
     golden("studies/fibre_loss.txt", "\n".join(fibre_loss_lines(fibre_loss())))
     golden("studies/fibre_loss.figure.txt", figures[0])
 
 
-@pytest.mark.usefixtures("blank")
 def test_lines_and_figure_of_a_learning_curve(golden: Golden, figures: list[Figure], tmp_path: Path) -> None:
     """Errors of 1 + 8 / sqrt(n) mm after 16 and 64 presses."""
     points = [

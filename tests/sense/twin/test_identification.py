@@ -114,9 +114,8 @@ def test_identify_gives_no_fibre_to_channels_without_readings(recording: Recordi
 
 def test_identify_rejects_recordings_that_do_not_suffice(recording: Recording) -> None:
     plan = Morphology.straight((1, 3), (8.0, 12.0))
-    narrow = simulate(
-        plan, RigSettings(presses=80), pad_settings=PadSettings(**plan.layout.settings, sensed_mm=(10.0, 11.0))
-    )
+    size = PadSettings(**plan.layout.settings, sensed_mm=(10.0, 11.0))
+    narrow = simulate(plan, RigSettings(presses=80), pad_settings=size)
     few = {"presses_mm": np.where(np.arange(300)[:, None] < 59, recording.presses_mm, np.nan)}
     noise = {"readings": np.random.default_rng(0).normal(2.0, 0.002, recording.readings.shape)}
     for unfit, pad, message in (
@@ -163,7 +162,8 @@ def test_doubts_are_told_whole(identification: Identification, golden: Golden) -
     pad, plan = identification.fit.pad, Morphology.straight(2)
     straight = replace(pad, plan=PadPlan.from_morphology(plan))
     lain = Wiring(straight.transform, 0.5, pad.fibres, 0.9)
-    turned, offsets = images(lain, plan.layout), [channel_indices(channel)[OFFSET] for channel in range(4)]
+    turned, swapped = images(lain, plan.layout), [replace(lain, fibres=(0, 1, 3, 2))]
+    offsets = [channel_indices(channel)[OFFSET] for channel in range(4)]
 
     def moved(places: Any, by: float, pad: AsBuiltPad = pad, **others: object) -> Identification:
         values = pad.values.copy()
@@ -183,9 +183,7 @@ def test_doubts_are_told_whole(identification: Identification, golden: Golden) -
         "askew": moved(0, np.radians(-101)),
         "shrunk": moved(3, -0.3),
         "straight fibres, images that fit": moved(0, 0.0, straight, alternatives=turned),
-        "straight fibres, two of them swapped": moved(
-            0, 0.0, straight, alternatives=[replace(lain, fibres=(0, 1, 3, 2))]
-        ),
+        "straight fibres, two of them swapped": moved(0, 0.0, straight, alternatives=swapped),
         "straight fibres 1.7 mm beside their plan": moved(np.concatenate(offsets), 0.15, straight, alternatives=turned),
         "winding fibres, images that fit": replace(identification, alternatives=turned),
     }
