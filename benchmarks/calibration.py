@@ -2,7 +2,7 @@
 
 `python -m padforge.benchmarks.calibration OUT [RECORDING.mat PRESSES...]` prints a table and draws
 OUT/bench_calibration.png: for presses on a simulated pad, and for each number PRESSES of those in a recording of the
-authors. A case takes some ten minutes on two cores, which nothing else should use meanwhile.
+authors. A case takes some three minutes on two cores, which nothing else should use meanwhile.
 """
 
 import sys

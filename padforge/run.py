@@ -40,9 +40,9 @@ _STAGE_SECTIONS = {
 }
 """Sections that the result of each stage depends on."""
 
-EPOCHS = 75
-"""Passes of the training through the presses unless `[localizer]` states them: less than half of the default of
-`padforge sense calibrate`. That makes errors on a simulated pad larger by 1 to 4 %, and on a built one by 2 to 6 %."""
+EPOCHS = 90
+"""Passes of the training through the presses unless `[localizer]` states them: half of the default of `padforge sense
+calibrate`. That makes errors on a simulated pad larger by 0 to 3 %, and on a built one by 2 to 5 %."""
 RESERVE_S = 30.0  # reserved after the training for calibration of radii, errors, fault detection, figures and report
 FORMAT = "padforge-run/1"
 NAME = "run.json"
