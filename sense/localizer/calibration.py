@@ -393,9 +393,11 @@ def _calibrate_scales(
         n_complete, features = moment
         growth = Experience.at_moment(n_complete).growth(n_trained) if n_trained else 1.0
         rows = np.flatnonzero(features.n_complete == n_complete)  # the next press cut others short
-        names = active_networks(model.networks, n_complete, features.n_timed, bool(model.bayes)) if len(rows) else []
+        if not len(rows):
+            return []
+        names = active_networks(model.networks, n_complete, features.n_timed, bool(model.bayes))
         pairs: list[tuple[str, Array]] = []
-        for failed in subsets if names else ():
+        for failed in subsets:
             outputs = predict_members(model.networks, features[rows].without(failed), *model.corrected)
             predicted, log_error = (half[:, :, :2] for half in np.split(outputs, 2, axis=2))
             error = np.abs(predicted - positions[rows]).mean(axis=2)
