@@ -8,7 +8,7 @@ import hashlib
 import json
 import logging
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from functools import partial
@@ -17,6 +17,7 @@ from pathlib import Path
 from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Any, TypeVar
 
+from padforge.common import profiling
 from padforge.common.command_line import INTERRUPTED
 from padforge.common.files import is_local, read_json, reraise_as_input_error, sha256, write_json
 from padforge.common.validation import InputError
@@ -116,19 +117,8 @@ class _StageCache:
         `files` returns the names of a result's files; results without files are not recorded. The argument of `compute`
         is a function that it may call to record the result as soon as its files are written. `inputs` are digests.
         """
-        from padforge.design.settings import Contact
-
-        run, names = self._run, _STAGE_SECTIONS[stage]
-        content = {
-            "settings": {name: _read_section(run.spec, name).model_dump(mode="json") for name in names},
-            # A search uses a stated contact alone, even if it equals the default.
-            "stated": {"contact": run.spec.stated(Contact)} if "contact" in names else {},
-            "seed": run.seed,
-            "inputs": inputs,
-        }
-        key = hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
-        entry = self._stages.get(stage)
-        if entry and entry["cache_key"] == key and entry["files"] == self._digests(entry["files"]):
+        key = self._key(stage, inputs)
+        if self.has(stage, **inputs):
             self.reused.append(stage)
             return load()
 
@@ -140,6 +130,26 @@ class _StageCache:
         result = compute(record)
         record(result)
         return result
+
+    def has(self, stage: str, **inputs: Any) -> bool:
+        """Return whether an earlier run has the result of a stage, as `get` would find it."""
+        entry = self._stages.get(stage)
+        if entry is None or entry["cache_key"] != self._key(stage, inputs):
+            return False
+        return entry["files"] == self._digests(entry["files"])
+
+    def _key(self, stage: str, inputs: Mapping[str, Any]) -> str:
+        from padforge.design.settings import Contact
+
+        run, names = self._run, _STAGE_SECTIONS[stage]
+        content = {
+            "settings": {name: _read_section(run.spec, name).model_dump(mode="json") for name in names},
+            # A search uses a stated contact alone, even if it equals the default.
+            "stated": {"contact": run.spec.stated(Contact)} if "contact" in names else {},
+            "seed": run.seed,
+            "inputs": inputs,
+        }
+        return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
     def _digests(self, names: Iterable[str]) -> dict[str, str]:
         paths = {name: self._run.out / name for name in names if is_local(name)}
@@ -181,9 +191,11 @@ def check_run(run: Run) -> None:
     plan = plan_simulation(Morphology.straight(pad.layout), rig, contact, pad)
     for notice in filter(None, (describe_other_depth(plan.depths_mm, contact), describe_large_strain(contact))):
         _log.warning(notice)
+    if "step" in run.formats:
+        metadata.version("build123d")  # if it is missing, this raises now and not after the search, as below
     localizer = run.spec.section(LocalizerSettings)
     if localizer.method == "published":
-        metadata.version("torch")  # if it is missing, this raises now and not after the search
+        metadata.version("torch")
     if run.time_budget is not None and localizer.method == "published":
         reason = "allowed is ensemble: the published training has no time limit"
         raise InputError(f"[localizer] method: got published with --time-budget, {reason}")
@@ -221,6 +233,7 @@ def run_stages(
 
     `on_line` receives the lines that summarize every stage; the other two open displays of progress.
     """
+    from padforge.common.background import BackgroundProcess
     from padforge.common.parallel import Checkpoints
     from padforge.design.contact_comparison import compare_contacts
     from padforge.design.design_run import load_result, run_design, summary_lines
@@ -252,58 +265,63 @@ def run_stages(
     def read_document(name: str) -> dict[str, Any]:
         return json.loads((out / name).read_bytes())
 
-    design = cache.get(
-        "design",
-        lambda result: [] if result.stopped == "interrupted" else ["design.json", PAD],
-        search,
-        lambda: load_result(out),
-    )
-    for line in summary_lines(design, out):
-        on_line(line)
-    if design.stopped == "interrupted":
-        return INTERRUPTED
-    if not design.stopped:
-        Checkpoints(out / "search", {}).clear()  # left by a run that was killed just after it wrote its results
-    pad, source, digest = design.morphology, [out / PAD], sha256(out / PAD)
-    settings = FabricationSettings.from_spec(spec)
-    mould = cache.get(
-        "mould",
-        lambda document: ["fabrication.json", *document["sha256"]],
-        lambda _: build(pad, out, run.formats, settings, source).to_dict(),
-        partial(read_document, "fabrication.json"),
-        pad=digest,
-        formats=sorted(run.formats),
-    )
+    cad = ["padforge.fabricate.cad.model"] if "step" in run.formats else []
+    with BackgroundProcess(cad) as worker:
+        design = cache.get(
+            "design",
+            lambda result: [] if result.stopped == "interrupted" else ["design.json", PAD],
+            search,
+            lambda: load_result(out),
+        )
+        for line in summary_lines(design, out):
+            on_line(line)
+        if design.stopped == "interrupted":
+            return INTERRUPTED
+        if not design.stopped:
+            Checkpoints(out / "search", {}).clear()  # left by a run that was killed just after it wrote its results
+        pad, source, digest = design.morphology, [out / PAD], sha256(out / PAD)
+        mould_inputs = {"pad": digest, "formats": sorted(run.formats)}
+        if not cache.has("mould", **mould_inputs):
+            worker.submit(build, pad, out, run.formats, FabricationSettings.from_spec(spec), source)
+        plan = spec.section(RigSettings).plan_file
+        recording = cache.get(
+            "recording",
+            lambda _: ["recording"],
+            lambda _: record_simulated(spec, pad, out / "recording", seed, source, replacing=True),
+            lambda: Recording.open(out / "recording"),
+            pad=digest,
+            plan=plan and sha256(plan),
+        )
+        on_line(f"sense: {len(recording.presses_mm)} presses on the simulated rig -> {out / 'recording'}")
+        contacts = cache.get(
+            "contacts",
+            lambda _: ["contacts.json"],
+            lambda _: compare_contacts(spec, pad, out, run.seed),
+            partial(read_document, "contacts.json"),
+            pad=digest,
+        )
+        calibration = cache.get(
+            "calibration",
+            lambda _: FILES,
+            calibrate,
+            partial(read_document, "calibration.json"),
+            recording=recording.digest,
+        )
+        for line in calibration_lines(calibration):
+            on_line(f"  {line}")
+        for line in contact_lines(contacts):
+            on_line(line)
+        with profiling.stage("mould"):
+            mould = cache.get(
+                "mould",
+                lambda document: ["fabrication.json", *document["sha256"]],
+                lambda _: worker.result().to_dict(),
+                partial(read_document, "fabrication.json"),
+                **mould_inputs,
+            )
     for line in mould_lines(mould, out):
         on_line(line)
-    plan = spec.section(RigSettings).plan_file
-    recording = cache.get(
-        "recording",
-        lambda _: ["recording"],
-        lambda _: record_simulated(spec, pad, out / "recording", seed, source, replacing=True),
-        lambda: Recording.open(out / "recording"),
-        pad=digest,
-        plan=plan and sha256(plan),
-    )
-    on_line(f"sense: {len(recording.presses_mm)} presses on the simulated rig -> {out / 'recording'}")
-    contacts = cache.get(
-        "contacts",
-        lambda _: ["contacts.json"],
-        lambda _: compare_contacts(spec, pad, out, run.seed),
-        partial(read_document, "contacts.json"),
-        pad=digest,
-    )
-    calibration = cache.get(
-        "calibration",
-        lambda _: FILES,
-        calibrate,
-        partial(read_document, "calibration.json"),
-        recording=recording.digest,
-    )
-    for line in calibration_lines(calibration):
-        on_line(f"  {line}")
-    for line in contact_lines(contacts):
-        on_line(line)
     if cache.reused:
-        _log.info("%s: reused from an earlier run: %s", out, ", ".join(cache.reused))
+        reused = sorted(cache.reused, key=list(_STAGE_SECTIONS).index)
+        _log.info("%s: reused from an earlier run: %s", out, ", ".join(reused))
     return int(bool(design.violations) or any(finding["status"] == "fail" for finding in mould["findings"]))

@@ -36,11 +36,13 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
 hypothesis.settings.register_profile("padforge", deadline=None, derandomize=True, max_examples=40)
 hypothesis.settings.load_profile("padforge")
 
-from padforge.common import compilation, plotting  # noqa: E402
+from padforge.common import background, compilation, plotting  # noqa: E402
 from tests.helpers import kernels  # noqa: E402
 from tests.helpers.golden import Golden  # noqa: E402
+from tests.helpers.in_this_process import InThisProcess  # noqa: E402
 from tests.helpers.once import Once  # noqa: E402
 
+background.BackgroundProcess = InThisProcess  # before other modules take the name from there
 compilation.NOTICE_AFTER_S = 3600.0  # so that compilation adds no line to the output of commands
 plotting.DPI = 40  # pixels take most of the time of a picture, and no test looks at them
 PUBLISHED = ROOT.parent / "shared" / "data" / "published"

@@ -2,11 +2,12 @@
 
 import math
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
 
+from padforge.common.parallel import map_threads
 from padforge.common.validation import MAX_VALUES, InputError, check_type
 from padforge.design.contact_set import served_contacts
 from padforge.design.morphology import Array, Morphology
@@ -73,7 +74,8 @@ class SearchProblem:
         return ScoredPad(pad, self.contacts[0], self.search, self.rules, self.pad)
 
     def _criterion(self, pad: Morphology) -> Array:
-        return np.array([criterion_errors(pad, contact, self.search, self.pad) for contact in self.contacts])
+        by_contact = partial(criterion_errors, pad, search=self.search, pad_settings=self.pad)
+        return np.array(list(map_threads(by_contact, self.contacts)))
 
     def settings(self) -> dict[str, Any]:
         """Return everything that a result depends on, by section, for JSON."""

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from padforge.common import profiling
-from padforge.common.parallel import Checkpoints, State, run_tasks
+from padforge.common.parallel import Checkpoints, State, map_threads, one_thread, run_tasks
 from padforge.common.progress import OnProgress, ignore_progress
 from padforge.common.settings import Spec, or_default
 from padforge.common.validation import InputError, check_float, check_path, check_type, short_repr
@@ -188,6 +188,8 @@ class Candidate:
 
     def to_result(self, straight: "Candidate") -> SearchResult:
         """Return the result of a search that chose this candidate."""
+        with one_thread():  # most of the time, therefore at once; `terms` finds them computed
+            list(map_threads(lambda each: each.scored.expected_errors, (self, straight)))
         terms = self.scored.terms(terms_of(self.problem.contacts[0]))
         straight_terms = straight.scored.terms(("expected_error_mm", "ambiguity_mm"))
         return SearchResult(self.pad, terms, self.violations, self.name, straight_terms, self.problem.rules.enforce)

@@ -89,13 +89,13 @@ class FaultLikelihoods:
     def log_likelihood_healthy(self, targets: Array, mean: Array, std: Array) -> Array:
         """Compute the log-likelihood (..., L) of the responses (..., L, T) of healthy fibres, up to a constant."""
         part = slice(0, COMPONENTS)
-        return _log_t(targets[..., part], mean[..., part], self._calibrated(std)[..., part]).sum(axis=-1)
+        return _joint_log_t(targets[..., part], mean[..., part], self._calibrated(std)[..., part])
 
     def largest_step(self, traces: Array) -> Array:
         """Compute the likeliest step (Q, L) within traces (Q, L, TRACE), signed, in deviations of healthy ones."""
         responses = traces - traces[..., :REST].mean(axis=-1, keepdims=True)
-        steps = np.einsum("csw,qcw->qcs", self.step_filters, responses)
-        return np.take_along_axis(steps, np.abs(steps).argmax(axis=-1)[..., None], axis=-1)[..., 0]
+        steps = responses.swapaxes(0, 1) @ self.step_filters.mT  # (L, Q, S), by BLAS
+        return np.take_along_axis(steps, np.abs(steps).argmax(axis=-1)[..., None], axis=-1)[..., 0].T
 
     def log_likelihood_ratios(self, traces: Array, targets: Array, mean: Array, std: Array) -> tuple[Array, Array]:
         """Compute the log-likelihood ratios (Q, L, H) of all hypotheses against health, for successive presses.
@@ -131,15 +131,12 @@ class FaultLikelihoods:
         healthy = self.log_likelihood_healthy(targets, mean, std)
         response, mean = targets[..., :COMPONENTS], mean[..., :COMPONENTS]
         std = self._calibrated(std)[..., :COMPONENTS]
-        gains = [
-            _log_t(response, gain * mean, np.hypot(gain * std, self.noise_floor)).sum(axis=-1)
-            for gain in GAINS.values()
-        ]
+        gains = [_joint_log_t(response, gain * mean, np.hypot(gain * std, self.noise_floor)) for gain in GAINS.values()]
         # In chunks, since the comparison of a press with the library takes kilobytes a fibre.
         parts = (response[first : first + _CHUNK, None] for first in range(0, len(response), _CHUNK))
-        others = (_log_t(part, self.library_mean, self.library_std).sum(axis=-1) for part in parts)
+        others = (_joint_log_t(part, self.library_mean, self.library_std) for part in parts)
         other = np.concatenate([np.logaddexp.reduce(each, axis=1) for each in others]) - np.log(LIBRARY)
-        inconsistent = np.logaddexp(other, _log_t(response, mean, STD_FACTOR * std).sum(axis=-1)) - np.log(2)
+        inconsistent = np.logaddexp(other, _joint_log_t(response, mean, STD_FACTOR * std)) - np.log(2)
         return [hypothesis - healthy for hypothesis in (*gains, inconsistent)]
 
     def _calibrated(self, std: Array) -> Array:
@@ -197,6 +194,12 @@ def fit_step_filters(traces: Array, noise_v: Array) -> Array:
 def _log_t(value: Array, mean: Array | float, std: Array | float) -> Array:
     """Return the logarithm of the density of Student's t, up to a constant."""
     return -(T_DEGREES + 1) / 2 * np.log1p(((value - mean) / std) ** 2 / T_DEGREES) - np.log(std)
+
+
+def _joint_log_t(value: Array, mean: Array, std: Array) -> Array:
+    """Return the sum of `_log_t` over the last axis: the logarithm of a product, in place of one for each factor."""
+    factors = 1 + ((value - mean) / std) ** 2 / T_DEGREES
+    return -(T_DEGREES + 1) / 2 * np.log(factors.prod(axis=-1)) - np.log(std.prod(axis=-1))
 
 
 def _shift_llr(value: Array, shift: Array | float) -> Array:

@@ -145,18 +145,27 @@ def predict_fibres(weights: Weights, inputs: Floats, fibre_mask: Mask) -> tuple[
     Returns the mean and the standard deviation of the mixture of the members.
     """
     # The first layer without a fibre is the sum over all minus the term of this fibre, computed once for all L.
-    terms = np.einsum("qcn,ecnh->eqch", inputs, weights["first.w"]) + weights["first.mask"][:, None]
-    terms = np.where(fibre_mask[:, :, None], terms, np.float32(0))
-    h = _silu(terms.sum(axis=2, keepdims=True) - terms + weights["first.b"][:, None, None])
+    terms = inputs.swapaxes(0, 1) @ weights["first.w"] + weights["first.mask"][:, :, None]  # (E, L, Q, H)
+    terms = np.where(fibre_mask.T[:, :, None], terms, np.float32(0))
+    h = _silu(terms.sum(axis=1, keepdims=True) - terms + weights["first.b"][:, None, None])
     h = _silu(h @ weights["hidden.w"][:, None] + weights["hidden.b"][:, None, None])
-    out = np.einsum("eqch,echt->eqct", h, weights["last.w"]) + weights["last.b"][:, None]
+    out = (h @ weights["last.w"] + weights["last.b"][:, :, None]).swapaxes(1, 2)
     mean, log_std = np.split(out.astype(np.float64), 2, axis=-1)
     variance = np.exp(2 * np.clip(log_std, *LOG_STD))
     return mean.mean(axis=0), np.sqrt(variance.mean(axis=0) + mean.var(axis=0))
 
 
 def _silu(x: Floats) -> Floats:
-    return x * np.float32(0.5) * (1 + np.tanh(x * np.float32(0.5)))
+    return x * _sigmoid(x)
+
+
+def _sigmoid(x: Floats) -> Floats:
+    """Return (1 + tanh(x / 2)) / 2, in one array for all steps, since allocating costs as much as computing."""
+    result = x * np.float32(0.5)
+    np.tanh(result, out=result)
+    result += np.float32(1)
+    result *= np.float32(0.5)
+    return result
 
 
 def train_networks(inputs: Floats, targets: Array, rows: list[Indices], rng: np.random.Generator) -> dict[str, Floats]:
@@ -227,8 +236,12 @@ def backpropagate(parameters: Parameters, inputs: Floats, targets: Floats, dropp
 
 
 def _silu_and_slope(x: Floats) -> tuple[Floats, Floats]:
-    sigmoid = np.float32(0.5) * (1 + np.tanh(np.float32(0.5) * x))
-    return x * sigmoid, sigmoid * (1 + x * (1 - sigmoid))
+    sigmoid = _sigmoid(x)
+    active, slope = x * sigmoid, 1 - sigmoid
+    slope *= x
+    slope += np.float32(1)
+    slope *= sigmoid
+    return active, slope
 
 
 def _loss_gradient(outputs: Floats, targets: Floats, dropped: Floats) -> Floats:

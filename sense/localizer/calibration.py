@@ -6,6 +6,7 @@ early stopping.
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
@@ -154,9 +155,7 @@ def calibrate(
     rng = np.random.default_rng(options.seed)
     positioned = np.flatnonzero(recording.has_position)
     training, test = split_presses(positioned, options.split, options.test_share, rng)
-    packages = ("safetensors", *["torch"] * (options.method == "published"))
-    made_by = provenance("padforge sense calibrate", options.seed, packages=packages)
-    made_by |= {"inputs": {"recording": recording.digest}, "recording_kind": recording.source.get("kind")}
+    made_by = calibration_provenance(recording, options)
     with stage("train"):
         model = fit_recording(recording, training, options, rng, on_progress, time_budget, pad)
     origin = {"fibre_names": recording.fibre_names, "pad_sha256": recording.pad_digest, "provenance": made_by}
@@ -166,6 +165,13 @@ def calibrate(
         evaluation = evaluate(model, recording, counts, by_moment=by_moment, on_progress=on_progress)
     evaluation = replace(evaluation, training_presses=len(training), settings=options.model_dump())
     return replace(model, errors=evaluation.errors), evaluation
+
+
+def calibration_provenance(recording: Recording, options: LocalizerSettings) -> dict[str, Any]:
+    """Return the provenance of what is learnt from a recording."""
+    packages = ("safetensors", *["torch"] * (options.method == "published"))
+    made_by = provenance("padforge sense calibrate", options.seed, packages=packages)
+    return made_by | {"inputs": {"recording": recording.digest}, "recording_kind": recording.source.get("kind")}
 
 
 def fit_recording(

@@ -2,6 +2,7 @@
 
 import logging
 from collections.abc import Collection
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 from matplotlib.ticker import LogLocator, NullFormatter
 
+from padforge.common.background import BackgroundProcess
 from padforge.common.files import atomic_files, check_replaceable, check_writable, write_json
 from padforge.common.plotting import ALARM, CURVES, FAINT, INK, add_caption, new_figure, save_figure, style_axes
 from padforge.common.profiling import stage
@@ -18,7 +20,7 @@ from padforge.common.progress import OnProgress, ignore_progress
 from padforge.common.validation import InputError
 from padforge.design import Morphology
 from padforge.sense.health.fault_detector import HEALTH_FILES, FaultDetector
-from padforge.sense.localizer.calibration import calibrate, missing_target_lines
+from padforge.sense.localizer.calibration import calibrate, calibration_provenance, missing_target_lines, split_unseen
 from padforge.sense.localizer.evaluation import Evaluation
 from padforge.sense.recording.recording import Recording
 from padforge.sense.report.sections import BY_LOSS, BY_MOMENT, MAP
@@ -55,26 +57,23 @@ def calibrate_into(
     path, origin = out / FILES[0], {"seed": options.seed, "inputs": {"recording": recording.digest}}
     check_replaceable(path, origin, FILES, force)
     by_moment = "moments" not in without
-    model, evaluation = calibrate(
-        recording, options, pad=pad, time_budget=time_budget, by_moment=by_moment, on_progress=on_progress
-    )
-    for line in missing_target_lines(recording, model):
-        _log.warning(line)
-    detector = None
-    if "health" not in without:
-        on_progress(0, 0, "health")
-        with stage("health"):
-            try:
-                detector = FaultDetector(seed=options.seed).fit(recording, model.test, model.provenance)
-            except InputError as error:
-                held_out = f"{len(model.test)} presses are held out"
-                _log.warning("the health of the fibres is not monitored: %s; %s", error, held_out)
-    # optional files of an earlier calibration must not stay
-    with atomic_files(out, without={*HEALTH_FILES, MAP, BY_LOSS, BY_MOMENT}) as folder:
+    with ExitStack() as stack:
+        health = None
+        if "health" not in without:  # learnt from the same presses as the localizer, and meanwhile
+            _, test = split_unseen(recording, None, options)
+            health = stack.enter_context(BackgroundProcess())
+            made_by = calibration_provenance(recording, options)
+            health.submit(FaultDetector(seed=options.seed).fit, recording, test, made_by)
+        model, evaluation = calibrate(
+            recording, options, pad=pad, time_budget=time_budget, by_moment=by_moment, on_progress=on_progress
+        )
+        for line in missing_target_lines(recording, model):
+            _log.warning(line)
+        # optional files of an earlier calibration must not stay
+        optional = {*HEALTH_FILES, MAP, BY_LOSS, BY_MOMENT}
+        folder = stack.enter_context(atomic_files(out, without=optional))
         model.save(folder)
         check_replaceable(path, folder / path.name, FILES, force)  # by content, since provenance does not show settings
-        if detector:
-            detector.save(folder)
         write_json(folder / "calibration.json", evaluation.to_dict())
         if "figures" not in without:
             with stage("figures"):
@@ -84,6 +83,14 @@ def calibrate_into(
                 save_figure(figure, folder / BY_LOSS)
                 if evaluation.by_moment:
                     draw_errors_by_moment(evaluation, folder / BY_MOMENT)
+        if health:
+            on_progress(0, 0, "health")
+            with stage("health"):
+                try:
+                    health.result().save(folder)
+                except InputError as error:
+                    held_out = f"{len(model.test)} presses are held out"
+                    _log.warning("the health of the fibres is not monitored: %s; %s", error, held_out)
     return evaluation.to_dict()
 
 

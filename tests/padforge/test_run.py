@@ -124,7 +124,7 @@ def test_resume_repeats_stages_of_changed_settings(folder: Path, monkeypatch: py
     assert resumed(folder, "--formats", "stl") == "design, recording, contacts, calibration"
     asked.clear()
     assert resumed(folder, "--seed", "7") == ""
-    design, _, recording, contacts, calibration = asked
+    design, recording, contacts, calibration, _ = asked
     assert (design[2], recording[3], contacts[3], calibration[2].seed) == ({"seed": 7}, {"seed": 7}, 7, 7)
 
 
@@ -174,7 +174,7 @@ def test_resume_continues_interrupted_search_and_calibration(finished, tmp_path,
     assert (ended.code, "reused from an earlier run" in ended.err) == (130, False), ended
     assert [sorted(states) for states in found] == [[0]]
     assert not (tmp_path / "out" / "pad" / "search").exists()
-    assert resumed(tmp_path) == "design, mould, recording, contacts"
+    assert resumed(tmp_path) == "design, recording, contacts"
     assert digests(tmp_path, *VOLATILE) == digests(finished[0], *VOLATILE)
 
 
