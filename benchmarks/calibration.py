@@ -32,7 +32,7 @@ from padforge.sense.recording.recording import Recording
 SIMULATED = 1275  # presses of the training on the simulated pad
 TEST = 400  # presses that are not trained on, and on which errors are measured
 MAX_FAILURES = 3
-EPOCHS = (11, 45, 90, 180)
+EPOCHS = (10, 40, 80, 150)
 WAYS: dict[str, dict[str, Any]] = {
     "as by default": {},
     "networks of 64 x 3": {"hidden": 64, "layers": 3},

@@ -1,7 +1,7 @@
 """Chain all stages of a pad, as `padforge run` does: design, mould, recording, contact comparison, calibration.
 
-A run may have a time budget. Every stage is cached by the digest of its settings and inputs, so that an interrupted run
-can be resumed.
+The mould, which no other stage needs, is built by a process in the background. A run may have a time budget. Every
+stage is cached by the digest of its settings and inputs, so that an interrupted run can be resumed.
 """
 
 import hashlib
@@ -41,9 +41,9 @@ _STAGE_SECTIONS = {
 }
 """Sections that the result of each stage depends on."""
 
-EPOCHS = 90
-"""Passes of the training through the presses unless `[localizer]` states them: half of the default of `padforge sense
-calibrate`. That makes errors on a simulated pad larger by 0 to 3 %, and on a built one by 2 to 5 %."""
+EPOCHS = 80
+"""Passes of the training through the presses unless `[localizer]` states them: about half of the default of `padforge
+sense calibrate`. That makes errors on a simulated pad larger by 0 to 3 %, and on a built one by 2 to 5 %."""
 RESERVE_S = 30.0  # reserved after the training for calibration of radii, errors, fault detection, figures and report
 FORMAT = "padforge-run/1"
 NAME = "run.json"

@@ -250,10 +250,10 @@ class LocalizerSettings(Settings):
     hidden: int = Field(default=192, ge=1, le=4096, description="width of the hidden layers")
     layers: int = Field(default=5, ge=1, le=32, description="residual hidden layers after the first")
     epochs: int = Field(
-        default=180,
+        default=150,
         ge=1,
         le=100_000,
-        description="passes through the presses, up to 9900 steps; in `padforge run` the default is 90",
+        description="passes through the presses, up to 9900 steps; in `padforge run` the default is 80",
     )
     batch: int = Field(default=256, ge=1, le=65_536, description="presses in a training step")
     learning_rate: float = Field(default=5e-3, gt=0, le=1, description="maximum rate of the one-cycle schedule")

@@ -23,8 +23,7 @@ PRIORITY = 19  # niceness of the process: it leaves the cores to what the user w
 class BackgroundProcess:
     """A process of low priority for one piece of work, such as CAD, which holds the interpreter lock.
 
-    It starts with the body of a `with` statement and imports modules until it has its work; when the body ends, it is
-    terminated.
+    It starts with the body of a `with` statement, imports modules until it has its work, and ends with the body.
     """
 
     def __init__(self, modules: Sequence[str] = ()) -> None:
@@ -32,6 +31,7 @@ class BackgroundProcess:
         context = multiprocessing.get_context("spawn")  # a fork would copy locks that other threads hold
         self._pipe, self._remote = context.Pipe()
         self._process = context.Process(target=_serve, args=(self._remote, modules), daemon=True)
+        self._is_working = False
 
     def __enter__(self) -> "BackgroundProcess":
         """Start the process."""
@@ -40,13 +40,17 @@ class BackgroundProcess:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None) -> None:
-        """Terminate the process; unfinished work removes its temporary files."""
-        self._process.terminate()
+        """End the process; unfinished work removes its temporary files."""
+        if self._is_working:
+            self._process.terminate()
+        else:
+            self._process.kill()  # to release the memory of CAD piece by piece would take two seconds
         self._process.join()
         self._pipe.close()
 
     def submit(self, work: Callable[..., Any], *arguments: Any) -> None:
         """Begin the work, a function of a module; it is pickled with its arguments."""
+        self._is_working = True
         self._pipe.send((work, arguments))
 
     def result(self) -> Any:
@@ -59,6 +63,7 @@ class BackgroundProcess:
             outcome, records = self._pipe.recv()
         except EOFError:
             raise Fault("a process that worked in the background was killed, perhaps for lack of memory") from None
+        self._is_working = False
         for record in records:
             logging.getLogger(record.name).handle(record)
         if isinstance(outcome, BaseException):
