@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from pandas import DataFrame
 
 FORMAT = "padforge-calibration/1"
-SIMULATED_NOTE = "simulated, by default with the scatter of a built pad, which itself errs 0.95 / 1.18 / 1.54 / 2.30 mm"
+SIMULATED_NOTE = "simulated, by default with the scatter of a built pad, which itself errs 0.94 / 1.20 / 1.57 / 2.33 mm"
 """Note beside simulated errors. Its numbers are of the published recording, with 0 to 3 of its 6 fibres failed."""
 CELLS = 5  # cells along a side of the map of errors by position
 MOMENT_SETS = 3  # maximum sets of failed fibres of a size at each moment

@@ -5,7 +5,6 @@ import math
 import multiprocessing
 import os
 import time
-from collections.abc import Callable
 from typing import Any
 
 import pytest
@@ -15,7 +14,7 @@ from padforge.common.validation import Fault
 from tests.helpers.in_this_process import BackgroundProcess
 
 
-def ran(work: Callable[..., Any], *arguments: object) -> Any:
+def ran(work: Any, *arguments: object) -> Any:
     with BackgroundProcess(["missing_module"]) as process:
         process.submit(work, *arguments)
         return process.result()

@@ -1,4 +1,3 @@
-from collections.abc import Callable
 from typing import Any
 
 from padforge.common.background import BackgroundProcess as BackgroundProcess  # before another takes its place
@@ -14,5 +13,5 @@ class InThisProcess:
 
     def __exit__(self, *_: object) -> None: ...
 
-    def submit(self, work: Callable[..., Any], *arguments: Any) -> None:
+    def submit(self, work: Any, *arguments: Any) -> None:
         self.result = lambda: work(*arguments)

@@ -225,7 +225,8 @@ def test_health_ignores_held_out(recording: Recording, localizer: LocalizerModel
     monkeypatch.setattr(calibration, "calibrate", lambda *_, **__: calibrated)
     known = first_presses(recording, 130)
     for name, each in (("plain", known), ("spoilt", without_sense(known, 120))):
-        calibration.calibrate_into(each, tmp_path / name, LocalizerSettings(), without=("figures",))
+        settings = LocalizerSettings(split="chronological", test_share=10 / 130)
+        calibration.calibrate_into(each, tmp_path / name, settings, without=("figures",))
     for file in HEALTH_FILES:
         assert (tmp_path / "plain" / file).read_bytes() == (tmp_path / "spoilt" / file).read_bytes()
 
