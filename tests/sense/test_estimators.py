@@ -219,14 +219,14 @@ def test_folds_are_predicted_by_models_of_others(localizer: LocalizerModel, reco
 
 @patch.object(trace_model, "MAX_STEPS", 2)
 @patch.object(health_model, "MIN_PRESSES", 100)
+@patch.object(calibration, "calibration_provenance", lambda *_: {})
 def test_health_ignores_held_out(recording: Recording, localizer: LocalizerModel, tmp_path, monkeypatch) -> None:
     """By a localizer, beside which health is learnt."""
     calibrated = replace(localizer, test=tuple(range(120, 130))), Mock(to_dict=dict)
     monkeypatch.setattr(calibration, "calibrate", lambda *_, **__: calibrated)
-    known = first_presses(recording, 130)
+    known, last = first_presses(recording, 130), LocalizerSettings(split="chronological", test_share=10 / 130)
     for name, each in (("plain", known), ("spoilt", without_sense(known, 120))):
-        settings = LocalizerSettings(split="chronological", test_share=10 / 130)
-        calibration.calibrate_into(each, tmp_path / name, settings, without=("figures",))
+        calibration.calibrate_into(each, tmp_path / name, last, without=("figures",))
     for file in HEALTH_FILES:
         assert (tmp_path / "plain" / file).read_bytes() == (tmp_path / "spoilt" / file).read_bytes()
 
