@@ -43,7 +43,7 @@ _STAGE_SECTIONS = {
 
 EPOCHS = 80
 """Passes of the training through the presses unless `[localizer]` states them: about half of the default of `padforge
-sense calibrate`. That makes errors on a simulated pad larger by 0 to 3 %, and on a built one by 2 to 5 %."""
+sense calibrate`. That makes errors on a simulated pad larger by 1 to 3 %, and on a built one by 2 to 5 %."""
 RESERVE_S = 30.0  # reserved after the training for calibration of radii, errors, fault detection, figures and report
 FORMAT = "padforge-run/1"
 NAME = "run.json"

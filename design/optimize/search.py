@@ -188,7 +188,7 @@ class Candidate:
 
     def to_result(self, straight: "Candidate") -> SearchResult:
         """Return the result of a search that chose this candidate."""
-        with one_thread():  # most of the time, therefore at once; `terms` finds them computed
+        with one_thread():  # both at once, since they take longest; `terms` reads the cached ones
             list(map_threads(lambda each: each.scored.expected_errors, (self, straight)))
         terms = self.scored.terms(terms_of(self.problem.contacts[0]))
         straight_terms = straight.scored.terms(("expected_error_mm", "ambiguity_mm"))

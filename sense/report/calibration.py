@@ -17,7 +17,7 @@ from padforge.common.files import atomic_files, check_replaceable, check_writabl
 from padforge.common.plotting import ALARM, CURVES, FAINT, INK, add_caption, new_figure, save_figure, style_axes
 from padforge.common.profiling import stage
 from padforge.common.progress import OnProgress, ignore_progress
-from padforge.common.validation import InputError
+from padforge.common.validation import Fault, InputError
 from padforge.design import Morphology
 from padforge.sense.health.fault_detector import HEALTH_FILES, FaultDetector
 from padforge.sense.localizer.calibration import calibrate, calibration_provenance, missing_target_lines, split_unseen
@@ -88,7 +88,7 @@ def calibrate_into(
             with stage("health"):
                 try:
                     health.result().save(folder)
-                except InputError as error:
+                except (InputError, Fault) as error:  # the localizer, minutes of training, is kept
                     held_out = f"{len(model.test)} presses are held out"
                     _log.warning("the health of the fibres is not monitored: %s; %s", error, held_out)
     return evaluation.to_dict()
